@@ -1,6 +1,9 @@
 # quickstart: set up and train a small policy.  test, coverage, lint: check the code.  docs: build the site.  bench: install its peers, print the benchmark tables.
 # Everything runs in .venv, which the first target makes; another interpreter: make quickstart PYTHON=python3.12
 
+FAST := tests/test_architecture.py $(addprefix tests/common/,$(addsuffix .py,test_rotations test_kinematics test_motors test_priority \
+  test_trajectories test_plausibility test_codec test_messages)) $(addprefix tests/learner/,$(addsuffix .py,test_gae test_losses \
+  test_staleness test_tickets test_rate_limit))
 supported := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do $$p -c '$(supported)' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
@@ -11,7 +14,7 @@ CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/congrasp
 # Compiled programs are kept between runs; another folder: JAX_COMPILATION_CACHE_DIR=...
 export JAX_COMPILATION_CACHE_DIR ?= $(CACHE)/jax
 
-.PHONY: quickstart test coverage lint docs bench install clean
+.PHONY: quickstart test check coverage lint docs bench install clean
 .DEFAULT_GOAL := quickstart
 
 quickstart: install
@@ -21,6 +24,10 @@ quickstart: install
 test: install
 	@tests/install_browser.sh $(VENV)/bin/python
 	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 3 --dist loadfile -m "not gpu" $(ARGS)
+
+# Without processes, engines and pictures: about a minute.
+check: lint
+	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -q -n 3 $(FAST)
 
 coverage:
 	$(MAKE) test ARGS="--cov --cov-report=term $(ARGS)"

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from congrasp.actors import initial, protocols
+from congrasp.actors import initial
+from congrasp.actors import stress as protocols
 from congrasp.actors.env import metric_names
 from congrasp.actors.episode import episode_message
 from congrasp.actors.initial import RequestedEpisodes
@@ -36,7 +37,7 @@ class Outcome(NamedTuple):
     aligned: np.ndarray
     """(B,) bool."""
     metrics: dict[str, np.ndarray]
-    """(B,) each, by the names in `actors.env.metric_names` and those of `actors.protocols.assess`."""
+    """(B,) each, by the names in `actors.env.metric_names` and those of `actors.stress.assess`."""
     trace: Trace
     """(T, B, ...)."""
 
@@ -45,7 +46,15 @@ class Attempts:
     """A policy that grasps one object after another, each in several ways at once, by its mean action."""
 
     def __init__(
-        self, hand: Hand, task: TaskConfig, bundle: PolicyBundle, *, hold: int, threads: int, lift: float = 0.0
+        self,
+        hand: Hand,
+        task: TaskConfig,
+        bundle: PolicyBundle,
+        *,
+        hold: int,
+        threads: int,
+        lift: float = 0.0,
+        speed: float = 0.0,
     ):
         """Compiles nothing yet.
 
@@ -56,12 +65,14 @@ class Attempts:
           hold: control steps without the table, or after the lift.
           threads: threads of the physics.
           lift: metres by which the hand goes up after the approach; the table then stands to the end.
+          speed: of the wrist along the heading at the start, m/s.
         """
+        self.speed = speed
         self._lift = lift
         self._hand, self._task, self._bundle = hand, task, bundle
         self._hold, self._threads = protocols.lift_steps(task, lift) + hold, threads
         self._worker: RolloutWorker | None = None
-        self._initial = jax.jit(functools.partial(initial.given, hand, task, hold=self._hold))
+        self._initial = jax.jit(functools.partial(initial.given, hand, task, hold=self._hold, speed=speed))
 
     @property
     def steps(self) -> int:

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from congrasp.actors import harvest, protocols, success
+from congrasp.actors import harvest, success
+from congrasp.actors import stress as protocols
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics.engine import Physics, PhysicsState, ResetState, where_environments
-from congrasp.actors.protocols import Frame, Protocol
+from congrasp.actors.stress import Frame, Protocol
 from congrasp.actors.success import Success
 from congrasp.common.config import ControlConfig, RewardWeights, TaskConfig
 from congrasp.common.hands.motors import motor_positions

@@ -11,14 +11,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from congrasp.actors.bank import make_references
 from congrasp.actors.physics.engine import where_environments
 from congrasp.common import rotations
 from congrasp.common.config import TaskConfig
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.bank import ConstraintBank
 from congrasp.common.task.constraints import get_constraint, optional
 from congrasp.common.task.constraints.base import Scene
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.build import make_references
 from congrasp.common.task.sampling.closed_poses import Poses
 from congrasp.common.task.types import Array
 

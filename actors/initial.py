@@ -15,10 +15,10 @@ from congrasp.common.config import SensingConfig, TaskConfig
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.closure import MARGIN, preshape
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.bank import ConstraintBank, Draw
 from congrasp.common.task.constraints import known, optional
 from congrasp.common.task.constraints.force import least_force
 from congrasp.common.task.constraints.priority import Resolution, active_blocks, resolve
+from congrasp.common.task.sampling.bank import ConstraintBank, Draw
 from congrasp.common.task.sampling.headings import Headings, local_width
 from congrasp.common.task.sensing import Sensors, draw_sensors
 from congrasp.common.task.types import Array, Goal, Surface
@@ -258,7 +258,14 @@ def own_key(key: Array, name: str, stage: int) -> Array:
     return jax.random.fold_in(jax.random.fold_in(key, zlib.crc32(name.encode())), stage)
 
 
-def given(hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int) -> tuple[InitialConditions, Resolution]:
+def handover_speed(task: TaskConfig) -> float:
+    """Wrist speed (m/s) at which a planned reach hands over: three quarters of the fastest start in training."""
+    return 0.75 * task.initial_speed * task.back_off / task.back_off_range[1]
+
+
+def given(
+    hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int, speed: float = 0.0
+) -> tuple[InitialConditions, Resolution]:
     """Episodes as they are asked for, of one object of nominal mass and friction, and what the priority rules did.
 
     The object's pose is shown as it is, whatever tracker the policy was trained with.
@@ -268,6 +275,7 @@ def given(hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int) -
       task: geometry of the approach.
       request: the episodes.
       hold: control steps without the table.
+      speed: of the wrist along the heading at the start, m/s.
     """
     resolution = resolve(hand, request.surface, request.goal, request.asked)
     batch = request.rest.shape[0]
@@ -278,7 +286,7 @@ def given(hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int) -
         resolution.goal,
         request.surface,
         request.rest,
-        _nominal(task, batch),
+        _nominal(task, batch)._replace(speed=jnp.full(batch, speed)),
         objects=index,
         mass_scale=nominal,
         friction=nominal,

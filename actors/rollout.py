@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors import harvest, initial, protocols
+from congrasp.actors import harvest, initial
+from congrasp.actors import stress as protocols
 from congrasp.actors.env import EnvState, GraspEnv, Settings, Transition, episode_fields
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
@@ -21,9 +22,9 @@ from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import metrics
-from congrasp.common.task.bank import ConstraintBank
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.observation import observe
+from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.types import Action, Array
 
 Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
@@ -36,7 +37,7 @@ wants of every environment and step."""
 class Trace(NamedTuple):
     """What is kept of one environment, or of several, at every step, for logs and pictures (T leads).
 
-    Poses are the world's, also where the policy sees a carried frame (`actors.protocols`).
+    Poses are the world's, also where the policy sees a carried frame (`actors.stress`).
     """
 
     q: Array

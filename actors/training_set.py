@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from congrasp.actors.bank import build_bank
 from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.pool import load_pool, scale_objects
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.stages import stage
-from congrasp.common.task.bank import ConstraintBank, rows_of, stacked
-from congrasp.common.task.constraint_sets import bank_of, load_for
+from congrasp.common.runtime.stages import stage
+from congrasp.common.task.sampling.bank import ConstraintBank, rows_of, stacked
+from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.task.sampling.sets import bank_of, load_for
 from congrasp.common.wire.codec import Message
 
 

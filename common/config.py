@@ -15,10 +15,10 @@ import dacite
 import jax
 from typing_extensions import Doc
 
-from congrasp.common.engines import PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import CONTACT_TIME
-from congrasp.common.inputs import file_name
+from congrasp.common.io.inputs import file_name
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.task.constraints import CONSTRAINTS, OURS, PAPER
 from congrasp.common.task.reward import GRASP
 

@@ -22,6 +22,18 @@ class CongraspError(Exception):
         super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}")
 
 
+class TooWideError(CongraspError):
+    """The object is wider, wherever it can be approached, than the hand opens."""
+
+    def __init__(self, name: str, width: float, opening: float):
+        """Args: the object's name, its smallest local width and the hand's widest opening, m."""
+        super().__init__(
+            f"'{name}' is too wide: {100 * width:.1f} cm where the hand would close, which opens to "
+            f"{100 * opening:.1f} cm.",
+            "Scale the object, approach a narrower part, or take a larger hand.",
+        )
+
+
 class PhysicsError(CongraspError):
     """The simulation produced values that are not finite."""
 

@@ -1,6 +1,7 @@
 """Rotations: unit quaternions (w, x, y, z), matrices and intrinsic x-y-z angles, over any leading axes."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from congrasp.common.task.types import Array
 
@@ -199,3 +200,9 @@ def compose_pose(
 ) -> tuple[Array, Array]:
     """A pose given in the frame of the first pose, in the frame in which the first pose is given."""
     return position + rotate(quaternion, local_position), multiply(quaternion, local_quaternion)
+
+
+def continuous(q: np.ndarray) -> np.ndarray:
+    """Quaternions (T, 4) of a motion without jumps of sign, so that neighbours can be interpolated."""
+    flips = np.sign(np.sum(q[1:] * q[:-1], -1))
+    return q * np.cumprod(np.concatenate([[1.0], np.where(flips == 0, 1.0, flips)]))[:, None]

@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     )
     from congrasp.common.request import GraspRequest
     from congrasp.services.assets.objects.options import ImportOptions
+    from congrasp.services.client.guard import Command, Guard
+    from congrasp.services.client.limits import JointLimits
+    from congrasp.services.client.policy import Answer, Policy
+    from congrasp.services.client.policy_client import PolicyClient
+    from congrasp.services.client.ticker import Ticker
     from congrasp.services.export.motion_file import GraspMotion, load_motion, save_motion
     from congrasp.services.grasp.grasper import Grasp, Grasper, grasp
-    from congrasp.services.serve.client import PolicyClient
-    from congrasp.services.serve.guard import Command, Guard
-    from congrasp.services.serve.limits import JointLimits
     from congrasp.services.serve.local import load_policy
-    from congrasp.services.serve.policy import Answer, Policy
-    from congrasp.services.serve.ticker import Ticker
 
 __all__ = [
     "Answer",
@@ -65,18 +65,18 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Answer": "congrasp.services.serve.policy",
-    "Command": "congrasp.services.serve.guard",
+    "Answer": "congrasp.services.client.policy",
+    "Command": "congrasp.services.client.guard",
     "Grasp": "congrasp.services.grasp.grasper",
     "GraspMotion": "congrasp.services.export.motion_file",
     "GraspRequest": "congrasp.common.request",
     "Grasper": "congrasp.services.grasp.grasper",
-    "Guard": "congrasp.services.serve.guard",
+    "Guard": "congrasp.services.client.guard",
     "ImportOptions": "congrasp.services.assets.objects.options",
-    "JointLimits": "congrasp.services.serve.limits",
-    "Policy": "congrasp.services.serve.policy",
-    "PolicyClient": "congrasp.services.serve.client",
-    "Ticker": "congrasp.services.serve.ticker",
+    "JointLimits": "congrasp.services.client.limits",
+    "Policy": "congrasp.services.client.policy",
+    "PolicyClient": "congrasp.services.client.policy_client",
+    "Ticker": "congrasp.services.client.ticker",
     "grasp": "congrasp.services.grasp.grasper",
     "load_motion": "congrasp.services.export.motion_file",
     "load_policy": "congrasp.services.serve.local",

@@ -237,9 +237,10 @@ class Grasp:
         return self.control["load_rate"] * (self.generalised_speed() - self.momentum)
 
     def generalised_speed(self):
-        """(6,) the wrist's speed plus its servos' damping times its joints."""
-        _, damping = self.servos()
-        return self.data.qvel[self.wrist_speeds] + damping * self.data.qpos[self.wrist]
+        """(6,) v + (damping - stiffness dt / 2) u of the wrist; servos and load make up its rate of change."""
+        stiffness, damping = self.servos()
+        factor = damping - 0.5 * self.task["control_dt"] * stiffness
+        return self.data.qvel[self.wrist_speeds] + factor * self.data.qpos[self.wrist]
 
     def servos(self):
         """(2, 6) stiffness (1/s^2) and damping (1/s) of the wrist's servos."""

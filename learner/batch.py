@@ -11,7 +11,7 @@ from congrasp.common.config import RunConfig
 from congrasp.common.policy.bundle import PolicySpec, full_layout
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import TAUGHT, WORLDS, RolloutForm, Schema
-from congrasp.learner.collectives import AXIS
+from congrasp.learner.distributed.collectives import AXIS
 
 
 def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> RolloutForm:

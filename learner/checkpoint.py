@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import sync_directory, write_atomically
+from congrasp.common.io.files import sync_directory, write_atomically
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.common.wire.codec import checksum as checksum_of
 

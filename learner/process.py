@@ -1,7 +1,8 @@
 """The learner process: rollouts in, policy bundles out, and a run directory from which it can be resumed.
 
-Several ranks (`learner.ranks`) train one policy, each with actors of its own. The run directory is rank 0's; the others
-take configuration, state and versions from it, and write only journals and what failed. All are at the same update.
+Several ranks (`learner.distributed`) train one policy, each with its own actors. The run directory is rank 0's; the
+others take configuration, state and versions from it, and write only journals and what failed. All are at the same
+update.
 """
 
 import contextlib
@@ -19,23 +20,25 @@ import numpy as np
 
 from congrasp.common.config import RunConfig, to_json
 from congrasp.common.errors import CongraspError, PhysicsError, TransportError
-from congrasp.common.files import write_atomically
+from congrasp.common.io.files import write_atomically
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.common.stages import stage
+from congrasp.common.runtime.stages import stage
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, encode, finite
-from congrasp.learner.admission import Admission
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
-from congrasp.learner.audit import AuditLog
 from congrasp.learner.batch import collate, rollout_form
 from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
 from congrasp.learner.collapse import CollapseWatch
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.ranges import task_ranges
-from congrasp.learner.ranks import Ranks, ended_by
+from congrasp.learner.distributed.ranks import Ranks, ended_by
+from congrasp.learner.hub.admission import Admission
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.ranges import task_ranges
+from congrasp.learner.hub.staleness import Counters, StalenessManager
+from congrasp.learner.hub.used_rollouts import AuditLog
+from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
 from congrasp.learner.run_directory import (
     CHECKPOINTS,
     CONFIG_FILE,
@@ -46,9 +49,7 @@ from congrasp.learner.run_directory import (
     open_run,
     published_version,
 )
-from congrasp.learner.staleness import Counters, StalenessManager
 from congrasp.learner.statistics import Pace, overall, summary
-from congrasp.learner.write_ahead import FOLDER, WriteAheadLog
 
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0

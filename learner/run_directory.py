@@ -16,12 +16,12 @@ from collections.abc import Callable, Iterator
 
 from congrasp.common.config import RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
-from congrasp.common.inputs import read_file
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_file
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.learner.audit import journalled_version
 from congrasp.learner.checkpoint import Checkpoints, set_aside
+from congrasp.learner.hub.used_rollouts import journalled_version
 
 POLICY_FILE = "policy.safetensors"
 INITIAL_FILE = "initial.safetensors"

@@ -19,18 +19,18 @@ import time
 
 import numpy as np
 
-from congrasp.actors.link import ActorLink, RunFinished, RunRestarted
+from congrasp.actors.process.link import ActorLink, RunFinished, RunRestarted
 from congrasp.common.errors import TransportError
-from congrasp.common.journal import AUDIT, Journal
+from congrasp.common.io.journal import AUDIT, Journal
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import FLOWS, Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.audit import AuditLog
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.staleness import StalenessManager
-from congrasp.learner.write_ahead import FOLDER, WriteAheadLog
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
+from congrasp.learner.hub.used_rollouts import AuditLog
+from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
 from congrasp.services.ops.audit import FAULTS, audit
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]

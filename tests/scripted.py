@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
 from congrasp.common.config import TaskConfig
@@ -13,6 +12,7 @@ from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.observation import layout
+from congrasp.common.task.sampling.build import build_bank
 
 NEAR = 0.03
 """Distance (m) of the hand centre from its heading position at which the fingers begin to close."""

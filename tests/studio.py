@@ -17,10 +17,10 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.scene import episode_entries
 from congrasp.services.record.writer import LogWriter
-from congrasp.services.viz.studio.catalogue import Catalogue
-from congrasp.services.viz.studio.jobs import Progress
-from congrasp.services.viz.studio.session import Session
-from congrasp.services.viz.studio.training import TrainingWindow
+from congrasp.services.studio.catalogue import Catalogue
+from congrasp.services.studio.jobs import Progress
+from congrasp.services.studio.session import Session
+from congrasp.services.studio.training import TrainingWindow
 from tests.episodes import episode
 
 STEPS, REMOVAL = 60, 40

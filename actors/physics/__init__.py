@@ -8,10 +8,10 @@ import jax
 
 from congrasp.actors.physics.engine import Physics
 from congrasp.common.config import TaskConfig
-from congrasp.common.engines import ENGINES, Engine, PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.engines import ENGINES, Engine, PhysicsName
 
 _NVIDIA = ("gpu", "cuda")
 

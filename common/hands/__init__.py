@@ -12,7 +12,7 @@ from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.mano import own_mano_hand
 from congrasp.common.hands.sharpa import SHARPA
 from congrasp.common.hands.spec import Hand
-from congrasp.common.inputs import LONGEST_NAME
+from congrasp.common.io.inputs import LONGEST_NAME
 
 HANDS: dict[str, Callable[[], Hand]] = {
     "human": lambda: HUMAN,

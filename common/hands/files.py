@@ -17,7 +17,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.motors import motor_limits
 from congrasp.common.hands.spec import Hand, Solid, chain_of
-from congrasp.common.inputs import LONGEST_NAME, read_file
+from congrasp.common.io.inputs import LONGEST_NAME, read_file
 
 FORMAT = 1
 MAX_BYTES = 1 << 20
@@ -33,9 +33,11 @@ TAKEN_JOINTS = _WRIST | {"object", "hold"}
 
 
 def hand_text(hand: Hand) -> str:
-    """The hand's file; links without `solids` have no such key, as in files from before there were any."""
+    """Returns the hand's file; `wide_pose` and the links' `solids` have no key where the hand has none."""
     fields = dataclasses.asdict(hand)
     del fields["text"]
+    if hand.wide_pose is None:
+        del fields["wide_pose"]
     for link in fields["links"]:
         if not link["solids"]:
             del link["solids"]

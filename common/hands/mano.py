@@ -14,7 +14,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.human import FINGER_GAINS, WRIST
 from congrasp.common.hands.spec import Capsule, Hand, Joint, Link, chain, vector
-from congrasp.common.pickles import read_pickle
+from congrasp.common.io.pickles import read_pickle
 
 VARIABLE = "CONGRASP_MANO"
 """Environment variable with the path of the user's file."""

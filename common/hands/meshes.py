@@ -11,7 +11,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand, own_hands
 from congrasp.common.hands.spec import Hand
-from congrasp.common.npz import read_npz
+from congrasp.common.io.npz import read_npz
 
 SUFFIX = ".visual.npz"
 MAX_FACES = 3000

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.inputs import LONGEST_NAME, file_name
+from congrasp.common.io.inputs import LONGEST_NAME, file_name
 from congrasp.common.objects.spec import COLOUR_POINTS, SURFACE_POINTS, GraspObject, Piece
 
 LARGEST = 10.0

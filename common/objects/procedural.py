@@ -8,23 +8,29 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
-from congrasp.common.objects.families import BASIC, BUILDERS, HOUSEHOLD, Draft
+from congrasp.common.objects.families import BASIC, BUILDERS, HOUSEHOLD, SCANS, Draft
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.surface import halves, mass_properties, sample_union
-from congrasp.common.parallel import parallel_map
+from congrasp.common.runtime.parallel import parallel_map
 
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)
 BASIC_FAMILIES = tuple(BASIC)
 HOUSEHOLD_FAMILIES = tuple(HOUSEHOLD)
 PRIMITIVE_FAMILIES = tuple(family for family in BASIC_FAMILIES if family not in ("ring", "bowl", "cup"))
 """Basic families whose objects have no mesh pieces."""
-GROUPS = {"basic": BASIC_FAMILIES, "household": HOUSEHOLD_FAMILIES, "all": FAMILIES}
-"""Names that stand for several families."""
-MASS_RANGE = (0.05, 0.5)
-"""Kilograms, of basic families."""
-HOUSEHOLD_MASS_RANGE = (0.02, 0.5)
-"""Kilograms, of household families."""
+GROUPS = {
+    "basic": BASIC_FAMILIES,
+    "household": HOUSEHOLD_FAMILIES,
+    "all": (*BASIC_FAMILIES, *HOUSEHOLD_FAMILIES),
+    "scans": tuple(SCANS),
+}
+"""Names that stand for several families; scans' kinds of shape are apart, so that pools of `all` stay the same."""
+MASS_RANGE = (0.02, 0.6)
+"""Kilograms."""
+_SETTLED = {True: (0.05, 0.5), False: (0.02, 0.5)}
+"""Kilograms between which basic families' objects, and the others, settle into their resting poses: masses may change
+without moving these by rounding errors."""
 _SIZE_RANGE, _HOUSEHOLD_SIZE_RANGE = (0.03, 0.25), (0.03, 0.3)
 _LEAST_SHARE = 0.1
 _ATTEMPTS = 100
@@ -33,8 +39,8 @@ _ATTEMPTS = 100
 def generate(seed: int, family: str | None = None) -> GraspObject:
     """A random object, the same for the same seed and family.
 
-    Its largest side is between 3 and 25 cm and its mass between 0.05 and 0.5 kg (3 to 30 cm and 0.02 to 0.5 kg in
-    household families), and both its graspable and its non-graspable region cover at least a tenth of the surface.
+    Its largest side is between 3 and 25 cm (30 cm in household families) and its mass between 0.02 and 0.6 kg, and both
+    its graspable and its non-graspable region cover at least a tenth of the surface.
     Mass and inertia are those of the sum of its pieces (overlaps count twice), scaled together where the mass had to
     be brought into range.
 
@@ -54,7 +60,7 @@ def generate(seed: int, family: str | None = None) -> GraspObject:
     for _ in range(_ATTEMPTS):
         obj = _build(f"{family}_{seed}", family, BUILDERS[family](rng), rng)
         if obj is not None:
-            return dataclasses.replace(obj, rest_poses=rest_poses(obj))
+            return obj
     raise RuntimeError(f"family {family} gave no usable object for seed {seed}")
 
 
@@ -91,8 +97,8 @@ def _check(seed: int, families: Sequence[str]) -> None:
 
 
 def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> GraspObject | None:
-    """The object of a draft without its resting poses, or None where its size or its parts are out of range."""
-    sizes, masses = (_SIZE_RANGE, MASS_RANGE) if family in BASIC else (_HOUSEHOLD_SIZE_RANGE, HOUSEHOLD_MASS_RANGE)
+    """The object of a draft, or None where its size or its parts are out of range."""
+    sizes = _SIZE_RANGE if family in BASIC else _HOUSEHOLD_SIZE_RANGE
     weight = np.array(draft.weight or [1.0] * max(1, len(draft.part_names)))
     densities = rng.uniform(*draft.density) * weight[[piece.part for piece in draft.pieces]]
     mass, center, inertia = mass_properties(draft.pieces, densities)
@@ -113,16 +119,16 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
     share = graspable[labels].mean()
     if not (sizes[0] <= size <= sizes[1] and _LEAST_SHARE <= share <= 1 - _LEAST_SHARE):
         return None
-    clipped = float(np.clip(mass, *masses))
+    settled, clipped = np.clip(mass, *_SETTLED[family in BASIC]), np.clip(draft.heavier * mass, *MASS_RANGE)
     vertices, faces = shapes.mesh_of(pieces)
-    return GraspObject(
+    obj = GraspObject(
         name=name,
         family=family,
         pieces=pieces,
         part_names=part_names,
         graspable=graspable,
-        mass=clipped,
-        inertia=inertia * clipped / mass,
+        mass=float(settled),
+        inertia=inertia * settled / mass,
         points=points.astype(np.float32),
         normals=normals.astype(np.float32),
         labels=labels,
@@ -130,3 +136,4 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
         visual_vertices=vertices,
         visual_faces=faces,
     )
+    return dataclasses.replace(obj, mass=float(clipped), inertia=inertia * clipped / mass, rest_poses=rest_poses(obj))

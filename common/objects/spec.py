@@ -14,6 +14,8 @@ COLOUR_POINTS = 32_768
 """Points of an object's surface whose colours are known, if it has any of its own."""
 PRIMITIVE_SLOTS = {"box": 3, "cylinder": 2, "capsule": 3, "ellipsoid": 2}
 """Most pieces of each kind in a primitive object: the geoms that a batched environment keeps for its object."""
+SURFACE_ERROR, VOLUME_ERROR = 0.005, 0.5
+"""m, and share of the mesh's volume, from which an imported shape is unreliable."""
 MAX_MESH_PIECES = 48
 """Most convex pieces of an object with mesh pieces."""
 MAX_MESH_VERTICES = 64
@@ -81,6 +83,12 @@ class GraspObject:
     """(Volume of the pieces' union - the mesh's) / the mesh's; None where the mesh was open, too."""
     colours: Colours | None = None
     """Its own, in the object frame."""
+
+    @property
+    def shape_reliable(self) -> bool:
+        """True if the pieces are close enough to the imported mesh for a grasp of them to be one of it."""
+        surface, volume = self.surface_error or 0.0, self.volume_error or 0.0
+        return surface <= SURFACE_ERROR and abs(volume) <= VOLUME_ERROR
 
     @property
     def non_graspable_points(self) -> np.ndarray:

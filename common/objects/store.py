@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
-from congrasp.common.inputs import file_name, read_file
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import file_name, read_file
 from congrasp.common.objects.checks import faults
 from congrasp.common.objects.spec import Colours, GraspObject, Piece
 from congrasp.common.wire.codec import Message, decode, encode

@@ -20,9 +20,9 @@ import numpy as np
 
 from congrasp.common.config import NetworkConfig, TaskConfig, with_older_critic, with_older_physics
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
 from congrasp.common.hands import check_reference, get_hand
-from congrasp.common.inputs import read_file
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_file
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.network import Layout, Params
 from congrasp.common.policy.normalizer import Affine, Statistics

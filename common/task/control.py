@@ -114,7 +114,8 @@ def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_veloci
 
     With w = v + damping u, the servos' law is dw/dt = stiffness (u_tgt - u) + d, where d is what everything else
     gives the wrist. The observer integrates dz/dt = stiffness (u_tgt - u) + rate (w - z), so that rate (w - z) is d
-    behind a low-pass of time constant 1 / rate (De Luca and Mattone 2003, doi 10.1109/ROBOT.2003.1241662).
+    behind a low-pass of time constant 1 / rate (De Luca and Mattone 2003, doi 10.1109/ROBOT.2003.1241662). In discrete
+    time the servos act on the mean of u over the step (trapezoidal rule), which changes w alone (`_generalised_speed`).
 
     Args:
       hand: its servos.
@@ -124,15 +125,21 @@ def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_veloci
       u_velocity: (B, 6).
       u_target: (B, 6) the step's targets.
     """
-    stiffness, damping = hand.wrist_servos
+    stiffness, _ = hand.wrist_servos
     decay = task.control_dt * task.control.load_rate
-    gained = task.control_dt * stiffness * (u_target - u) + decay * (u_velocity + damping * u)
+    gained = task.control_dt * stiffness * (u_target - u) + decay * _generalised_speed(hand, task, u, u_velocity)
     return (momentum + gained) / (1.0 + decay)
 
 
 def wrist_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array) -> Array:
     """d (B, 6), m/s^2 and rad/s^2, that everything but its servos gives the wrist; see `track_load`."""
-    return task.control.load_rate * (u_velocity + hand.wrist_servos[1] * u - momentum)
+    return task.control.load_rate * (_generalised_speed(hand, task, u, u_velocity) - momentum)
+
+
+def _generalised_speed(hand: Hand, task: TaskConfig, u: Array, u_velocity: Array) -> Array:
+    """w (B, 6) of `track_load`: with steps of dt, v + (damping - stiffness dt / 2) u."""
+    stiffness, damping = hand.wrist_servos
+    return u_velocity + (damping - 0.5 * task.control_dt * stiffness) * u
 
 
 class _Servo(NamedTuple):

@@ -28,7 +28,7 @@ from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import RECORDABLE, Schema
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
 from congrasp.learner.batch import partition_specs
-from congrasp.learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 _SCHEMA = {name: RECORDABLE[name] for name in ("observation", "teacher_observation")}
 _SPECS = partition_specs(_SCHEMA)

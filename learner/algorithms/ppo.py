@@ -31,7 +31,7 @@ from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
 from congrasp.learner.algorithms import gae, losses
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
 from congrasp.learner.batch import partition_specs
-from congrasp.learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 _SPECS = partition_specs(RECORDABLE)
 _CHECKED_INPUTS = tuple(name for name, spec in {**RECORDED, **PRIVILEGED}.items() if spec.dtypes != ("bool",))

@@ -78,8 +78,8 @@ class Algorithm(Protocol):
         Args:
           state: the training state; the arrays of its `optimizer` must not be used again.
           batch: the arrays of `batch_schema`, with all the rollouts of this process along the axis B.
-          mesh: of the ranks' devices along `learner.collectives.AXIS`, each of which calls this with the same state and
-            a batch of the same shape, and comes to the same state; None if this process is alone.
+          mesh: of the ranks' devices along `collectives.AXIS`, each of which calls this with the same state and a batch
+            of the same shape, and comes to the same state; None if this process is alone.
 
         Raises:
           NonFiniteUpdate: naming the first term that was not finite; the batch is dropped.

@@ -27,7 +27,7 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
-from congrasp.actors.link import ActorLink
+from congrasp.actors.process.link import ActorLink
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.transport import urls
@@ -35,9 +35,9 @@ from congrasp.common.transport.keys import FLOWS
 from congrasp.common.transport.ports import free_port, local_url, shifted
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.staleness import StalenessManager
-from congrasp.services.serve.client import PolicyClient
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.load import Example, example_episode, processor_seconds, serving, wait_until_ready
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset

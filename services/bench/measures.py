@@ -9,18 +9,18 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.physics import make_physics, resolve_physics
 from congrasp.actors.rollout import Probe, RolloutWorker
 from congrasp.common.config import ObjectsConfig
-from congrasp.common.engines import PhysicsName
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool, scale_objects
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import sample_action
 from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.task import plausibility
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.protocol import protocol, two_seconds
 
 

@@ -14,17 +14,17 @@ from mujoco import rollout
 from rich.console import Console
 from rich.table import Table
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.physics import make_physics, resolve_physics
 from congrasp.actors.physics.engine import Physics, PhysicsState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker
-from congrasp.common.engines import ENGINES, PhysicsName
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.pool import load_pool, scale_objects
 from congrasp.common.policy.bundle import PolicyBundle, sample_action
+from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
 

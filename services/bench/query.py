@@ -4,7 +4,7 @@ import pathlib
 import tempfile
 
 from congrasp.common.policy import bundle as bundles
-from congrasp.services.serve.client import PolicyClient
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.load import example_episode, measure, processor_seconds, serving, wait_until_ready
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError, TransportError
-from congrasp.common.parallel import cores
+from congrasp.common.runtime.parallel import cores
 from congrasp.learner.run_directory import create_run
 from congrasp.services.train.processes import engine_of, leave_gpus_to, train
 

@@ -16,7 +16,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import local_url
 from congrasp.common.wire.codec import Message
-from congrasp.learner.rate_limit import RateLimit
+from congrasp.learner.hub.rate_limit import RateLimit
 from congrasp.services.ops.certificates import create_authority, issue
 
 _KEYS = Keys("bench")

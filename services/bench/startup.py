@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.table import Table
 
 from congrasp.common.config import RunConfig
-from congrasp.common.engines import PhysicsName
 from congrasp.common.errors import CongraspError
-from congrasp.common.stages import imported, since_start, stages
+from congrasp.common.runtime.engines import PhysicsName
+from congrasp.common.runtime.stages import imported, since_start, stages
 from congrasp.services.train.warmup import until_first_update
 
 _STOPPED_SECONDS = 30.0

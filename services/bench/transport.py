@@ -23,18 +23,18 @@ import zenoh
 from zenoh import CongestionControl
 from zenoh.handlers import FifoChannel
 
-from congrasp.actors.link import ActorLink, RunFinished
+from congrasp.actors.process.link import ActorLink, RunFinished
 from congrasp.common.errors import CongraspError
-from congrasp.common.journal import AUDIT, Journal
+from congrasp.common.io.journal import AUDIT, Journal
 from congrasp.common.transport import urls
 from congrasp.common.transport.ports import free_port, local_url
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.admission import Admission, Ranges
-from congrasp.learner.audit import AuditLog
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.staleness import StalenessManager
-from congrasp.learner.write_ahead import FOLDER, WriteAheadLog
+from congrasp.learner.hub.admission import Admission, Ranges
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
+from congrasp.learner.hub.used_rollouts import AuditLog
+from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
 
 _FORM = RolloutForm(steps=20, worlds=340, observation=534, action=26, half=True)
 """Of the human hand's rollouts; these have 8.0 MB."""

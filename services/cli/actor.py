@@ -38,9 +38,9 @@ def actor(
       congrasp actor --connect tcp/127.0.0.1:7447 --run human
       congrasp actor --connect tls/10.0.0.5:7447 --run human --certs actor.1
     """
-    from congrasp.actors.process import run_actor
-    from congrasp.common.journal import Journal
-    from congrasp.common.parallel import cores
+    from congrasp.actors.process.actor import run_actor
+    from congrasp.common.io.journal import Journal
+    from congrasp.common.runtime.parallel import cores
     from congrasp.common.transport import urls
     from congrasp.common.transport.keys import process_name
     from congrasp.services.ops.logs import log

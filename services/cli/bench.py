@@ -20,7 +20,7 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
       congrasp bench physics
       congrasp bench physics --engines native warp --environments 1024
     """
-    from congrasp.common.parallel import cores
+    from congrasp.common.runtime.parallel import cores
     from congrasp.services.bench import physics as bench
 
     bench.bench_physics(environments, threads or cores(), repeats, list(engines) or bench.engines())  # type: ignore[arg-type]
@@ -309,7 +309,7 @@ def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int 
       congrasp bench measures
       congrasp bench measures --environments 256
     """
-    from congrasp.common.parallel import cores
+    from congrasp.common.runtime.parallel import cores
     from congrasp.services.bench.measures import bench_measures
 
     bench_measures(engine, environments, threads or cores(), repeats)

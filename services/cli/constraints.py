@@ -59,9 +59,9 @@ def generate(
     from congrasp.common.config import TaskConfig
     from congrasp.common.hands import get_hand
     from congrasp.common.objects.procedural import generate_many
+    from congrasp.common.task.sampling.write_sets import make_sets, save
     from congrasp.services.assets.objects.named import find_object, objects_of
     from congrasp.services.cli.console import tracked
-    from congrasp.services.grasp.constraint_sets import make_sets, save
 
     if not objects and count < 1:
         raise CongraspError("There is no object to make constraints for.", "Name objects, or set --count.")
@@ -86,9 +86,9 @@ def _references(
     hand: "Hand", policy: pathlib.Path | None, objects: "list[GraspObject]", seed: int, track: "Track"
 ) -> Any:
     """Constraints with references from a policy's grasps; prints how many there are."""
-    from congrasp.common.parallel import cores
     from congrasp.common.policy import bundle as bundles
     from congrasp.common.policy.pretrained import policy_file, reference_file
+    from congrasp.common.runtime.parallel import cores
     from congrasp.services.evaluate.evaluator import Evaluator
 
     bundle = bundles.load(policy or reference_file(hand.name) or policy_file(None, hand.name))
@@ -187,9 +187,9 @@ def _save(
     folder: pathlib.Path,
 ) -> None:
     """Writes objects to their folder, and their sets and the outcome of each sequence to `out`."""
-    from congrasp.common.files import write_atomically
+    from congrasp.common.io.files import write_atomically
     from congrasp.common.objects.store import Catalogue
-    from congrasp.services.grasp.constraint_sets import save
+    from congrasp.common.task.sampling.write_sets import save
 
     catalogue = Catalogue(folder)
     for obj, made in zip(objects, sets, strict=True):
@@ -259,9 +259,9 @@ def show(
       congrasp constraints show sets/mug_7.constraints.safetensors
       congrasp constraints show sets/mug_7.constraints.safetensors --png mug.png --rest 2
     """
-    from congrasp.common.task.constraint_sets import load
+    from congrasp.common.task.sampling.sets import load
+    from congrasp.common.task.sampling.write_sets import describe
     from congrasp.services.cli.console import show_facts
-    from congrasp.services.grasp.constraint_sets import describe
 
     constraints = load(file)
     rests = len(constraints.arrays["rest"])

@@ -10,8 +10,8 @@ import tyro
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.config import Split
-from congrasp.common.engines import engine_title
 from congrasp.common.errors import CongraspError
+from congrasp.common.runtime.engines import engine_title
 
 if TYPE_CHECKING:
     from rich.console import Console

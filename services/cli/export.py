@@ -31,7 +31,7 @@ def policy(
       congrasp export policy
       congrasp export policy --hand allegro --to stablehlo
     """
-    from congrasp.common.files import check_free
+    from congrasp.common.io.files import check_free
     from congrasp.common.policy.bundle import load
     from congrasp.common.policy.pretrained import policy_file
     from congrasp.services.export.policy import SUFFIXES, TOLERANCE, export_policy
@@ -146,7 +146,7 @@ def layout(
       congrasp export layout runs/mine
       congrasp export layout recordings/learner.mcap --out layout.json
     """
-    from congrasp.common.files import check_free
+    from congrasp.common.io.files import check_free
     from congrasp.services.export.layout import export_layout
 
     check_free(out, force=force)

@@ -138,7 +138,7 @@ def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
     """Prints where everything is; returns the exit code."""
     from congrasp.services.grasp.jobs import SHEET
 
-    held = sum(bool(result.facts.get("success")) for result in results)
+    held = sum(result.held for result in results)
     failed = sum(bool(result.error) for result in results)
     if len(results) > 1:
         summary = f"{held} of {len(results)} objects are held; {failed} could not be used."

@@ -124,9 +124,9 @@ def import_hand(
 def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | None) -> None:
     """Writes a hand's file and picture, by default in the folder of the user's own hands, and prints all of it."""
     from congrasp.common.errors import CongraspError
-    from congrasp.common.files import write_atomically
     from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder
     from congrasp.common.hands.files import hand_text
+    from congrasp.common.io.files import write_atomically
     from congrasp.services.assets.hands.model_files import describe
     from congrasp.services.assets.hands.visual import save_meshes
     from congrasp.services.viz.hand_sheets import joints_sheet
@@ -168,7 +168,7 @@ def check(
       congrasp hands check my_hand --png check.png --json check.json
     """
     from congrasp.common.hands import get_hand
-    from congrasp.common.parallel import cores
+    from congrasp.common.runtime.parallel import cores
     from congrasp.services.assets.hands.check import check_hand, write_findings
     from congrasp.services.train.recipe import recipe
     from congrasp.services.viz.check_sheet import check_sheet

@@ -16,7 +16,7 @@ from congrasp.services.train.presets import with_hand
 
 if TYPE_CHECKING:
     from congrasp.common.transport.base import Transport
-    from congrasp.learner.ranks import Ranks
+    from congrasp.learner.distributed.ranks import Ranks
 
 
 def learner(
@@ -74,7 +74,7 @@ def learner(
     from congrasp.common.errors import CongraspError
     from congrasp.common.policy import bundle as bundles
     from congrasp.common.transport import urls
-    from congrasp.learner.ranks import Ranks, end_process
+    from congrasp.learner.distributed.ranks import Ranks, end_process
     from congrasp.learner.run_directory import CONFIG_FILE, continue_run, create_run, listening
     from congrasp.services.ops.shutdown import on_signal
 

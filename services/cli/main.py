@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import cache_folder
+from congrasp.common.io.files import cache_folder
 from congrasp.services.ops.logs import log_error
 from congrasp.services.ops.shutdown import follow_parent, on_signal
 

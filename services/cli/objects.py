@@ -22,7 +22,8 @@ def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tup
       out: Folder for the objects.
       count: Number of objects.
       seed: Seed of the first; the others follow. Training never uses seeds from one million upward.
-      families: Families, in turn, or groups of them: basic (if none is named), household, all.
+      families: Families, in turn, or groups of them: basic (if none is named), household, all (both),
+        scans.
 
     Examples:
       congrasp objects generate --count 100
@@ -178,7 +179,7 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
         "avoid region": avoided or "nothing",
         "digest": digest(obj),
     }
-    for i, texts in enumerate(zip(_reach(obj, free), _reach(obj, on_graspable), strict=True)):
+    for i, texts in enumerate(zip(_reach(obj, free), _reach(obj, on_graspable, region=True), strict=True)):
         facts[f"resting pose {i + 1}"] = (
             f"{100 * obj.rest_poses[i][2]:.1f} cm high; headings within reach of the human hand {texts[0]}, on the "
             f"graspable region {texts[1]}"
@@ -231,8 +232,8 @@ def rests(
     return 0
 
 
-def _reach(obj: "GraspObject", headings: "Headings | None") -> list[str]:
-    """For each resting pose, what share of the headings the table leaves the human hand."""
+def _reach(obj: "GraspObject", headings: "Headings | None", *, region: bool = False) -> list[str]:
+    """Share of the headings, or of those on the graspable region, that the human hand has in each resting pose."""
     from congrasp.common.hands.human import HUMAN
     from congrasp.common.hands.outline import outline
     from congrasp.common.task.sampling.headings import above, within_reach
@@ -240,7 +241,8 @@ def _reach(obj: "GraspObject", headings: "Headings | None") -> list[str]:
     if headings is None:
         return ["none"] * len(obj.rest_poses)
     texts = []
-    found = within_reach(headings, obj.points, obj.rest_poses, outline(HUMAN))
+    avoid = obj.non_graspable_points if region else None
+    found = within_reach(headings, obj.points, obj.rest_poses, outline(HUMAN), avoid)
     for pose, cleared, reachable in zip(obj.rest_poses, *found, strict=True):
         texts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
     return texts

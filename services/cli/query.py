@@ -41,7 +41,7 @@ def query(
     import json as json_module
 
     from congrasp.services.cli.console import at_least
-    from congrasp.services.serve.client import PolicyClient
+    from congrasp.services.client.policy_client import PolicyClient
     from congrasp.services.serve.load import example_episode, measure, one_answer
 
     at_least(1, repeat=repeat, concurrency=concurrency, states=states)

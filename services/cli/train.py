@@ -9,7 +9,7 @@ import tyro
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.config import MetricWriter, RunConfig, Split
-from congrasp.common.inputs import file_name
+from congrasp.common.io.inputs import file_name
 from congrasp.common.task.methods import with_method
 from congrasp.learner.run_directory import CONFIG_FILE, open_run
 from congrasp.services.train.presets import get_preset, with_hand

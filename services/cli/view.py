@@ -44,7 +44,7 @@ def view(
     """
     from congrasp.common.errors import CongraspError
     from congrasp.services.ops.shutdown import on_signal
-    from congrasp.services.viz.studio.app import open_view
+    from congrasp.services.studio.app import open_view
 
     if run_dir is not None:
         if connect or policy or recordings or run != _RUN:

@@ -3,7 +3,7 @@
 import dataclasses
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
-from congrasp.common.engines import PhysicsName
+from congrasp.common.runtime.engines import PhysicsName
 
 
 def warmup(
@@ -35,7 +35,7 @@ def warmup(
     """
     from rich.console import Console
 
-    from congrasp.common.stages import imported
+    from congrasp.common.runtime.stages import imported
     from congrasp.services.ops.shutdown import on_signal
     from congrasp.services.train.command import first_update
     from congrasp.services.train.presets import get_preset

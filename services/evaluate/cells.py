@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from congrasp.actors.protocols import SURVIVAL
+from congrasp.actors.stress import SURVIVAL
 from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.services.evaluate.scores import ERRORS, UNITS, Row
 
@@ -26,7 +26,7 @@ PLAUSIBILITY = (
 )
 """Columns of the table of plausibility (`plausibility_cells`): deepest penetration (mean, 95th percentile), in the
 object also that of the hand's own meshes where it has some; peak speed and acceleration of the wrist; rates. Each push
-is six pushes, one after the other (`actors.protocols.Protocol`)."""
+is six pushes, one after the other (`actors.stress.Protocol`)."""
 FORCES = ("constraint", "link, N", "sum, N", "torque, % of limit", "links in contact at table removal", "diverged")
 """Columns of the table of forces after the removal (mean, 95th percentile); `force_cells` fills them."""
 

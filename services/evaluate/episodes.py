@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors import protocols
+from congrasp.actors import stress as protocols
 from congrasp.actors.env import EnvState, metric_names
 from congrasp.actors.episode import episode_message
 from congrasp.actors.harvest import Grasps
@@ -18,11 +18,11 @@ from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import RolloutWorker, Trace, finished_episodes
 from congrasp.common.config import TaskConfig
-from congrasp.common.engines import PhysicsName
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.distance import DistanceField
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, act_by_mean
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.task import plausibility
 from congrasp.common.task.constraints import get_constraint
 from congrasp.common.task.types import Array, Goal, Surface
@@ -105,7 +105,7 @@ class Episodes:
 
         Args:
           conditions: what they start from; their hold is that of these episodes.
-          stressed: whether what grasps survive after the hold is simulated too (`actors.protocols`).
+          stressed: whether what grasps survive after the hold is simulated too (`actors.stress`).
         """
         task, worker = self._task, self._worker
         start, window, length = task.approach_steps, task.hold_steps, task.approach_steps + self._hold

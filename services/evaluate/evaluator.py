@@ -10,17 +10,17 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.initial import InitialConditions
 from congrasp.common.config import TaskConfig
-from congrasp.common.engines import ENGINES, PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.pool import scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate import loads, references, sensing
 from congrasp.services.evaluate.episodes import Batch, Episodes
@@ -80,7 +80,7 @@ class Evaluator:
           friction: sliding friction between hand and object.
           hold_steps: control steps without the table; the task's, which count for success, if not given.
           bank: constraints to draw from, of these objects in this order
-            (`services.grasp.constraint_sets.bank_of`); made from the seed if not given, with references of the
+            (`common.task.sampling.write_sets.bank_of`); made from the seed if not given, with references of the
             reference policy (`services.evaluate.references`).
           paper: which of the paper's tables rows stand beside (`services.evaluate.paper`); empty for none.
         """

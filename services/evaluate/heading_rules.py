@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.headings import Headings, feasible
 from congrasp.services.evaluate.plan import repeated_rests
 
@@ -48,7 +48,7 @@ def heading_rules(
     """Effect of the rules on the headings of the whole surface, over all resting poses.
 
     Args:
-      bank: of the objects (`actors.bank.build_bank`).
+      bank: of the objects (`common.task.sampling.build.build_bank`).
       objects: N objects, in the hand's size.
       by_center: the same with the task's `headings` set to `center`.
     """

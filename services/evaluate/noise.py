@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.motors import coupled
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.sampling.bank import ConstraintBank
 
 
 @dataclasses.dataclass(frozen=True)

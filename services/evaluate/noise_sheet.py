@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
+from congrasp.common.io.files import write_atomically
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.noise import LEVELS
 from congrasp.services.evaluate.scores import Row

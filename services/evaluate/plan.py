@@ -19,8 +19,8 @@ from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.bank import ConstraintBank
 from congrasp.common.task.constraints import get_constraint, optional, require_known
+from congrasp.common.task.sampling.bank import ConstraintBank
 
 ALIGNED = ":aligned"
 """Ends the name of a row whose pose and trajectory belong together; elsewhere each is drawn for itself."""

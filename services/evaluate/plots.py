@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.inputs import read_json
+from congrasp.common.io.inputs import read_json
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.record.palette import INK
 from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, save, style

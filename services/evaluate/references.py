@@ -16,19 +16,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors import initial
-from congrasp.actors.bank import POSES, make_references
 from congrasp.actors.initial import PlannedEpisodes
-from congrasp.common.caches import keep, read_kept
 from congrasp.common.config import TaskConfig
-from congrasp.common.engines import ENGINES, PhysicsName
-from congrasp.common.files import cache_folder
 from congrasp.common.hands import get_hand
+from congrasp.common.io.caches import keep, read_kept
+from congrasp.common.io.files import cache_folder
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import reference_file
-from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.build import POSES, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.evaluate.episodes import Episodes
@@ -83,7 +83,7 @@ def make(
       policy: the reference policy.
       task: geometry of the approach, and which waypoints trajectories have.
       objects: N objects, in the hand's size.
-      bank: of these objects (`actors.bank.build_bank`); its own references stand in where the policy makes none.
+      bank: of these objects (`build_bank`); its own references stand in where the policy makes none.
       physics: engine; not `auto`.
       threads: threads of the `native` engine.
       progress: is told how many references there are, and how many at most.

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
+from congrasp.common.io.files import write_atomically
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.wire.codec import encode
 from congrasp.services.evaluate.cells import FORCES, error_title, force_cells, paper_cells, rate_cells, scaled

@@ -5,10 +5,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from congrasp.actors.physics import PhysicsName, resolve_physics
-from congrasp.common.engines import engine_title
 from congrasp.common.errors import CongraspError
-from congrasp.common.parallel import cores
 from congrasp.common.policy import bundle as bundles
+from congrasp.common.runtime.engines import engine_title
+from congrasp.common.runtime.parallel import cores
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.exam import exam_pool

@@ -17,11 +17,11 @@ from typing import Any
 
 import jax
 
-from congrasp.common.engines import engine_title
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
-from congrasp.common.inputs import read_json
-from congrasp.common.parallel import cores
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_json
+from congrasp.common.runtime.engines import engine_title
+from congrasp.common.runtime.parallel import cores
 from congrasp.services.evaluate.cells import paper_cells, plausibility_cells, rate_cells, row_title
 from congrasp.services.evaluate.heading_rules import HeadingRules
 from congrasp.services.evaluate.scores import Row

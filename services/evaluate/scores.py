@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from congrasp.actors.protocols import ASSESSED, SURVIVAL
+from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common.config import TaskConfig
-from congrasp.common.files import write_atomically
+from congrasp.common.io.files import write_atomically
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.services.evaluate.intervals import NORMAL_95, clustered, independent_episodes, standard_error
@@ -113,7 +113,7 @@ class Row:
     """Rate of episodes in which the physics failed."""
     paper: PaperRow | None
     plausibility: dict[str, float | None] = dataclasses.field(default_factory=dict)
-    """Over all episodes: means of the measures, `_p95` of the deepest penetrations, and rates (`actors.protocols`)."""
+    """Over all episodes: means of the measures, `_p95` of the deepest penetrations, and rates (`actors.stress`)."""
     margins: dict[str, float] = dataclasses.field(default_factory=dict)
     """Of each error with two successful episodes: half of the 95 % interval of its mean, 1.96 standard errors."""
     quantiles: dict[str, list[float]] = dataclasses.field(default_factory=dict)

@@ -7,8 +7,8 @@ import numpy as np
 
 from congrasp.common.config import ObjectsConfig
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
-from congrasp.common.parallel import cores
 from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.runtime.parallel import cores
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.viz.render import episode_strip
 from congrasp.services.viz.sheets import contact_sheet, save_png

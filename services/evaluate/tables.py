@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from congrasp.common.config import Split
-from congrasp.common.engines import PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.parallel import cores
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.common.task.bank import ConstraintBank
-from congrasp.common.task.constraint_sets import bank_of, load_for
+from congrasp.common.runtime.engines import PhysicsName
+from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.methods import takes
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.sets import bank_of, load_for
 from congrasp.services.evaluate import loads, sensing
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.exam import Exam, exam_pool

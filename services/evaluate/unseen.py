@@ -18,21 +18,22 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from congrasp.actors.bank import build_bank, headings_of
 from congrasp.common.config import TaskConfig
-from congrasp.common.engines import ENGINES, PhysicsName
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.outline import Outline, outline
 from congrasp.common.hands.spec import Hand
-from congrasp.common.inputs import read_file
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_file
 from congrasp.common.objects import procedural
 from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.pool import object_scale, scale_objects
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.parallel import parallel_map
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
-from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.runtime.parallel import parallel_map
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.build import build_bank, headings_of
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.evaluate.episodes import Episodes
@@ -246,7 +247,8 @@ def _with_bank(
             return objects, build_bank(hand, task, filled, seed)
         except CongraspError as error:
             scale, seeds = object_scale(hand, task), [(seed, n) for n in range(size)]
-            fine = parallel_map(_approachable, [task] * size, filled, seeds, [scale] * size)
+            own = itertools.repeat(outline(hand), size)
+            fine = parallel_map(_approachable, [task] * size, filled, seeds, [scale] * size, own)
             if all(fine):
                 raise
             _log.warning("%s", error)
@@ -255,10 +257,10 @@ def _with_bank(
     return [], None
 
 
-def _approachable(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float) -> bool:
-    """Whether an object has a heading."""
+def _approachable(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, own: Outline) -> bool:
+    """True if an object has a heading for the hand with this outline."""
     try:
-        headings_of(task, obj, seed, None, scale)
+        headings_of(task, obj, seed, None, scale, own)
     except CongraspError:
         return False
     return True

@@ -10,9 +10,9 @@ from scipy.spatial import QhullError
 
 import congrasp.common.objects
 import congrasp.services.assets.objects
-from congrasp.common.caches import keep, read_kept, source_digest
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import cache_folder, write_atomically
+from congrasp.common.io.caches import keep, read_kept, source_digest
+from congrasp.common.io.files import cache_folder, write_atomically
 from congrasp.common.objects import shapes
 from congrasp.common.objects.plain import plain_object
 from congrasp.common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.skin import Skin
-from congrasp.common.parallel import cores
+from congrasp.common.runtime.parallel import cores
 from congrasp.services.export.frames import skin_of_motion
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.viz.raster import render_scene

@@ -138,13 +138,6 @@ def bodies(motion: GraspMotion) -> list[Body]:
     return [*found, Body(OBJECT, -1, motion.object_position.astype(float), turn)]
 
 
-def continuous_quaternions(rotation: Rotation, *, scalar_first: bool) -> np.ndarray:
-    """(T, 4) without jumps of sign, so that neighbours can be interpolated."""
-    q = rotation.as_quat(scalar_first=scalar_first)
-    flips = np.sign(np.sum(q[1:] * q[:-1], -1))
-    return q * np.cumprod(np.concatenate([[1.0], np.where(flips == 0, 1.0, flips)]))[:, None]
-
-
 def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
     """(T, 4, 4) of positions (T, 3) and T rotations."""
     matrices = np.tile(np.eye(4), (len(position), 1, 1))

@@ -15,6 +15,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.skin import Skin
+from congrasp.common.rotations import continuous
 from congrasp.services.export.frames import (
     COLOURS,
     FROM_Y_UP,
@@ -23,7 +24,6 @@ from congrasp.services.export.frames import (
     TO_Y_UP,
     Track,
     bodies,
-    continuous_quaternions,
     facts,
     object_mesh,
     pose_matrices,
@@ -54,7 +54,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         if body.name == OBJECT:
             node.mesh = len(file.meshes)
             file.meshes.append(gltf.Mesh(name=OBJECT, primitives=[_primitive(file, data, *object_mesh(motion))]))
-        tracks = {"rotation": continuous_quaternions(body.rotation, scalar_first=False)}
+        tracks = {"rotation": continuous(body.rotation.as_quat(scalar_first=False))}
         if len(body.translation) > 1:
             tracks["translation"] = body.translation
         for name, values in tracks.items():

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import foxglove.layouts as fl
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
-from congrasp.common.inputs import parse_json
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import parse_json
 from congrasp.services.record.channels import flatten
 from congrasp.services.record.reader import log_files, metrics_of, read_records
 

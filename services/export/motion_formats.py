@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import check_free
+from congrasp.common.io.files import check_free
 from congrasp.services.export.frames import TOLERANCE_MM, error_mm
 from congrasp.services.export.motion_file import GraspMotion, load_motion, motion_of_episode
 from congrasp.services.record.reader import pick_episode

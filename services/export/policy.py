@@ -14,18 +14,18 @@ import numpy as np
 
 from congrasp.actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, TABLE_AWAY, object_contact, scene_spec
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.mjcf import WRIST_JOINTS
 from congrasp.common.hands.motors import transmission
 from congrasp.common.hands.spec import Hand, link_origin
+from congrasp.common.io.files import write_atomically
 from congrasp.common.policy.bundle import PolicyBundle, content_hash, mean_action
 from congrasp.common.policy.network import gated
 from congrasp.common.task import observation
 from congrasp.common.task.geometry import FORCE_SCALE
 from congrasp.common.wire.codec import encode
-from congrasp.services.serve.limits import JointLimits
+from congrasp.services.client.limits import JointLimits
 
 TOLERANCE = 1e-5
 """Largest absolute difference between an exported policy and the Flax policy that is let through, in action units."""

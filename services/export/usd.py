@@ -16,6 +16,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.skin import Skin
+from congrasp.common.rotations import continuous
 from congrasp.services.export.frames import (
     COLOURS,
     OBJECT,
@@ -24,7 +25,6 @@ from congrasp.services.export.frames import (
     Track,
     bodies,
     capsules,
-    continuous_quaternions,
     facts,
     identifiers,
     object_mesh,
@@ -59,7 +59,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         translate, orient = xform.AddTranslateOp(_DOUBLE), xform.AddOrientOp(_DOUBLE)
         if len(body.translation) == 1:
             translate.Set(Gf.Vec3d(*body.translation[0]))
-        for t, turn in enumerate(continuous_quaternions(body.rotation, scalar_first=True)):
+        for t, turn in enumerate(continuous(body.rotation.as_quat(scalar_first=True))):
             orient.Set(Gf.Quatd(*turn), t)
             if len(body.translation) > 1:
                 translate.Set(Gf.Vec3d(*body.translation[t]), t)
@@ -110,7 +110,7 @@ def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body
     skeleton.CreateRestTransformsAttr([Gf.Matrix4d().SetTranslate(Gf.Vec3d(*o)) for o in skin.origins - parents])
     animation.CreateJointsAttr(names)
     animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)] * len(links))
-    turns = np.stack([continuous_quaternions(link.rotation, scalar_first=True) for link in links], 1)
+    turns = np.stack([continuous(link.rotation.as_quat(scalar_first=True)) for link in links], 1)
     places = np.stack([np.broadcast_to(link.translation, (len(turns), 3)) for link in links], 1)
     rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
     for t, (turn, place) in enumerate(zip(turns, places, strict=True)):

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from congrasp.actors.bank import clear_of_table
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.outline import outline
 from congrasp.common.hands.spec import Hand
@@ -10,7 +9,8 @@ from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.constraints import CONSTRAINTS
-from congrasp.common.task.sampling.headings import above, sample_headings, within_reach
+from congrasp.common.task.sampling.build import clear_of_table
+from congrasp.common.task.sampling.headings import INWARD, above, max_width, sample_headings, within_reach
 
 
 def headings(
@@ -22,7 +22,17 @@ def headings(
     """
     direction, position = request.given("heading", "direction"), request.given("heading", "position")
     restricted = request.avoid is not None
-    found = sample_headings(obj, rng, use_affordance=restricted, lenient=True, along=direction, at=position)
+    own = outline(hand)
+    found = sample_headings(
+        obj,
+        rng,
+        use_affordance=restricted,
+        lenient=True,
+        inward=hand.object_scale * INWARD,
+        max_width=max_width(own, hand.object_scale),
+        along=direction,
+        at=position,
+    )
     if found is None:
         raise CongraspError(
             f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
@@ -31,9 +41,7 @@ def headings(
             else "Leave out --heading and --at, or make the graspable part larger.",
         )
     options, weights = [], []
-    for r, (cleared, room) in enumerate(
-        zip(*within_reach(found, obj.points, obj.rest_poses, outline(hand)), strict=True)
-    ):
+    for r, (cleared, room) in enumerate(zip(*within_reach(found, obj.points, obj.rest_poses, own), strict=True)):
         if request.rest not in (None, r):
             continue
         if request.above:
@@ -59,7 +67,7 @@ def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
     if request.given("heading", "direction") is None:
         return (
             f"'{obj.name}' cannot be approached in any of its resting poses.",
-            "Scale it so that some part is narrower than 12 cm, or leave out --heading above and --at.",
+            "Leave out --heading above and --at, or scale it.",
         )
     down = -matrix(obj.rest_poses[0][3:])[2]
     return (

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
+from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.grasper import Grasp
@@ -29,7 +29,7 @@ from congrasp.services.viz.sheets import save_png
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
 PORTRAIT = "portrait.png"
 """Its last frame, 1280 x 720, with a view from the thumb's side."""
-_FORMAT = 2  # of result.json: what was written with another is done anew
+_FORMAT = 4  # of result.json: what was written with another is done anew
 THUMBNAIL = "thumbnail.png"
 """A picture of its last frame."""
 OBJECT = "object.png"

@@ -12,18 +12,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.attempts import Attempts, Outcome
-from congrasp.actors.initial import RequestedEpisodes
-from congrasp.actors.protocols import ASSESSED, SURVIVAL
+from congrasp.actors.initial import RequestedEpisodes, handover_speed
+from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.parallel import cores
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
+from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional, require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.task.types import Goal, Surface
@@ -79,6 +79,24 @@ class Grasp:
         """Whether this one held the object to the end."""
         return self.motion.metrics["held"] > 0
 
+    @property
+    def sink(self) -> float:
+        """Metres by which the wrist sinks in the hold at most."""
+        height = self.motion.wrist_position[self._from("hold") :, 2]
+        return float(max(height[0] - height.min(), 0.0))
+
+    @property
+    def shove(self) -> float:
+        """Metres by which the object moves at most before it is lifted, or the table removed."""
+        phase = "lift" if "lift" in self.motion.about["phases"] else "hold"
+        moved = self.motion.object_position[: self._from(phase)] - self.motion.object_position[0]
+        return float(np.linalg.norm(moved, axis=-1).max())
+
+    def _from(self, phase: str) -> int:
+        """The first step of a phase."""
+        begin = self.motion.about["phases"][phase]
+        return min(int(np.searchsorted(self.motion.time, begin - 1e-6)), len(self.motion.time) - 1)
+
     def facts(self) -> dict[str, Any]:
         """Result, attempts and errors, for tables and files."""
         return {
@@ -91,6 +109,8 @@ class Grasp:
             "rest": self.rest + 1,
             "phases": self.motion.about.get("phases", {}),
             "constraints": list(self.motion.constraints),
+            "sink_mm": 1e3 * self.sink,
+            "shove_mm": 1e3 * self.shove,
             "links_at_removal": self.motion.metrics["links_at_removal"],
             **{name: value for name, value in self.motion.metrics.items() if name in ASSESSED},
             **{name: self.motion.metrics[name] for name in _errors_of(self.motion.constraints)},
@@ -130,7 +150,15 @@ class Grasper:
         self._compiled = False
         self._approach, self._lift = approach, lift
         hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
-        self._attempts = Attempts(self.hand, self.task, policy, hold=hold, lift=lift, threads=threads or cores())
+        self._attempts = Attempts(
+            self.hand,
+            self.task,
+            policy,
+            hold=hold,
+            lift=lift,
+            threads=threads or cores(),
+            speed=handover_speed(self.task) if approach else 0.0,
+        )
 
     def grasp(
         self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
@@ -244,7 +272,9 @@ class Grasper:
         turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
         first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
         heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(arrays["goal/heading_direction"])
-        return plan_reach(self.hand, obj, rest, heading, first, self._approach, self.task.control_dt)
+        return plan_reach(
+            self.hand, obj, rest, heading, first, self._approach, self.task.control_dt, self._attempts.speed
+        )
 
 
 def grasp(

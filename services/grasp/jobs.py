@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import math
 import pathlib
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -12,12 +11,12 @@ import numpy as np
 from PIL import Image
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
-from congrasp.common.inputs import file_name
-from congrasp.common.objects.procedural import MASS_RANGE
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import file_name
 from congrasp.common.objects.resting import rest_tilts
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.store import Catalogue
+from congrasp.services.assets.objects.materials import with_mass
 from congrasp.services.assets.objects.named import ObjectAt, objects_at
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sizes import size_in_words
@@ -59,12 +58,19 @@ class Result(NamedTuple):
     skipped: bool = False
     """It was finished before."""
 
+    @property
+    def held(self) -> bool:
+        """True if the object is held, and its shape is that of its file."""
+        return bool(self.facts.get("success")) and self.facts["shape_reliable"]
+
     def line(self) -> str:
         """One line."""
         if self.error:
             return self.error
         facts = self.facts
         outcome = "held" if facts["success"] else "not held"
+        if not facts["shape_reliable"]:
+            outcome += ", but its shape is unreliable (see its notes; repair the mesh, or set --time-limit)"
         outcome += ", also against pushes of 1 N" if facts.get("push_survival") else ""
         best = f"best of {facts['attempts']} attempts, {facts['attempts_held']} of which hold it"
         errors = [f"{what} {_shown(facts, stem)}" for stem, what in _ERRORS.items() if f"{stem}_m" in facts]
@@ -139,7 +145,8 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "key": key,
             "file": str(at.path),
             "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
-            "mass": obj.mass,
+            "object_mass": obj.mass,
+            "shape_reliable": obj.shape_reliable,
             "notes": [*obj.notes, *_notes(at, obj, settings.options)],
             "rules": list(found.active),
         }
@@ -171,14 +178,13 @@ def rest_pose(obj: GraspObject, text: str) -> int:
 
 
 def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
-    """What is said of a mesh's mass, beside the notes of its import."""
+    """Where a mesh's mass comes from, where the user has not set it."""
     if not at.source or options.mass is not None:
         return []
-    grams = f"{1000 * obj.mass:.0f} g"
-    bound = next((limit for limit in MASS_RANGE if math.isclose(obj.mass, limit, rel_tol=1e-3)), None)
-    if bound is None:
-        return [f"its mass is {grams} (--density {options.density:g} kg/m³; --mass sets another)"]
-    return [f"its mass is {grams}, a limit for masses from --density {options.density:g} kg/m³; --mass sets another"]
+    basis = f"of {options.material}" if options.material else "by its surface and volume"
+    if options.density is not None:
+        basis = f"by {options.density:g} kg/m³"
+    return [f"its mass is {1000 * obj.mass:.0f} g, {basis} (--material or --mass sets another)"]
 
 
 def _content(at: ObjectAt) -> str:
@@ -190,9 +196,11 @@ def _content(at: ObjectAt) -> str:
 
 
 def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
-    """The object; of an object file the scale is all that the options change."""
+    """The object; of an object file, or one of the generator, the options set scale and mass alone."""
     check_options(options)
-    return at.load(options) if at.source else at.load().scaled(options.scale)
+    if at.source:
+        return at.load(options)
+    return with_mass(at.load().scaled(options.scale), options.mass, options.material)
 
 
 def _identity(text: str) -> str:
@@ -203,7 +211,7 @@ def _identity(text: str) -> str:
 
 def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> None:
     """Writes the results of a hand as JSON, and the last frames of all grasps as one picture."""
-    held = sum(bool(result.facts.get("success")) for result in results)
+    held = sum(result.held for result in results)
     rows = [{"name": r.name, "error": r.error} if r.error else {"name": r.name, **r.facts} for r in results]
     summary = {"hand": hand, "objects": len(rows), "succeeded": held, "results": rows}
     write_atomically(out / SUMMARY, json.dumps(summary, indent=2).encode())
@@ -211,8 +219,15 @@ def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> Non
     if drawn:
         images = [np.asarray(Image.open(out / result.name / THUMBNAIL).convert("RGB")) for result in drawn]
         labels = [
-            f"{name}: {'held' if facts['success'] else 'NOT HELD'}, {facts['attempts_held']} of {facts['attempts']}"
-            for name, facts, *_ in drawn
+            f"{result.name}: {_verdict(result)}, {result.facts['attempts_held']} of {result.facts['attempts']}"
+            for result in drawn
         ]
         title = f"{hand} hand: {held} of {len(rows)} objects held for two seconds without the table"
         save_png(out / SHEET, contact_sheet(images, labels, columns=min(_COLUMNS, len(drawn)), title=title))
+
+
+def _verdict(result: Result) -> str:
+    """The outcome on a picture."""
+    if not result.facts["shape_reliable"]:
+        return "SHAPE UNRELIABLE"
+    return "held" if result.held else "NOT HELD"

@@ -17,17 +17,17 @@ from scipy.spatial.transform import Rotation, Slerp
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.motors import coupled
 from congrasp.common.hands.spec import Hand
-from congrasp.common.inputs import read_json
+from congrasp.common.io.inputs import read_json
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
-from congrasp.common.task import constraint_sets
+from congrasp.common.rotations import continuous
 from congrasp.common.task.constraints import CONSTRAINTS, get_constraint
 from congrasp.common.task.constraints.base import Option
 from congrasp.common.task.constraints.force import least_force
+from congrasp.common.task.sampling import sets as constraint_sets
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.headers import check_header
 from congrasp.services.assets.objects.sizes import size_in_words
-from congrasp.services.export.frames import continuous_quaternions
 from congrasp.services.export.motion_file import GraspMotion, load_motion
 from congrasp.services.grasp.wrist_paths import HUGE, read_csv
 from congrasp.services.record.goals import grasp_span
@@ -364,7 +364,7 @@ def _resampled(position: np.ndarray, quaternion: np.ndarray, waypoints: int, wha
     wanted = np.linspace(0.0, along[-1], waypoints)
     places = np.stack([np.interp(wanted, along, column) for column in position.T], -1)
     turns = Slerp(along, Rotation.from_quat(quaternion, scalar_first=True))(wanted)
-    return {"position": places, "quaternion": continuous_quaternions(turns, scalar_first=True)}
+    return {"position": places, "quaternion": continuous(turns.as_quat(scalar_first=True))}
 
 
 READERS: dict[str, Callable[[Written], dict[str, np.ndarray] | None]] = {

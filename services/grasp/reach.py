@@ -1,7 +1,8 @@
 """The way of the hand from beside the table to where a grasp begins: planned, free of contact, as smooth as an arm.
 
-The wrist follows a quadratic Bezier curve and the shortest turn, both by the minimum-jerk profile
-s = 10 x^3 - 15 x^4 + 6 x^5 (Flash and Hogan 1985), so that it begins and ends at rest.
+The wrist follows a cubic Bezier curve that ends along the heading. Its way s(x), x = t / T, has minimum jerk (Flash and
+Hogan 1985) from rest to the speed at which the policy takes over:
+s = (10 - 4 m) x^3 + (7 m - 15) x^4 + (6 - 3 m) x^5 with m = v T / length. Turn and fingers come to rest (m = 0).
 """
 
 import itertools
@@ -32,6 +33,8 @@ _BESIDE, _ABOVE = 0.34, 0.04  # of the wrist from the object's centre, of the ha
 _RELAXED = 0.15  # share of the way from the open to the closed pose, before it sets out
 _CHECKED, _ALONG = 25, 5  # poses of the curve that are checked, and points on a capsule's axis
 _AZIMUTHS = np.radians([0, 30, -30, 60, -60, 100, -100, 140, -140, 180])
+_FINE = 401  # points of the curve
+_MOST_STRETCH = 50.0  # of the requested time
 _BACK = (0.08, 0.15, 0.22)  # of the curve's middle point from its end, against the heading, m
 _UP = (0.0, 0.10, 0.20, 0.32)  # and upwards, m
 _TOLERANCE = 1e-3  # m
@@ -52,21 +55,45 @@ class _Curve(NamedTuple):
     """A way of the wrist and fingers."""
 
     points: np.ndarray
-    """(3, 3) where it begins, is drawn to, and ends, m."""
+    """(n, 3) along it, m."""
+    length: np.ndarray
+    """(n,) m, from its beginning."""
     turns: Slerp
     fingers: np.ndarray
     """(2, F) rad."""
 
-    def at(self, share: np.ndarray) -> Reach:
-        """Poses at shares (N,) of the way."""
-        a, b, c = self.points
+    def at(self, x: np.ndarray, seconds: float, speed: float) -> Reach:
+        """Poses at shares x (N,) of the time T = `seconds`, with `speed` (m/s) at its end.
+
+        The wrist only goes forward, s'(x) >= 0, which takes m <= 5/2: where T is longer, it sets out later.
+        """
+        way = self.way(x, seconds, speed) * self.length[-1]
+        position = np.stack([np.interp(way, self.length, axis) for axis in self.points.T], -1)
+        share = np.clip(_minimum_jerk(x, 0.0), 0.0, 1.0)
         s = share[:, None]
-        position = (1 - s) ** 2 * a + 2 * s * (1 - s) * b + s**2 * c
         return Reach(position, self.turns(share), (1 - s) * self.fingers[0] + s * self.fingers[1])
+
+    def way(self, x: np.ndarray, seconds: float, speed: float) -> np.ndarray:
+        """Shares (N,) of the way at shares x (N,) of the time, see `at`."""
+        moving = min(seconds, 2.5 * self.length[-1] / speed) if speed else seconds
+        since = np.clip(1.0 - (1.0 - x) * seconds / moving, 0.0, 1.0)
+        return _minimum_jerk(since, speed * moving / self.length[-1])
+
+
+def _minimum_jerk(x: np.ndarray, end: float) -> np.ndarray:
+    """s(x) (N,) from rest at 0 to slope `end` at 1, without acceleration at both."""
+    return (10 - 4 * end) * x**3 + (7 * end - 15) * x**4 + (6 - 3 * end) * x**5
 
 
 def plan_reach(
-    hand: Hand, obj: GraspObject, rest: np.ndarray, heading: np.ndarray, first: Reach, seconds: float, dt: float
+    hand: Hand,
+    obj: GraspObject,
+    rest: np.ndarray,
+    heading: np.ndarray,
+    first: Reach,
+    seconds: float,
+    dt: float,
+    speed: float = 0.0,
 ) -> Reach:
     """The way to where a grasp begins.
 
@@ -78,12 +105,13 @@ def plan_reach(
       first: the one pose in which the grasp begins.
       seconds: how long it takes; longer where the wrist would be faster than `SPEED`, `ACCELERATION` or `TURNING`.
       dt: length of a control step, s.
+      speed: of the wrist at the end, along the heading, m/s.
 
     Raises:
       CongraspError: every way that was tried touches the object or the table.
     """
-    checked = np.linspace(0, 1, _CHECKED)
-    near = np.where(checked > _NEAR_END, 0.0, CLEARANCE)
+    x = np.linspace(0, 1, _CHECKED)
+    checked = _minimum_jerk(x, 0.0)
     field = distance_field([obj])
     relaxed = hand.q_open + _RELAXED * (hand.q_closed - hand.q_open)
     fingers = np.stack([relaxed, first.q[0]])
@@ -91,12 +119,12 @@ def plan_reach(
     end = clearances(hand, field, rest, axes[-1:], first)[:, 0]
     lowest = (_palm_down(hand, np.array([1.0, 0.0, 0.0])).apply(axes[0])[:, 2] - _radii(hand)).min()
     for curve in _curves(hand, rest, heading, first, fingers, _ABOVE - float(lowest)):
-        found = clearances(hand, field, rest, axes, curve.at(checked))
-        needed = np.where(near > 0, CLEARANCE, np.minimum(CLEARANCE, end[:, None])) - _TOLERANCE
+        steps = math.ceil(_duration(curve, seconds, speed) / dt)
+        found = clearances(hand, field, rest, axes, curve.at(x, steps * dt, speed))
+        far = curve.way(x, steps * dt, speed) <= _NEAR_END
+        needed = np.where(far, CLEARANCE, np.minimum(CLEARANCE, end[:, None])) - _TOLERANCE
         if (found >= needed).all():
-            steps = math.ceil(max(seconds, _shortest(curve)) / dt)
-            x = np.arange(steps) / steps
-            return curve.at(10 * x**3 - 15 * x**4 + 6 * x**5)
+            return curve.at(np.arange(steps) / steps, steps * dt, speed)
     raise CongraspError(
         f"From beside the table no way leads to a grasp of '{obj.name}' without touching it or the table.",
         "Leave out --approach, or set another --heading.",
@@ -116,7 +144,11 @@ def _curves(
         middle = end - back * heading + [0.0, 0.0, up]
         middle[2] = max(middle[2], 0.06)
         turns = Rotation.concatenate([_palm_down(hand, -out), first.rotation[0]])
-        yield _Curve(np.stack([begin, middle, end]), Slerp([0, 1], turns), fingers)
+        s = np.linspace(0, 1, _FINE)[:, None]
+        last = end - back / 3 * heading
+        points = (1 - s) ** 3 * begin + 3 * s * (1 - s) ** 2 * middle + 3 * s**2 * (1 - s) * last + s**3 * end
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        yield _Curve(points, length, Slerp([0, 1], turns), fingers)
 
 
 def _palm_down(hand: Hand, forward: np.ndarray) -> Rotation:
@@ -169,15 +201,18 @@ def _at(field: DistanceField, points: np.ndarray) -> jax.Array:
     return field.at(jnp.zeros(1, int), points[None])[0]
 
 
-def _shortest(curve: _Curve) -> float:
-    """Seconds that the way takes at least, so that the wrist keeps to its limits."""
-    x = np.linspace(0, 1, 201)
-    poses, h = curve.at(10 * x**3 - 15 * x**4 + 6 * x**5), x[1]
-    velocity = np.diff(poses.position, axis=0) / h
-    speed = float(np.linalg.norm(velocity, axis=1).max())
-    acceleration = float(np.linalg.norm(np.diff(velocity, axis=0) / h, axis=1).max())
-    turning = float((poses.rotation[:-1].inv() * poses.rotation[1:]).magnitude().max() / h)
-    return max(speed / SPEED, math.sqrt(acceleration / ACCELERATION), turning / TURNING)
+def _duration(curve: _Curve, seconds: float, speed: float) -> float:
+    """Seconds of the way: as requested, or as many more as it takes the wrist to keep to its limits."""
+    x = np.linspace(0, 1, _FINE)
+    for found in seconds * np.geomspace(1.0, _MOST_STRETCH, 100):
+        poses, h = curve.at(x, found, speed), found * x[1]
+        velocity = np.diff(poses.position, axis=0) / h
+        fastest = np.linalg.norm(velocity, axis=1).max() / SPEED
+        hardest = np.linalg.norm(np.diff(velocity, axis=0) / h, axis=1).max() / ACCELERATION
+        turning = (poses.rotation[:-1].inv() * poses.rotation[1:]).magnitude().max() / h / TURNING
+        if max(fastest, hardest, turning) <= 1.0:
+            break
+    return float(found)
 
 
 def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:

@@ -15,8 +15,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.journal import AUDIT, JournalLines, has_fields, read_journal
-from congrasp.learner.audit import Used, read_uses, replay
+from congrasp.common.io.journal import AUDIT, JournalLines, has_fields, read_journal
+from congrasp.learner.hub.used_rollouts import Used, read_uses, replay
 
 Identity = tuple[str, str, int]
 """Actor, incarnation and sequence number."""

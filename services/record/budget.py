@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 
 from congrasp.common.errors import CongraspError
-from congrasp.learner.rate_limit import certificate
+from congrasp.learner.hub.rate_limit import certificate
 
 Name = tuple[str, str]
 """Role and name of who publishes."""

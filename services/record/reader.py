@@ -10,7 +10,7 @@ import numpy as np
 from mcap.writer import MCAP0_MAGIC
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.inputs import open_file, parse_json
+from congrasp.common.io.inputs import open_file, parse_json
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.record.channels import ROLLOUT_SCHEMA, flatten
 from congrasp.services.record.salvage import Dropped, read_messages

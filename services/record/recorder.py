@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.inputs import file_name
+from congrasp.common.io.inputs import file_name
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message

@@ -7,10 +7,10 @@ import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from congrasp.common.engines import PhysicsName
 from congrasp.common.errors import CongraspError
-from congrasp.common.inputs import read_json
+from congrasp.common.io.inputs import read_json
 from congrasp.common.policy.bundle import content_hash
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.wire.codec import encode
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.evaluate.failures import failure_sheets

@@ -7,8 +7,8 @@ import pathlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from congrasp.common.files import write_atomically
-from congrasp.common.inputs import read_file
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_file
 from congrasp.services.evaluate.cells import PLAUSIBILITY, RATES, plausibility_cells, rate_cells
 from congrasp.services.evaluate.report import Picture, embedded, template
 from congrasp.services.evaluate.scores import Row

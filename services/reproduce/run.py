@@ -10,9 +10,9 @@ from typing import NamedTuple
 import jax
 
 from congrasp.actors.physics import resolve_physics
-from congrasp.common.engines import engine_title
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy.pretrained import pretrained_file
+from congrasp.common.runtime.engines import engine_title
 from congrasp.common.task.methods import get_method
 from congrasp.services.evaluate.lineup import Entrant, read_entrant
 from congrasp.services.evaluate.report import curves_of

@@ -16,9 +16,9 @@ import psutil
 from congrasp.common.errors import CongraspError, OverloadedError, TransportError
 from congrasp.common.request import GraspRequest
 from congrasp.common.transport.ports import local_url
+from congrasp.services.client.policy import Policy
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
-from congrasp.services.serve.client import PolicyClient
-from congrasp.services.serve.policy import Policy
 
 
 @contextlib.contextmanager
@@ -91,11 +91,11 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     import jax
 
     from congrasp.actors import initial
-    from congrasp.actors.bank import build_bank
     from congrasp.common.config import TaskConfig
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
     from congrasp.common.objects.pool import scale_objects
+    from congrasp.common.task.sampling.build import build_bank
 
     task = TaskConfig(hand=hand, constraints=("heading",))
     found = get_hand(hand)

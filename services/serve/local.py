@@ -9,9 +9,9 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.wire.codec import Message
-from congrasp.services.serve.episode import EpisodePolicy
+from congrasp.services.client.episode import EpisodePolicy
+from congrasp.services.client.policy import Policy
 from congrasp.services.serve.inference import BATCH_SIZES, PolicyFunction
-from congrasp.services.serve.policy import Policy
 
 
 class LocalPolicy(EpisodePolicy):

@@ -14,14 +14,14 @@ import numpy as np
 from rich.console import Console
 
 from congrasp.common.config import MetricWriter, ObjectsConfig, RunConfig
-from congrasp.common.engines import ENGINES, PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
-from congrasp.common.parallel import cores
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, policy_spec
 from congrasp.common.policy.pretrained import pretrained_file
-from congrasp.common.stages import imported, since_start, stages
+from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.stages import imported, since_start, stages
 from congrasp.common.transport import urls
 from congrasp.common.transport.ports import LEARNER_URL
 from congrasp.common.transport.security import CERTIFICATE_FILE, check_exposure
@@ -36,11 +36,11 @@ from congrasp.learner.run_directory import (
     create_run,
     has_checkpoints,
 )
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.evaluate.showcase import showcase
 from congrasp.services.ops.shutdown import on_signal
-from congrasp.services.serve.client import PolicyClient
 from congrasp.services.serve.load import example_episode, one_answer, serving, wait_until_ready
 from congrasp.services.train.learn import learn
 from congrasp.services.train.presets import FULL, easier

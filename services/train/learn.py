@@ -7,15 +7,15 @@ import pathlib
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
-from congrasp.actors.process import run_actor
+from congrasp.actors.process.actor import run_actor
 from congrasp.common.config import MetricWriter, RunConfig
-from congrasp.common.engines import PhysicsName
-from congrasp.common.parallel import cores, prepare_workers
+from congrasp.common.runtime.engines import PhysicsName
+from congrasp.common.runtime.parallel import cores, prepare_workers
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.pair import PairTransport
+from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
 from congrasp.learner.process import run_learner
-from congrasp.learner.ranks import ROUND_SECONDS, Ranks
 from congrasp.services.ops.metrics import LearnerMetrics, exposed
 from congrasp.services.ops.shutdown import GRACE
 from congrasp.services.ops.status import ask

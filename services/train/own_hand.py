@@ -9,14 +9,14 @@ import pathlib
 import time
 from collections.abc import Callable, Sequence
 
-from congrasp.common.engines import PhysicsName
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
 from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.spec import Hand
-from congrasp.common.inputs import read_json
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_json
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import own_policy_file, pretrained_hands
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE
 from congrasp.services.assets.hands.check import Finding, read_findings
 from congrasp.services.train.presets import FULL, get_preset

@@ -15,10 +15,10 @@ import jax
 
 from congrasp.actors.physics import resolve_physics
 from congrasp.common.config import MetricWriter, RunConfig
-from congrasp.common.engines import PhysicsName
 from congrasp.common.errors import CongraspError, TransportError
-from congrasp.common.journal import AUDIT
-from congrasp.common.parallel import cores
+from congrasp.common.io.journal import AUDIT
+from congrasp.common.runtime.engines import PhysicsName
+from congrasp.common.runtime.parallel import cores
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
-from congrasp.common.inputs import read_json
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_json
 from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE, has_checkpoints
 from congrasp.services.train.processes import Child, end_all
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 
 from congrasp.common.config import RunConfig
-from congrasp.common.engines import PhysicsName
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.learner.run_directory import create_run
 from congrasp.services.train.learn import learn
 from congrasp.services.train.processes import engine_of

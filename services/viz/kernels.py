@@ -6,7 +6,7 @@ import os
 import numba
 import numpy as np
 
-from congrasp.common.files import cache_folder
+from congrasp.common.io.files import cache_folder
 
 GAMMA = 2.2
 """sRGB is about linear light to the power of one over this."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
+from congrasp.common.io.files import write_atomically
 from congrasp.services.record.palette import INK
 from congrasp.services.record.reader import read_metrics
 from congrasp.services.viz.titles import titled

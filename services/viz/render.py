@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
-from congrasp.common.parallel import cores
+from congrasp.common.runtime.parallel import cores
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.goals import active_blocks, grasp_span, phases_of
 from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
+from congrasp.common.io.files import write_atomically
 from congrasp.services.record.palette import INK
 
 _QUIET, _PAPER = (96, 103, 116), (251, 251, 252)

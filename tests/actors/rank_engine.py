@@ -11,7 +11,7 @@ from congrasp.actors.physics.warp import WarpPhysics
 from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
-from congrasp.learner.ranks import Ranks
+from congrasp.learner.distributed.ranks import Ranks
 
 
 def main() -> None:

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.bank import POSES, build_bank, make_references
 from congrasp.actors.harvest import Grasps, renew
 from congrasp.actors.physics.engine import where_environments
 from congrasp.common import rotations
@@ -16,6 +15,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.common.objects import procedural
+from congrasp.common.task.sampling.build import POSES, build_bank, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
 
 HAND = get_hand("human")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from congrasp.actors.failure_weights import FailureWeights
+from congrasp.actors.process.failure_weights import FailureWeights
 
 
 def test_weights_by_hand():

@@ -13,7 +13,6 @@ import pytest
 from congrasp.actors.initial import initial_hand, sample
 from congrasp.common.config import TaskConfig
 from congrasp.common.hands.kinematics import hand_center, keypoints, link_transforms
-from congrasp.common.task.bank import ConstraintBank
 from congrasp.common.task.constraints import optional
 from congrasp.common.task.constraints.heading import heading_wrist_pose
 from congrasp.common.task.constraints.priority import resolve
@@ -22,6 +21,7 @@ from congrasp.common.task.features import scene_of
 from congrasp.common.task.geometry import in_world
 from congrasp.common.task.metrics import errors
 from congrasp.common.task.reward import reward_terms
+from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.types import Goal, Surface
 from tests.scenes import HAND, F, K, quaternions, scene, units
 

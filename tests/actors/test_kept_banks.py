@@ -6,12 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.actors import kept_banks
-from congrasp.actors.kept_banks import kept_bank
 from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
-from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.sampling import kept as kept_banks
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.kept import kept_bank
 
 HAND = get_hand("human")
 TASK = TaskConfig()

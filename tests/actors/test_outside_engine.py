@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.physics import ENGINES, Engine, make_physics, resolve_physics
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker
@@ -16,6 +15,7 @@ from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig, run_con
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.train.command import untrained
 

@@ -9,7 +9,6 @@ import numpy as np
 import psutil
 import pytest
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics import resolve_physics
 from congrasp.actors.physics.engine import ResetState
@@ -22,6 +21,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.sampling.build import build_bank
 from tests import draws
 
 HAND = get_hand("human")

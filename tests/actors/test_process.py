@@ -9,8 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.actors import process
 from congrasp.actors.env import episode_fields
+from congrasp.actors.process.actor import actor as process
 from congrasp.actors.rollout import Rollout, Trace
 from congrasp.actors.training_set import TrainingSet
 from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig, to_json
@@ -30,8 +30,8 @@ from congrasp.common.wire.messages import EPISODE, validate
 from congrasp.common.wire.schema import PRIVILEGED, RECORDED
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.batch import rollout_form
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
 
 T, B = 5, 3
 CONFIG = RunConfig(

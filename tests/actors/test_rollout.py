@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.env import GraspEnv, episode_fields, metric_names
 from congrasp.actors.physics.engine import PhysicsState, where_environments
 from congrasp.actors.physics.native import NativePhysics
@@ -17,7 +16,9 @@ from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
 from congrasp.common.objects import procedural
+from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.observation import layout
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.types import CONTACTS_PER_LINK, Action
 from tests import draws
 
@@ -37,7 +38,8 @@ def bank():
 @pytest.fixture(scope="module")
 def drawn(bank):
     """So many episodes that shares of them can be counted."""
-    return draws.sample(HAND, TASK, bank, jax.random.key(0), DRAWN)
+    task = dataclasses.replace(TASK, constraints=PAPER)
+    return draws.sample(HAND, task, bank, jax.random.key(0), DRAWN)
 
 
 def _noise(parameters, observation, key):
@@ -69,7 +71,7 @@ def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(d
         goal["trajectory"].position[:, 0],
         goal["trajectory"].quaternion[:, 0],
     )
-    np.testing.assert_allclose(np.asarray(start.base_position)[trajectory], np.asarray(first[0])[trajectory], atol=1e-5)
+    _raised_at_most(np.asarray(start.base_position - first[0])[trajectory])
     # Otherwise v points along v-bar, and the hand centre lies 15 cm before p-bar.
     direction = np.asarray(rotations.rotate(start.object_quaternion, goal["heading"].direction))
     v = np.asarray(rotations.rotate(start.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, (DRAWN, 3))))
@@ -77,10 +79,16 @@ def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(d
     center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, start.q)))
     center = np.asarray(rotations.rotate(start.base_quaternion, center) + start.base_position)
     target = np.asarray(rotations.rotate(start.object_quaternion, goal["heading"].position) + start.object_position)
-    np.testing.assert_allclose((center + TASK.back_off * direction)[~trajectory], target[~trajectory], atol=1e-4)
+    _raised_at_most((center + TASK.back_off * direction - target)[~trajectory])
     pose = np.asarray(goal.active["pose_finger"])
     np.testing.assert_allclose(np.asarray(start.q)[pose], np.asarray(goal["pose"].q)[pose], atol=1e-6)
     np.testing.assert_allclose(np.asarray(start.q)[~pose], np.tile(HAND.q_open, (DRAWN - pose.sum(), 1)), atol=1e-6)
+
+
+def _raised_at_most(difference: np.ndarray) -> None:
+    """Differences (E, 3) are zero, but for a few starts that are raised out of the table."""
+    np.testing.assert_allclose(difference[:, :2], 0.0, atol=1e-4)
+    assert difference[:, 2].min() > -1e-4 and (difference[:, 2] < 1e-4).mean() > 0.9
 
 
 def test_rollouts_go_through_whole_episodes_and_on(bank):

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker
 from congrasp.common.config import SensingConfig, TaskConfig
@@ -15,6 +14,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import observation, privileged
+from congrasp.common.task.sampling.build import build_bank
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(0, "cylinder")]

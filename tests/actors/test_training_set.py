@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from congrasp.actors import harvest
-from congrasp.actors.bank import headings_of
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.training_set import training_set
 from congrasp.common.config import ObjectsConfig, RunConfig, Split, TaskConfig
@@ -16,9 +15,10 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
-from congrasp.common.task.bank import rows_of, stacked
-from congrasp.common.task.constraint_sets import load_for
-from congrasp.services.grasp.constraint_sets import make_sets, save
+from congrasp.common.task.sampling.bank import rows_of, stacked
+from congrasp.common.task.sampling.build import headings_of
+from congrasp.common.task.sampling.sets import load_for
+from congrasp.common.task.sampling.write_sets import make_sets, save
 from tests import draws
 
 HAND = get_hand("human")

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.initial import InitialConditions, sample
 from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.errors import CongraspError
@@ -34,6 +33,7 @@ from congrasp.common.task.constraints.priority import active_blocks
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import GRASP, reward_terms, terms
+from congrasp.common.task.sampling.build import build_bank
 from tests.scenes import HAND, active, moved, scene
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
@@ -257,9 +257,10 @@ def _same(some: InitialConditions, more: InitialConditions, but: str, moved: np.
     if moved is not None:
         position = np.where(moved[:, None], some.goal["heading"].position, more.goal["heading"].position)
         base = np.where(moved[:, None], some.reset_state.base_position, more.reset_state.base_position)
+        q = np.where(moved[:, None], some.reset_state.q, more.reset_state.q)  # opened to the width at the heading
         more = more._replace(
             goal=more.goal.replace("heading", position=position),
-            reset_state=more.reset_state._replace(base_position=base),
+            reset_state=more.reset_state._replace(base_position=base, q=q),
         )
     goals = [dict(part.goal.flat().items()) for part in (some, more)]
     actives = [part.goal.active for part in (some, more)]

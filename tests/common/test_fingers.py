@@ -15,13 +15,13 @@ from congrasp.common.hands import get_hand, kinematics
 from congrasp.common.policy.bundle import load
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.task import metrics
-from congrasp.common.task.bank import Draw
 from congrasp.common.task.constraints import PAPER, get_constraint
 from congrasp.common.task.constraints.fingers import FingersGoal, finger_sets, keypoint_weights
 from congrasp.common.task.features import features, scene_of
 from congrasp.common.task.geometry import hand_center
 from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import reward_terms, terms
+from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.types import Goal, Surface
 from tests.scenes import HAND, L, active, scene
 
@@ -182,7 +182,7 @@ def test_a_pinch_begins_and_ends_at_the_heading(seed):
     """The wrist is placed by the set's centre, so that a hand that only moves forward arrives with no error."""
     goal = dataclasses.replace(scene(seed)[2], active=active("fingers"))
     q = np.tile(HAND.q_open, (4, 1))
-    position, quaternion = HEADING.initial_wrist(HAND, TASK, goal, q)[1:]
+    position, quaternion = HEADING.initial_wrist(HAND, np.full(4, TASK.back_off), goal, q)[1:]
     position = position + TASK.back_off * goal["heading"].direction
     points = kinematics.keypoints(HAND, kinematics.link_transforms(HAND, q))
     center = hand_center(HAND, points, goal["fingers"].allowed)

@@ -12,12 +12,12 @@ from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.task import metrics
-from congrasp.common.task.bank import Draw
 from congrasp.common.task.constraints import PAPER, get_constraint
 from congrasp.common.task.constraints.force import ForceGoal, least_force
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.observation import fields
 from congrasp.common.task.reward import reward_terms, terms
+from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.types import Surface
 from congrasp.services.grasp.parse import read_request
 from tests.scenes import HAND, L, active, scene

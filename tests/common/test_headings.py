@@ -8,19 +8,22 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from congrasp.common.errors import TooWideError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import CLOSURES
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.common.hands.outline import CENTER, Outline, depth_below, outline
-from congrasp.common.objects.procedural import FAMILIES, generate
+from congrasp.common.objects.procedural import FAMILIES, GROUPS, generate, generate_many
 from congrasp.common.task.sampling.headings import (
     INWARD,
     MAX_WIDTH,
     Headings,
     above,
     clear_table,
+    closes_on,
     feasible,
     local_width,
+    max_width,
     sample_headings,
     within_reach,
 )
@@ -122,16 +125,18 @@ def test_the_first_surface_that_the_hand_meets_is_the_headings():
         assert not ((aside < 0.0099) & (depth < -INWARD - 0.0151) & (depth > -0.169)).any()
 
 
-def test_few_headings_are_repeated_and_none_falls_back_to_the_narrowest():
+def test_few_headings_are_repeated():
     obj = generate(0, "ball")
-    fallback = sample_headings(obj, np.random.default_rng(0), use_affordance=False, max_width=1e-3, attempts=1)
-    assert fallback.position.shape == (256, 3)
-    assert len(np.unique(fallback.position, axis=0)) == 20
-    np.testing.assert_allclose((fallback.direction * fallback.cross).sum(-1), 0, atol=1e-5)
-    tight = sample_headings(obj, np.random.default_rng(0), use_affordance=False, max_width=0.055, attempts=1)
+    tight = sample_headings(obj, np.random.default_rng(0), use_affordance=False, max_width=0.073, attempts=1)
+    assert tight.position.shape == (256, 3)
     different = len(np.unique(tight.position, axis=0))
     assert 0 < different < 256
-    np.testing.assert_array_equal(tight.position[different : 2 * different][:10], tight.position[:10])
+    np.testing.assert_array_equal(tight.position[different : 2 * different], tight.position[:different])
+
+
+def test_what_is_wider_than_the_hand_opens_has_no_heading():
+    with pytest.raises(TooWideError, match=r"^'ball_0' is too wide: 7\.\d cm .* which opens to 5\.0 cm"):
+        sample_headings(generate(0, "ball"), np.random.default_rng(0), use_affordance=False, max_width=0.05)
 
 
 def test_the_smaller_part_of_a_ball_cannot_be_held_alone():
@@ -304,3 +309,57 @@ def test_a_card_is_approached_as_well_as_it_goes():
     (cleared,), (reachable,) = within_reach(card, np.zeros((1, 3)), FLAT[None], tall)
     np.testing.assert_array_equal(reachable, [True, False])
     np.testing.assert_allclose(cleared.position[0], [0, 0, -0.04], atol=2e-6)
+
+
+def bar_headings(*depths):
+    """Headings along x, at depths in a bar (x from 0 to 8 cm, 3 cm wide) whose first 4 cm are graspable."""
+    x, y = np.meshgrid(np.linspace(0, 0.08, 33), [-0.015, 0.015])
+    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1)
+    count = len(depths)
+    position = np.stack([np.array(depths), np.zeros(count), np.zeros(count)], -1)
+    axes = (np.tile(axis, (count, 1)) for axis in (LEVEL, [0.0, 1.0, 0.0]))
+    return Headings(position, *axes), points, points[:, 0] > 0.04
+
+
+def test_fingers_close_on_the_region_where_they_end():
+    """By hand: they reach 1 cm beyond the position, and keep 1 cm off the avoid region, which begins at 4.25 cm."""
+    assert closes_on(*bar_headings(0.02, 0.01)).all()
+    # Behind the bar's end nothing is between them; further in they meet the avoid region at the same width.
+    assert not closes_on(*bar_headings(-0.015, 0.03, 0.05)).any()
+    headings, points, avoid = bar_headings(0.03)
+    points[avoid, 1] *= 0.6  # the avoid region is thinner: the graspable one is met first
+    assert closes_on(headings, points, avoid).all()
+
+
+def covered(obj, hand):
+    """Headings (H) cleared in each resting pose, and (R, H) bool whether they are allowed, on the graspable region."""
+    widest = max_width(hand, 1.0)
+    found = sample_headings(obj, np.random.default_rng(0), use_affordance=True, max_width=widest)
+    if found is None:
+        return [], np.zeros((len(obj.rest_poses), 0), bool)
+    return within_reach(found, obj.points, obj.rest_poses, hand, obj.non_graspable_points)
+
+
+@pytest.mark.parametrize("families", ["all", "scans"])
+def test_every_region_has_a_heading_that_can_be_held_or_is_uncovered(families):
+    """Over a pool: what is allowed obeys the rules at the place to which the table moved it."""
+    hand, uncovered = outline(get_hand("human")), 0
+    objects = generate_many(66 if families == "all" else 12, 1_000_000, (families,))
+    assert {obj.family for obj in objects} == set(GROUPS[families])
+    for obj in objects:
+        points, avoid = obj.points[:256].astype(float), obj.non_graspable_points[:256]
+        for moved, allowed, rest in zip(*covered(obj, hand), obj.rest_poses, strict=False):
+            assert not allowed.any() or local_width(moved, obj.points)[allowed].max() <= max_width(hand, 1.0)
+            assert feasible(moved, rest, hand, local_width(moved, obj.points))[allowed].all()
+            for position, direction, cross in zip(*(part[allowed][:8].astype(float) for part in moved), strict=True):
+                away = np.linalg.norm(points - position, axis=-1)
+                assert away[~avoid].min() < away[avoid].min()
+                offset = points - position
+                slab = np.abs(offset @ np.cross(direction, cross)) < 0.03
+                held = offset[slab & ~avoid & (offset @ direction < 0.01)] @ cross
+                other = offset[slab & avoid & (offset @ direction < 0.02)] @ cross
+                assert len(held) >= 2
+                if len(other):
+                    assert held.min() + 0.005 <= other.min() + 1e-6 and other.max() - 1e-6 <= held.max() - 0.005
+        uncovered += not covered(obj, hand)[1].any()
+    assert uncovered <= 0.1 * len(objects)

@@ -76,7 +76,8 @@ def test_without_learning_actions_count_for_nothing_and_fingers_close_after_half
     act = jax.jit(lambda action, *step: decode(scene_of(HAND, task, *step), task.control, action))
     rng = np.random.default_rng(0)
     closing = np.clip(np.array(HAND.q_closed) - HAND.q_open, -0.05, 0.05)
-    for time, moved in ((24.0, 0.0 * closing), (25.0, closing)):
+    half = task.approach_steps // 2
+    for time, moved in ((half - 1.0, 0.0 * closing), (half, closing)):
         step = state._replace(time=np.full(4, time, np.float32)), surface, goal
         still = act(np.zeros((4, F + 6), np.float32), *step)
         np.testing.assert_allclose(still.q_target - state.q_target, np.tile(moved, (4, 1)), atol=1e-6)

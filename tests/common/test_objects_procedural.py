@@ -17,7 +17,6 @@ from congrasp.common.objects.procedural import (
     BASIC_FAMILIES,
     FAMILIES,
     HOUSEHOLD_FAMILIES,
-    HOUSEHOLD_MASS_RANGE,
     MASS_RANGE,
     PRIMITIVE_FAMILIES,
     family_turns,
@@ -95,8 +94,7 @@ def test_parts_and_slots_are_usable(obj):
 @settings(max_examples=60, deadline=None)
 @given(objects)
 def test_mass_and_inertia_are_those_of_a_body(obj):
-    least, most = MASS_RANGE if obj.family in BASIC_FAMILIES else HOUSEHOLD_MASS_RANGE
-    assert least <= obj.mass <= most
+    assert MASS_RANGE[0] <= obj.mass <= MASS_RANGE[1]
     np.testing.assert_allclose(obj.inertia, obj.inertia.T, rtol=1e-9, atol=1e-15)
     a, b, c = np.linalg.eigvalsh(obj.inertia)
     assert a > 0

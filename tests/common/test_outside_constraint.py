@@ -73,12 +73,12 @@ def test_nothing_else_must_be_changed():
 
 def episodes(task):
     """Metrics of short episodes with it; it is sampled, observed, rewarded and measured in them."""
-    from congrasp.actors.bank import build_bank
     from congrasp.actors.physics.native import NativePhysics
     from congrasp.actors.rollout import RolloutWorker, finished_episodes
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
     from congrasp.common.task.observation import layout
+    from congrasp.common.task.sampling.build import build_bank
 
     hand, batch = get_hand("human"), 32
     objects = [procedural.generate(0, "box")]
@@ -118,20 +118,21 @@ def episodes(task):
 
 def tables(task, values):
     """Its row of an evaluation, from those episodes that had it alone, as if they had all held the object."""
-    from congrasp.services.evaluate import scores
+    from congrasp.services.evaluate import cells, scores
 
     assert scores.TABLES["single"][-1] == "level" and scores.ERRORS["level"] == {"level_m": "level_m"}
     others = ("trajectory", "pose_finger", "affordance")
     alone = (values["mask_level"] > 0) & ~np.any([values[f"mask_{name}"] for name in others], 0)
     assert alone.any()
-    some = {name: column[alone] for name, column in {**values, "success": np.ones(len(alone))}.items()}
+    plan = {"identity": np.arange(len(alone)), "mass_kg": np.full(len(alone), 0.2)}
+    some = {name: column[alone] for name, column in {**values, **plan, "success": np.ones(len(alone))}.items()}
     nothing = np.zeros((0, 1, 1))
     row = scores.summarise(
         "level", "human", scores.Sample(some, nothing, nothing), held_2s=False, objects=list("abcdefgh")
     )
     np.testing.assert_allclose(row.errors["level_m"], some["level_m"].mean())
     assert row.to_json()["level_m"] == row.errors["level_m"] and row.errors["heading_m"] is None
-    assert any("level" in cell for cell in scores.rate_cells(row))
+    assert any("level" in cell for cell in cells.rate_cells(row))
 
 
 def server(task):

@@ -9,11 +9,11 @@ import time
 import psutil
 import pytest
 
-from congrasp.common import parallel
+from congrasp.common.runtime import parallel
 
 _SCRIPT = """
 import time
-from congrasp.common.parallel import parallel_map
+from congrasp.common.runtime.parallel import parallel_map
 if __name__ == "__main__":
     parallel_map(time.sleep, [60.0] * 200)
 """

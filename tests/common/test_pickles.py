@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.pickles import parse_pickle, read_pickle
+from congrasp.common.io.pickles import parse_pickle, read_pickle
 from tests.limits import limited
 from tests.mano_file import Reduced, content, dumps, mano_pickle, selection
 

@@ -2,7 +2,7 @@ import time
 
 import pytest
 
-from congrasp.common import stages
+from congrasp.common.runtime import stages
 
 
 @pytest.fixture(autouse=True)

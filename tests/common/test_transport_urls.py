@@ -12,7 +12,7 @@ import time
 import pytest
 
 import tests.socket_transport  # noqa: F401  adds its scheme
-from congrasp.actors.link import ActorLink
+from congrasp.actors.process.link import ActorLink
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import FLOWS, Keys, flow
@@ -20,8 +20,8 @@ from congrasp.common.transport.ports import free_port, local_url, rank_url, reac
 from congrasp.common.transport.security import RIGHTS, Credentials
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.ops.certificates import create_authority, issue
 from tests.cluster import ROOT, A, B, D, T, bundle, rollout
 

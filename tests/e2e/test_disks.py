@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.journal import AUDIT, Journal, read_journal
+from congrasp.common.io.journal import AUDIT, Journal, read_journal
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message

@@ -9,9 +9,9 @@ import time
 
 import pytest
 
-from congrasp.common.journal import AUDIT, read_journal
+from congrasp.common.io.journal import AUDIT, read_journal
 from congrasp.common.wire.codec import Message
-from congrasp.learner.write_ahead import FOLDER
+from congrasp.learner.hub.write_ahead import FOLDER
 from congrasp.services.bench.second_reading import read_again
 from congrasp.services.ops.audit import audit
 from tests.cluster import KEYS, Proxy, T, rollout

@@ -23,10 +23,10 @@ from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig, run_con
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text, read_hand
-from congrasp.common.journal import Journal, read_journal
+from congrasp.common.io.journal import Journal, read_journal
+from congrasp.common.io.pickles import read_pickle
 from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
-from congrasp.common.pickles import read_pickle
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.bundle import PolicyBundle
@@ -35,9 +35,9 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.admission import Admission, Ranges
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.hub.admission import Admission, Ranges
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.assets.objects.sources import read_mesh
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.grasp.wrist_paths import read_bvh, read_wrist_path

@@ -11,15 +11,15 @@ import numpy as np
 import psutil
 import pytest
 
-from congrasp.actors.link import ActorLink
+from congrasp.actors.process.link import ActorLink
 from congrasp.common.errors import TransportError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.ports import local_url, shifted
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.bench.attacks import attacked, throttled
 from tests.cluster import A, B, D, T, bundle, rollout
 

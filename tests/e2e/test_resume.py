@@ -17,7 +17,7 @@ from congrasp.common.errors import TransportError
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message, decode
-from congrasp.learner.audit import journal_path, replay
+from congrasp.learner.hub.used_rollouts import journal_path, replay
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run, open_run
 from tests.learner.test_process import CONFIG

@@ -15,7 +15,7 @@ import pytest
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from congrasp.actors.link import ActorLink
+from congrasp.actors.process.link import ActorLink
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.certificates import read
 from congrasp.common.transport.keys import Keys, below
@@ -24,10 +24,10 @@ from congrasp.common.transport.security import RIGHTS, Credentials
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.certificates import create_authority, issue, revoke
-from congrasp.services.serve.client import PolicyClient
 from tests.cluster import A, B, D, T, bundle, rollout
 
 pytestmark = pytest.mark.timeout(60)
@@ -433,7 +433,7 @@ def test_who_is_revoked_is_out_and_the_others_stay(run):
 
 ACTOR = """
 import sys
-from congrasp.actors.link import ActorLink
+from congrasp.actors.process.link import ActorLink
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
 

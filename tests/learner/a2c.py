@@ -15,7 +15,7 @@ from congrasp.common.wire.schema import RECORDED
 from congrasp.learner.algorithms import gae
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
 from congrasp.learner.batch import partition_specs
-from congrasp.learner.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 SCHEMA = {name: spec for name, spec in RECORDED.items() if name != "log_probability"}
 OPTIMIZER = optax.adam(0.01)

@@ -13,8 +13,8 @@ from congrasp.common.config import NetworkConfig, PPOConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import encode
+from congrasp.learner.distributed.ranks import Ranks, end_process
 from congrasp.learner.process import run_learner
-from congrasp.learner.ranks import Ranks, end_process
 from tests.learner.made_up_actor import MadeUpActor
 
 CONFIG = RunConfig(

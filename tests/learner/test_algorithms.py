@@ -10,16 +10,16 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.actors.link import ActorLink, RunFinished
+from congrasp.actors.process.link import ActorLink, RunFinished
 from congrasp.common.config import PPOConfig, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
-from congrasp.learner.admission import Ranges
 from congrasp.learner.algorithms import ALGORITHMS, make_algorithm
 from congrasp.learner.batch import collate, partition_specs
+from congrasp.learner.hub.admission import Ranges
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run
 from congrasp.services.bench import toy
@@ -113,7 +113,7 @@ import jax, numpy as np
 from jax.sharding import Mesh
 from congrasp.common.config import RunConfig
 from congrasp.learner.batch import collate
-from congrasp.learner.collectives import AXIS
+from congrasp.learner.distributed.collectives import AXIS
 from congrasp.services.bench import toy
 from tests.learner.a2c import A2C, SCHEMA
 from tests.learner.test_ppo import rollout

@@ -14,7 +14,7 @@ import jax, numpy as np
 from jax.sharding import Mesh
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate
-from congrasp.learner.collectives import AXIS, shard
+from congrasp.learner.distributed.collectives import AXIS, shard
 from congrasp.services.bench import toy
 from tests.learner.test_ppo import fresh, rollout
 

@@ -140,7 +140,7 @@ def test_the_command_line_s_teacher_is_the_whole_task(teacher, monkeypatch):
 TWO_DEVICES = """
 import sys, jax, numpy as np
 from jax.sharding import Mesh
-from congrasp.learner.collectives import AXIS
+from congrasp.learner.distributed.collectives import AXIS
 from tests.learner.test_distill import algorithm, batch, run_of
 
 mesh = Mesh(np.array(jax.devices()), (AXIS,))

@@ -15,14 +15,14 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner import hub
-from congrasp.learner.admission import Admission, Ranges
 from congrasp.learner.batch import collate
-from congrasp.learner.deduplication import Sequences
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.rate_limit import RateLimit
-from congrasp.learner.staleness import StalenessManager
-from congrasp.learner.write_ahead import PART, WriteAheadLog
+from congrasp.learner.hub import hub
+from congrasp.learner.hub.admission import Admission, Ranges
+from congrasp.learner.hub.deduplication import Sequences
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.rate_limit import RateLimit
+from congrasp.learner.hub.staleness import StalenessManager
+from congrasp.learner.hub.write_ahead import PART, WriteAheadLog
 
 pytestmark = pytest.mark.timeout(30)
 KEYS = Keys("test")

@@ -22,8 +22,8 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
-from congrasp.learner.admission import Admission
 from congrasp.learner.algorithms import ppo
+from congrasp.learner.hub.admission import Admission
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run, open_run
 from tests.learner.made_up_actor import MadeUpActor

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.bank import build_bank
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker, finished_episodes
 from congrasp.common.config import CurriculumConfig, RewardWeights, TaskConfig
@@ -14,12 +13,13 @@ from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.metrics import episode_fields
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.schema import PRIVILEGED, RECORDED
-from congrasp.learner.admission import Admission
-from congrasp.learner.ranges import task_ranges
+from congrasp.learner.hub.admission import Admission
+from congrasp.learner.hub.ranges import task_ranges
 
-TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, hold_steps_max=40)
+TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, approach_steps=50, hold_steps_max=40)
 RANGES = task_ranges(TASK, CurriculumConfig())
 WORLDS, STEPS = 8, 90
 

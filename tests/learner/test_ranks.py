@@ -16,8 +16,8 @@ import pytest
 
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
-from congrasp.learner import ranks as ranks_module
-from congrasp.learner.ranks import Ranks, ended_by
+from congrasp.learner.distributed import ranks as ranks_module
+from congrasp.learner.distributed.ranks import Ranks, ended_by
 from congrasp.learner.run_directory import create_run
 from tests.learner.rank_process import CONFIG
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from congrasp.common.errors import CongraspError
-from congrasp.learner.audit import AuditLog
+from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.run_directory import (
     continue_run,
     create_run,

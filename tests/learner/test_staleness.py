@@ -9,7 +9,7 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.hub.staleness import StalenessManager
 
 A, B = ("a", "1"), ("b", "1")
 

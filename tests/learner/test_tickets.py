@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.hub.staleness import StalenessManager
 
 _RETRY = 0.05  # seconds until an actor that got no ticket asks again
 

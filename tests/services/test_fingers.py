@@ -26,11 +26,11 @@ from congrasp.services.grasp.parse import read_request
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.requests import Layout
+from congrasp.services.studio import description
+from congrasp.services.studio.grasping import PolicyGrasping
+from congrasp.services.studio.lanes import for_page, lanes
+from congrasp.services.studio.state import Studio
 from congrasp.services.train.command import untrained
-from congrasp.services.viz.studio import description
-from congrasp.services.viz.studio.grasping import PolicyGrasping
-from congrasp.services.viz.studio.lanes import for_page, lanes
-from congrasp.services.viz.studio.state import Studio
 
 HAND = get_hand("human")
 TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))

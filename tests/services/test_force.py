@@ -21,9 +21,9 @@ from congrasp.services.export.policy import describe
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.serve.inference import Inference, PolicyFunction
+from congrasp.services.studio import description
+from congrasp.services.studio.state import Studio
 from congrasp.services.train.command import untrained
-from congrasp.services.viz.studio import description
-from congrasp.services.viz.studio.state import Studio
 from tests.services.test_fingers import query
 
 __all__ = ["query"]

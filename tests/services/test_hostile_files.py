@@ -15,17 +15,17 @@ from congrasp.common.config import NetworkConfig, TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text, read_hand
-from congrasp.common.inputs import file_name, read_file
+from congrasp.common.io.inputs import file_name, read_file
 from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
-from congrasp.common.task import constraint_sets as stored_sets
+from congrasp.common.task.sampling import sets as stored_sets
+from congrasp.common.task.sampling import write_sets as constraint_sets
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
-from congrasp.services.grasp import constraint_sets
 from tests.episodes import episode
 from tests.limits import limited
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.inputs import read_json
+from congrasp.common.io.inputs import read_json
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.grasp import wrist_paths
 from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel

@@ -90,7 +90,7 @@ def teapot(rng: Rng) -> Draft:
         draft.capsule((0.6 * radius, 0, rise), (ear, 0, 0.4 * rise), thick, part=1),
         draft.capsule((ear, 0, 0.4 * rise), (0.75 * radius, 0, -0.6 * rise), thick, part=1),
     )
-    return Draft(pieces, ("body", "handle"), (False, True))
+    return Draft(pieces, ("body", "handle"), (False, True), heavier=2.0)
 
 
 @_family
@@ -124,7 +124,7 @@ def hammer(rng: Rng) -> Draft:
         draft.capsule((0, 0, 0), (length, 0, 0), radius),
         draft.box(half, (length, rng.uniform(-0.01, 0.01), 0), part=1),
     )
-    return Draft(pieces, ("handle", "head"), (True, False), (1, 3))
+    return Draft(pieces, ("handle", "head"), (True, False), (1, 3), heavier=2.2)
 
 
 @_family
@@ -188,7 +188,7 @@ def pan(rng: Rng) -> Draft:
         draft.capsule((0.9 * radius, 0, 0), (radius + handle, 0, rise), grip),
         draft.cylinder((0, 0, -half), (0, 0, half), radius, part=1),
     )
-    return Draft(pieces, ("handle", "disc"), (True, False))
+    return Draft(pieces, ("handle", "disc"), (True, False), heavier=3.0)
 
 
 @_family
@@ -293,4 +293,4 @@ def _vessel(bottom: float, top: float, height: float, wall: float) -> Draft:
     for pair in itertools.pairwise(turns):
         corners = [(bottom - wall, wall), (bottom, wall), (top - wall, height), (top, height)]
         pieces.append(draft.mesh(np.array([draft.polar(r, turn, z) for turn in pair for r, z in corners])))
-    return Draft(tuple(pieces))
+    return Draft(tuple(pieces), heavier=2.0)

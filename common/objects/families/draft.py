@@ -23,6 +23,8 @@ class Draft(NamedTuple):
     """Relative density of each part; empty means equal."""
     density: tuple[float, float] = (300.0, 1000.0)
     """Range of the density, kg/m^3."""
+    heavier: float = 1.0
+    """Factor on the mass. It leaves the shape unchanged bit for bit, which another density would not."""
 
 
 Builder = Callable[[Rng], Draft]

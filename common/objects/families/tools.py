@@ -137,7 +137,7 @@ def clothes_iron(rng: Rng) -> Draft:
     base = hull(sole, np.array(sole) * [0.85, 0.6, 1] + [0, 0, high], part=1)
     path = arc(np.pi, 0, 5, (0.36 * length, rng.uniform(0.045, 0.06)), (0, 0, 0.85 * high))
     handle = sweep(path, (0, 1, 0), rng.uniform(0.014, 0.02), rng.uniform(0.02, 0.028), rounded=True)
-    return Draft((*handle, base), ("handle", "base"), (True, False), (), (300.0, 1000.0))
+    return Draft((*handle, base), ("handle", "base"), (True, False), heavier=2.5)
 
 
 @_family

@@ -24,8 +24,8 @@ from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
     from congrasp.common.config import TaskConfig
-    from congrasp.common.task.bank import Draw
     from congrasp.common.task.features import Contacts, Features
+    from congrasp.common.task.sampling.bank import Draw
 
 REACH = 0.15
 """Metres of approach before the heading position that are searched for the avoid region."""

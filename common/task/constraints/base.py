@@ -19,8 +19,8 @@ from congrasp.common.task.types import Array, Goal, SceneState, Surface
 
 if TYPE_CHECKING:
     from congrasp.common.config import TaskConfig
-    from congrasp.common.task.bank import Draw
     from congrasp.common.task.features import Contacts, Features
+    from congrasp.common.task.sampling.bank import Draw
     from congrasp.common.task.sensing import Readings
 
 Window = Literal["approach", "hold"]

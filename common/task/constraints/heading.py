@@ -26,8 +26,8 @@ from congrasp.common.task.types import Array, Goal
 
 if TYPE_CHECKING:
     from congrasp.common.config import TaskConfig
-    from congrasp.common.task.bank import Draw
     from congrasp.common.task.features import Contacts, Features
+    from congrasp.common.task.sampling.bank import Draw
 
 _FAR = 0.15
 """Metres beyond which the distance costs no more: what a fallen object carries away must not drown all else."""

@@ -27,8 +27,8 @@ from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
     from congrasp.common.config import TaskConfig
-    from congrasp.common.task.bank import Draw
     from congrasp.common.task.features import Contacts, Features
+    from congrasp.common.task.sampling.bank import Draw
 
 TOUCHING = 0.015
 """Metres from a joint or fingertip of a reference pose to the surface that it is about to touch."""

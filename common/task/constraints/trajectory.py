@@ -28,7 +28,7 @@ from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
     from congrasp.common.config import TaskConfig
-    from congrasp.common.task.bank import Draw
+    from congrasp.common.task.sampling.bank import Draw
 
 APART = 0.02
 """Metres between a pose's wrist and a trajectory's end from which on they contradict."""

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from congrasp.common.errors import TooWideError
 from congrasp.common.hands.outline import CENTER, Outline, depth_below
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
@@ -20,9 +21,7 @@ _SKIN = 0.004  # m that the widest pose is wider than the object on either side
 _BREADTH = 0.03  # half the breadth of the slab in which the local width is measured: a hand is some 6 cm broad
 _BEYOND = 0.01  # the slab ends this far beyond the heading position, where the fingertips close
 _TUBE = 0.01  # radius around the approach in which nothing may stand before the surface point
-_MARGIN = (
-    0.01  # an approach stays this far from the avoid region, and closing fingers, which are this thick, meet none of it
-)
+_MARGIN = 0.01  # an approach keeps this far from the avoid region, of which closing fingers, so thick, meet nothing
 _BACK = 0.015  # longest way back from the table: to a hand whose centre is 5 mm inside the surface
 _FARTHEST_BACK = 0.03  # the same for objects that leave no other choice: to 1 cm over the surface
 _FACING = 0.5  # least cosine between a surface's inward normal and a direction that is given
@@ -72,7 +71,8 @@ def sample_headings(
       paper's regions are those that people held, and can be held).
 
     If fewer than `count` remain after `attempts` batches, those found are repeated. If none remains on the whole
-    surface, the candidates that break the fewest of the rules but the first are taken, among them the narrowest.
+    surface, the candidates that break the fewest of the rules but the first are taken, among them the narrowest; the
+    first one holds.
 
     Args:
       obj: the object.
@@ -91,6 +91,9 @@ def sample_headings(
 
     Returns:
       H headings, float32; None if the graspable region cannot be approached.
+
+    Raises:
+      TooWideError: the object is wider than `max_width` wherever it can be approached.
     """
     avoid = obj.non_graspable_points & use_affordance
     sources = _sources(obj, avoid, along)
@@ -118,6 +121,10 @@ def sample_headings(
         last = _last_resort(points, avoid, position, direction, faults, rng, lenient=lenient)
         if last is None:
             return None
+        width = local_width(last, points)
+        if not avoid.any() and width.min() > max_width:
+            raise TooWideError(obj.name, width.min(), max_width)
+        last = Headings(*(part[width <= max(max_width, width.min())] for part in last))
         found.append(last)
     pool = Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     chosen = np.resize(np.arange(len(pool.position)), count)
@@ -213,7 +220,7 @@ def feasible(
 
 
 def within_reach(
-    headings: Headings, points: np.ndarray, rest_poses: np.ndarray, outline: Outline
+    headings: Headings, points: np.ndarray, rest_poses: np.ndarray, outline: Outline, avoid: np.ndarray | None = None
 ) -> tuple[list[Headings], np.ndarray]:
     """The headings clear of the table in each of R resting poses (R, 7), and (R, H) bool whether they can be followed.
 
@@ -221,20 +228,49 @@ def within_reach(
     lost, with one policy, and of the others one in 25. Flat objects, none of whose headings can be cleared by that, get
     3 cm; and where the table leaves the hand no room at all, as beside a card, its centre alone counts.
 
+    Headings of a graspable region must still close on it where they end (`closes_on`), and the hand's centre alone
+    never counts: what cannot be held without the rest of the object is no region.
+
     Args:
       headings: H of them, in the object frame.
       points: (P, 3) the object's surface points, m.
       rest_poses: (R, 7) poses of the object, with the table's top at z = 0.
       outline: of the hand.
+      avoid: (P,) bool, the avoid region of headings that are made for the graspable one; None for other headings.
     """
     width = local_width(headings, points)
-    for own, farthest in ((outline, _BACK), (outline, _FARTHEST_BACK), (CENTER, _FARTHEST_BACK)):
+    ways = [(outline, _BACK), (outline, _FARTHEST_BACK), (CENTER, _FARTHEST_BACK)]
+    for own, farthest in ways if avoid is None else ways[:2]:
         cleared = [clear_table(headings, rest, own, width, farthest) for rest in rest_poses]
         pairs = zip(cleared, rest_poses, strict=True)
         reachable = np.array([feasible(moved, rest, own, width) for moved, rest in pairs])
+        if avoid is not None:
+            reachable &= np.array([closes_on(moved, points, avoid) for moved in cleared])
         if reachable.any():
             break
     return cleared, reachable
+
+
+def closes_on(headings: Headings, points: np.ndarray, avoid: np.ndarray) -> np.ndarray:
+    """(H,) bool, true where fingers that close at the position meet the graspable region, on both sides and first.
+
+    The position is nearer to that region than to the other, and along the cross-finger axis the other ends at least
+    5 mm further inside (`sample_headings`).
+
+    Args:
+      headings: in the object frame.
+      points: (P, 3) surface points, of which the first 256 are taken, m.
+      avoid: (P,) bool, the avoid region.
+    """
+    points, avoid = points[:_WIDTH_POINTS], avoid[:_WIDTH_POINTS]
+    along, aside, depth = (
+        axis @ points.T - (axis * headings.position).sum(-1)[:, None]
+        for axis in (headings.cross, np.cross(headings.direction, headings.cross), headings.direction)
+    )
+    (low, high), first = _region_first(along, np.abs(aside) < _BREADTH, depth, avoid)
+    squared = along**2 + aside**2 + depth**2
+    nearer = squared[:, ~avoid].min(-1, initial=np.inf) < squared[:, avoid].min(-1, initial=np.inf)
+    return (high > low) & first & nearer
 
 
 def local_width(headings: Headings, points: np.ndarray) -> np.ndarray:
@@ -327,14 +363,28 @@ def _roll(
     low, high = _extent(along, slab & (depth < _BEYOND))
     width = high - low
     if avoid.any():
-        low, high = _extent(along, slab & (depth < _BEYOND) & ~avoid)
-        low_avoid, high_avoid = _extent(along, slab & (depth < _BEYOND + _MARGIN) & avoid)
-        width[(low_avoid < low + _MARGIN / 2) | (high_avoid > high - _MARGIN / 2)] = np.inf
+        width[~_region_first(along, slab, depth, avoid)[1]] = np.inf
     # Gumbel's trick draws a roll with probability exp(-width / preference).
     pick = (rng.gumbel(size=width.shape) - width / _PREFERENCE).argmax(-1)
     rows = np.arange(len(width))
     sign = rng.choice(np.array([-1.0, 1.0], np.float32), len(width))
     return sign[:, None] * axes[rows, pick], width[rows, pick]
+
+
+def _region_first(
+    along: np.ndarray, slab: np.ndarray, depth: np.ndarray, avoid: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Extent (...,) of the graspable region between closing fingers, and (...,) bool whether they meet it first.
+
+    Args:
+      along: (..., P) m, surface points along the cross-finger axis.
+      slab: (..., P) bool, within the hand's breadth.
+      depth: (..., P) m, beyond the heading position.
+      avoid: (P,) bool, the avoid region.
+    """
+    low, high = _extent(along, slab & (depth < _BEYOND) & ~avoid)
+    low_avoid, high_avoid = _extent(along, slab & (depth < _BEYOND + _MARGIN) & avoid)
+    return (low, high), ~((low_avoid < low + _MARGIN / 2) | (high_avoid > high - _MARGIN / 2))
 
 
 def _extent(along: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,16 +5,16 @@ from typing import Any
 
 import numpy as np
 
-from congrasp.common.npz import read_npz
-from congrasp.common.pickles import parse_pickle
+from congrasp.common.io.npz import read_npz
+from congrasp.common.io.pickles import parse_pickle
 
 
 def read_archive(path: pathlib.Path) -> dict[str, Any]:
     """The file's arrays by name; what NumPy wrote as an object is that object.
 
     Raises:
-      CongraspError: it is no NPZ file, larger than the limits of `common.npz`, or holds what is neither a plain value
-        nor an array.
+      CongraspError: it is no NPZ file, larger than the limits of `common.io.npz`, or holds what is neither a plain
+        value nor an array.
     """
     return read_npz(path, "Get the file again.", objects=_value)
 

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from congrasp.actors.bank import HEADINGS, SOFT, above_table, clear_of_table, headings_of, height_over_table
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.human import HUMAN
@@ -18,8 +17,17 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import store
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.bank import ConstraintBank
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.build import (
+    HEADINGS,
+    SOFT,
+    above_table,
+    clear_of_table,
+    headings_of,
+    height_over_table,
+)
 from congrasp.common.task.sampling.headings import Headings
+from congrasp.common.task.sampling.write_sets import for_training, set_of
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
 from congrasp.services.assets.captures.objects import import_meshes
@@ -29,7 +37,6 @@ from congrasp.services.assets.captures.transfer import demonstrated_headings, tr
 from congrasp.services.assets.objects.affordance import near_points, relabelled, two_parts
 from congrasp.services.assets.objects.meshes import UNLABELLED
 from congrasp.services.assets.objects.sources import safe_name
-from congrasp.services.grasp.constraint_sets import for_training, set_of
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
 _Shapes = dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]

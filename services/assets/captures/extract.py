@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.rotations import continuous
 from congrasp.services.assets.captures.fit import Fit, fit
 from congrasp.services.assets.captures.sequence import FINGERS, Dropped, Sequence
-from congrasp.services.export.frames import continuous_quaternions
 
 STABLE = 5
 """Frames that thumb and another finger must touch in a row."""
@@ -290,4 +290,4 @@ def _resampled(path: np.ndarray, turns: Rotation, waypoints: int) -> tuple[np.nd
     length, path, turns = length[keep], path[keep], turns[keep]
     wanted = np.linspace(length[0], length[-1], waypoints)
     position = np.stack([np.interp(wanted, length, axis) for axis in path.T], -1)
-    return position, continuous_quaternions(Slerp(length, turns)(wanted), scalar_first=True)
+    return position, continuous(Slerp(length, turns)(wanted).as_quat(scalar_first=True))

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.mano import ManoModel
-from congrasp.common.inputs import file_name, read_file
-from congrasp.common.pickles import read_pickle
+from congrasp.common.io.inputs import file_name, read_file
+from congrasp.common.io.pickles import read_pickle
 from congrasp.services.assets.captures import mano
 from congrasp.services.assets.captures.objects import Meshes
 from congrasp.services.assets.captures.sequence import Dropped, Part, Sequence, read_or_drop

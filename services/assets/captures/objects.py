@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Callable, Mapping
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.inputs import file_name
+from congrasp.common.io.inputs import file_name
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.captures.sequence import Dropped
 from congrasp.services.assets.objects.meshes import import_sources

@@ -14,11 +14,11 @@ from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.rotations import continuous
 from congrasp.common.task.sampling.closed_poses import closed_poses
 from congrasp.common.task.sampling.headings import Headings
 from congrasp.services.assets.captures.extract import Demonstration
 from congrasp.services.assets.captures.fit import joint_positions
-from congrasp.services.export.frames import continuous_quaternions
 
 _AT_ONCE = 20
 """Poses that are closed in one compiled call."""
@@ -66,7 +66,7 @@ def transferred(
         path = scale * (human.apply(center) + demonstration.position)
         # The hand centre of the closed hand, in the wrist frame, is what the last pose leaves between the two.
         positions.append(path - turn.apply(turn[-1].inv().apply(path[-1] - last)))
-        quaternions.append(continuous_quaternions(turn, scalar_first=True))
+        quaternions.append(continuous(turn.as_quat(scalar_first=True)))
     return q, np.array(positions), np.array(quaternions)
 
 

@@ -15,16 +15,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors import protocols
+from congrasp.actors import stress as protocols
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import write_atomically
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.measures import tip_forces
 from congrasp.common.hands.mjcf import overlapping
 from congrasp.common.hands.spec import Hand, chain_of
-from congrasp.common.inputs import read_json
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_json
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import HELD_OUT_SEED
 from congrasp.common.objects.spec import GraspObject

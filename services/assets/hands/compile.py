@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 import trimesh
 
+import congrasp
 from congrasp.common.errors import CongraspError
 
 MEMORY = 3 << 30
@@ -49,7 +50,7 @@ _FINITE = (
     *("geom_quat", "mesh_vert", "dof_armature", "dof_damping", "actuator_biasprm", "actuator_forcerange"),
 )
 _NATIVE = (".stl", ".obj", ".msh")
-_ROOT = pathlib.Path(__file__).parents[3]
+_ROOT = pathlib.Path(congrasp.__file__).parents[1]
 _REMEDY = "MuJoCo must be able to load it."
 
 

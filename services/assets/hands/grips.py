@@ -3,7 +3,7 @@
 The hand comes from above: its heading axis points down, and the object lies in the grasp frame, the cylinder's and the
 box's length across the plane in which the fingers close. Each object is tried at several places along the heading axis
 and with several forces, side by side. It is held in place until the fingers have closed; then it is let go, without a
-table. The lift and the pushes are those of `actors.protocols`.
+table. The lift and the pushes are those of `actors.stress`.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors import protocols
+from congrasp.actors import stress as protocols
 from congrasp.actors.physics.engine import PhysicsState, ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.common import rotations
@@ -51,7 +51,7 @@ class Grip(NamedTuple):
     held: bool
     """Half a second after it was let go."""
     survived: dict[str, bool]
-    """By the names of `actors.protocols.SURVIVAL`."""
+    """By the names of `actors.stress.SURVIVAL`."""
     touching: np.ndarray
     """(L,) bool, links in contact half a second after it was let go."""
     q: np.ndarray

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import trimesh
 
-from congrasp.common.files import write_atomically
 from congrasp.common.hands.meshes import MAX_FACES, PARTS, Meshes, beside
+from congrasp.common.io.files import write_atomically
 from congrasp.services.assets.hands.geometry import geom_mesh
 
 

@@ -1,7 +1,8 @@
 """Convex pieces of a mesh: its hull where that is the shape, else CoACD under limits, V-HACD where it fails, the hull.
 
 The decomposers are native code that cannot be interrupted, so that they run in a child process
-(`python -m services.assets.objects.decompose`) which is killed at the time limit and cannot take more than its memory.
+(`python -m congrasp.services.assets.objects.decompose`) with limits of memory and of processor time: how busy the
+machine is changes when a shape is ready, not which one it is.
 """
 
 import os
@@ -17,15 +18,19 @@ from typing import NamedTuple
 
 import numpy as np
 
+import congrasp
+from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_PIECES
 from congrasp.services.assets.objects.pieces import DEPTH, GROWTH, deepest, merge, solid_hull
 
 FALLBACK_LIMIT = 30.0
-"""Seconds that V-HACD may take."""
+"""Seconds of processor time that V-HACD may take."""
+STARVED = 20.0
+"""Seconds of the clock for each second of processor time after which the machine counts as too busy."""
 _MEMORY = 6 << 30  # bytes of address space
 _FINEST = 0.01  # the smallest threshold that CoACD takes, of half the longest side
-_ROOT = pathlib.Path(__file__).resolve().parents[3]
+_ROOT = pathlib.Path(congrasp.__file__).parents[1]
 
 
 class Decomposition(NamedTuple):
@@ -53,8 +58,11 @@ def decompose(
       vertices: (V, 3), m, not all in a plane.
       faces: (F, 3).
       volume: what the mesh encloses if it is closed, m^3; one that is nearly its hull needs no decomposition.
-      time_limit: seconds for CoACD; V-HACD gets half a minute after it.
+      time_limit: seconds of processor time for CoACD; V-HACD gets half a minute after it.
       max_pieces: most pieces.
+
+    Raises:
+      CongraspError: the machine is too busy for the child to come to its limit.
     """
     hull = shapes.hull_of(vertices)
     whole = [hull.points[hull.vertices]]
@@ -82,7 +90,7 @@ def _in_child(
         try:
             child = subprocess.run(
                 [*command, method, mesh, result, str(max_pieces), str(limit)],
-                timeout=limit,
+                timeout=STARVED * limit + STARVED,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
@@ -90,7 +98,13 @@ def _in_child(
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            return [], f"took longer than {limit:g} s"
+            raise CongraspError(
+                f"The machine is too busy: {method} got less than {limit:g} s of processor time in "
+                f"{STARVED * limit + STARVED:.0f} s.",
+                "Stop other programs and try again.",
+            ) from None
+        if child.returncode == -signal.SIGPROF:
+            return [], f"took longer than {limit:g} s of processor time"
         if child.returncode != 0 or not os.path.exists(result):
             last = child.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {child.returncode}"]
             return [], f"failed ({last[0]})"
@@ -100,8 +114,8 @@ def _in_child(
 
 
 def _child(method: str, mesh: str, result: str, max_pieces: str, limit: str) -> None:
-    """Decomposes one mesh file into another; ends by itself after the limit, or when the parent is gone."""
-    signal.alarm(int(float(limit)) + 5)
+    """Decomposes one mesh file into another; ends by itself at the limit, or when the parent is gone."""
+    signal.setitimer(signal.ITIMER_PROF, float(limit))  # of processor time; its signal ends the process
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
     with np.load(mesh) as arrays:

@@ -7,30 +7,31 @@ import hashlib
 import pathlib
 import queue
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.files import cache_folder
+from congrasp.common.io.files import cache_folder
 from congrasp.common.objects import shapes, store
-from congrasp.common.objects.procedural import MASS_RANGE
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.spec import Colours, GraspObject, Piece
 from congrasp.common.objects.surface import halves, mass_properties, sample_mesh
-from congrasp.common.parallel import cores
+from congrasp.common.runtime.parallel import cores
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.collision import convex_pieces
 from congrasp.services.assets.objects.colours import sample_colours
+from congrasp.services.assets.objects.materials import Weight, guessed_mass, materials_of, weigh
 from congrasp.services.assets.objects.options import ImportOptions, check_options
+from congrasp.services.assets.objects.regions import cut_to_hold
 from congrasp.services.assets.objects.sizes import metres_per_unit
 from congrasp.services.assets.objects.sources import Source, read_mesh
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object whose files name none."""
-_CACHE_VERSION = 6
+_CACHE_VERSION = 8
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
 
@@ -38,7 +39,7 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
     """Imports one object, or takes it from the cache of finished imports; its `notes` say what the user should know.
 
     Its origin moves to the centre of mass; its orientation stays the file's. Parts come from part files; an object
-    without them is labelled by its two halves, the slimmer one graspable.
+    without them is labelled by two halves, the slimmer one graspable if a hand can close on it (`cut_to_hold`).
 
     Raises:
       CongraspError: a mesh cannot be used; the line names it, its fault and the remedy.
@@ -126,15 +127,13 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     meshes = [_scaled(mesh, factor) for mesh in visuals]
     whole = _joined(meshes)
     closed = all(mesh.is_volume for mesh in meshes)
-    if not closed:
-        stand_in = "convex pieces" if source.pieces else "convex hull"
+    if not (closed or options.material):
         notes.append(
-            f"its surface is open, so that nobody knows what is inside: mass and inertia are those of its {stand_in} "
-            "(--mass sets the mass)"
+            f"its surface is open: mass and inertia are those of its convex {'pieces' if source.pieces else 'hull'} "
+            "(--material weighs its wall, and --mass sets the mass)"
         )
     hulls, owners, errors = convex_pieces(source, meshes, whole, [factor * piece for piece in given], options, notes)
-    solids = hulls if source.pieces else [np.asarray(whole.vertices)]
-    mass, center, inertia = _weigh(whole if closed else None, solids, options)
+    mass, center, inertia = _weighed(source, meshes, factor, hulls if source.pieces else None, options)
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
     whole.apply_translation(-center)
     points, normals, face = sample_mesh(
@@ -145,12 +144,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     if not 0.1 <= share <= 0.9:
         notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
     if not source.parts_are_pieces:
-        near = cKDTree(points)
-        votes = (labels[near.query(np.asarray(piece.vertices) + piece.pos)[1]] for piece in pieces)
-        pieces = tuple(
-            dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
-            for piece, vote in zip(pieces, votes, strict=True)
-        )
+        pieces = _labelled(pieces, points, labels)
     picture = repair.with_few_faces(whole)
     colours = _colours(source, factor, center, seed, notes)
     obj = GraspObject(
@@ -174,7 +168,8 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         volume_error=errors.volume,
         colours=colours,
     )
-    return dataclasses.replace(obj, rest_poses=rest_poses(obj))
+    obj = dataclasses.replace(obj, rest_poses=rest_poses(obj))
+    return obj if source.parts else cut_to_hold(obj)
 
 
 def _colours(source: Source, factor: float, center: np.ndarray, seed: int, notes: list[str]) -> Colours | None:
@@ -203,26 +198,57 @@ def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
     return mesh
 
 
-def _weigh(
-    closed: trimesh.Trimesh | None, solids: Iterable[np.ndarray], options: ImportOptions
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass, centre of mass and inertia: of the mesh if it is closed, of convex solids (V, 3) otherwise."""
-    if closed is not None:
-        properties = closed.mass_properties
-        volume, center = float(properties["volume"]), np.asarray(properties["center_mass"])
-        per_volume = np.asarray(properties["inertia"]) / volume
+def _weighed(
+    source: Source,
+    meshes: Sequence[trimesh.Trimesh],
+    factor: float,
+    hulls: Sequence[np.ndarray] | None,
+    options: ImportOptions,
+) -> Weight:
+    """Mass properties by the options: of materials, or of an evenly dense body.
+
+    Args:
+      source: the object's files.
+      meshes: its surface, m.
+      factor: metres per unit of the files.
+      hulls: vertices (V, 3) of the convex solids that stand for it if it is open, m; the surface's hull if None.
+      options: material, density and mass.
+    """
+    whole, text = _joined(meshes), options.material
+    if "=" in text:
+        bodies = meshes if source.parts_are_pieces else [_scaled(read_mesh(part.path), factor) for part in source.parts]
+        found = weigh(bodies, materials_of(text, [part.part for part in source.parts]))
+    elif text:
+        found = weigh(meshes, materials_of(text, [""] * len(meshes)))
     else:
-        pieces = tuple(Piece("mesh", (0, 0, 0), vertices=solid) for solid in solids)
-        volume, center, inertia = mass_properties(pieces, np.ones(len(pieces)))
-        per_volume = inertia / volume
-    mass = float(np.clip(volume * options.density, *MASS_RANGE)) if options.mass is None else options.mass
-    return mass, center, per_volume * mass
+        if all(mesh.is_volume for mesh in meshes):
+            properties = whole.mass_properties
+            volume, center = float(properties["volume"]), np.asarray(properties["center_mass"])
+            inertia = np.asarray(properties["inertia"])
+        else:
+            solids = [np.asarray(whole.vertices)] if hulls is None else hulls
+            pieces = tuple(Piece("mesh", (0, 0, 0), vertices=solid) for solid in solids)
+            volume, center, inertia = mass_properties(pieces, np.ones(len(pieces)))
+        mass = guessed_mass(volume, float(whole.area)) if options.density is None else options.density * volume
+        found = Weight(mass, center, inertia * mass / volume)
+    mass = found.mass if options.mass is None else options.mass
+    return Weight(mass, found.center, found.inertia * (mass / found.mass))
 
 
 def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
     """A convex piece of vertices (V, 3) around its own middle, relative to the centre of mass."""
     middle = hull.mean(0)
     return Piece("mesh", (0.0, 0.0, 0.0), tuple((middle - center).tolist()), vertices=hull - middle, part=part)
+
+
+def _labelled(pieces: tuple[Piece, ...], points: np.ndarray, labels: np.ndarray) -> tuple[Piece, ...]:
+    """The pieces, each of the part that most of its vertices are nearest to, by labelled (N,) points (N, 3)."""
+    near = cKDTree(points)
+    votes = (labels[near.query(np.asarray(piece.vertices) + piece.pos)[1]] for piece in pieces)
+    return tuple(
+        dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
+        for piece, vote in zip(pieces, votes, strict=True)
+    )
 
 
 def _labels(

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.inputs import LONGEST_NAME
+from congrasp.common.io.inputs import LONGEST_NAME
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.headers import MAX_FACES, check_header
 from congrasp.services.assets.objects.kinds import CONVERT, SUFFIXES, kind_of

@@ -6,12 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.actors.bank import build_bank
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate import exam
 from congrasp.services.evaluate.episodes import identity, reference
 from congrasp.services.evaluate.heading_rules import HeadingRules, heading_rules

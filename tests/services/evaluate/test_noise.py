@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from congrasp.actors.bank import build_bank
 from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.objects import procedural
-from congrasp.common.task import constraint_sets as stored_sets
+from congrasp.common.task.sampling import sets as stored_sets
+from congrasp.common.task.sampling import write_sets as constraint_sets
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.noise import LEVELS, Noise, with_noise
 from congrasp.services.evaluate.noise_sheet import draw_curves
-from congrasp.services.grasp import constraint_sets
 from congrasp.services.train.command import untrained
 
 HAND = get_hand("human")

@@ -19,6 +19,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.objects.spec import Colours
+from congrasp.common.rotations import continuous
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.cli.main import main
 from congrasp.services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
@@ -300,7 +301,7 @@ def test_a_bvh_has_the_skeleton_of_the_skin(human: GraspMotion, tmp_path: pathli
 
 def test_neighbouring_quaternions_do_not_jump() -> None:
     flipped = Rotation.from_rotvec(np.outer(np.linspace(0, 12, 50), [0, 0, 1]))
-    q = frames.continuous_quaternions(flipped, scalar_first=False)
+    q = continuous(flipped.as_quat(scalar_first=False))
     assert (np.sum(q[1:] * q[:-1], -1) > 0).all()
 
 

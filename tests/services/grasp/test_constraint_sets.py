@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from congrasp.actors.bank import build_bank
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.outline import outline
 from congrasp.common.objects import procedural, store
-from congrasp.common.task import constraint_sets as stored_sets
+from congrasp.common.task.sampling import sets as stored_sets
+from congrasp.common.task.sampling import write_sets as constraint_sets
+from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.sampling.headings import Headings, within_reach
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.main import load
-from congrasp.services.grasp import constraint_sets
 from congrasp.services.grasp.parse import read_request
 
 HAND = get_hand("human")

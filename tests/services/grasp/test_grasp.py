@@ -10,8 +10,8 @@ import trimesh
 from PIL import Image
 
 from congrasp.actors.attempts import Outcome
-from congrasp.actors.protocols import ASSESSED, SURVIVAL
 from congrasp.actors.rollout import Trace
+from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
@@ -23,6 +23,7 @@ from congrasp.services.cli.main import load
 from congrasp.services.export.motion_file import load_motion, motion_of_episode
 from congrasp.services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
 from congrasp.services.grasp.grasper import Grasp, Grasper, costs
+from congrasp.services.grasp.jobs import Result
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.record.reader import read_episodes
 from tests.episodes import episode
@@ -42,6 +43,13 @@ def grasper():
     grasper = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, threads=2)
     yield grasper
     grasper.close()
+
+
+def test_a_shape_that_is_another_one_is_not_held():
+    held = {"success": True, "shape_reliable": True}
+    assert Result("mug", held).held
+    assert not Result("mug", held | {"shape_reliable": False}).held
+    assert not Result("mug", held | {"success": False}).held
 
 
 def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
@@ -126,7 +134,7 @@ def made_up(monkeypatch):
     def grasp(self, obj, request=None, progress=lambda what, done, total: None):
         calls.append(obj.name)
         made = episode(success=obj.name != "loose")
-        made.meta.update(object=obj.name)
+        made.meta.update(object=obj.name, phases={"grasp": 0.0, "hold": 0.04})
         made.meta["metrics"] |= dict.fromkeys(
             ("heading_rad", "heading_m", "pose_rad", "pose_m", "trajectory_rad", "trajectory_m"), 0.01
         )

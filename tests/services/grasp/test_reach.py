@@ -59,11 +59,12 @@ def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.nd
 
 @pytest.mark.parametrize("name", ["human", "allegro"])
 @pytest.mark.parametrize("heading", [(0.0, 0.0, -1.0), (-1.0, 0.2, -0.4)])
-def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, heading, ball) -> None:
+@pytest.mark.parametrize("speed", [0.0, 0.36])
+def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, heading, speed, ball) -> None:
     hand, way = get_hand(name), np.array(heading) / np.linalg.norm(heading)
     first = beginning(hand, way, ball, 0.16)
     rest = np.asarray(ball.rest_poses[0], float)
-    reach = plan_reach(hand, ball, rest, way, first, 0.2, DT)
+    reach = plan_reach(hand, ball, rest, way, first, 0.2, DT, speed)
     assert np.linalg.norm((reach.position[0] - rest[:3])[:2]) > 0.3  # beside the table
     whole = Reach(
         np.concatenate([reach.position, first.position]),
@@ -75,11 +76,15 @@ def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, headi
     assert low.min() > min(CLEARANCE, low[-1]) - 2e-3
     velocity = np.diff(whole.position, axis=0) / DT
     assert np.linalg.norm(velocity, axis=1).max() < 1.02 * SPEED
-    acceleration = np.diff(velocity, axis=0, prepend=0 * velocity[:1], append=0 * velocity[:1]) / DT
+    np.testing.assert_allclose(velocity[-1], speed * way, atol=0.02)
+    acceleration = np.diff(velocity, axis=0, prepend=0 * velocity[:1], append=[speed * way]) / DT
     assert np.linalg.norm(acceleration, axis=1).max() < 1.05 * ACCELERATION
     turned = (whole.rotation[:-1].inv() * whole.rotation[1:]).magnitude() / DT
     assert turned.max() < 1.02 * TURNING
-    assert len(plan_reach(hand, ball, rest, way, first, 3.0, DT).q) == 300  # slower if it is asked for
+    slow = plan_reach(hand, ball, rest, way, first, 3.0, DT, speed)
+    assert len(slow.q) == 300
+    steps = np.diff(slow.position, axis=0)
+    assert (steps[1:] * steps[:-1]).sum(-1).min() > -1e-9  # it never goes back
 
 
 def test_where_no_way_leads_is_said(ball) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.journal import AUDIT, Journal
+from congrasp.common.io.journal import AUDIT, Journal
 from congrasp.services.cli.audit import audit as command
 from congrasp.services.ops.audit import audit
 

@@ -16,8 +16,8 @@ import pytest
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub import LearnerHub
-from congrasp.learner.staleness import StalenessManager
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.cli.doctor import doctor as command
 from congrasp.services.ops import doctor
 from congrasp.services.ops.certificates import create_authority, issue

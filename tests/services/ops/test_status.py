@@ -19,9 +19,9 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub import LearnerHub
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.run_directory import POLICY_FILE, create_run, listening
-from congrasp.learner.staleness import StalenessManager
 from congrasp.services.cli.status import status
 from congrasp.services.cli.view import _of_folder, view
 from congrasp.services.ops.status import ask, tables, warnings

@@ -13,7 +13,7 @@ from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
-from congrasp.services.serve.client import PolicyClient
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.requests import PACKED, Layout
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.services.serve.limits import JointLimits, Limiter, as_numbers
+from congrasp.services.client.limits import JointLimits, Limiter, as_numbers
 
 JOINTS, PERIOD = 3, 0.01
 LIMITS = JointLimits(

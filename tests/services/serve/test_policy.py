@@ -11,11 +11,11 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.request import GraspRequest
 from congrasp.common.transport import urls
 from congrasp.common.transport.ports import free_port
-from congrasp.services.serve.client import PolicyClient
-from congrasp.services.serve.episode import EpisodePolicy
+from congrasp.services.client.episode import EpisodePolicy
+from congrasp.services.client.policy import Policy
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.local import LocalPolicy, load_policy
-from congrasp.services.serve.policy import Policy
 from congrasp.services.serve.server import PolicyServer, follow_file
 from congrasp.services.train.command import untrained
 

@@ -20,7 +20,7 @@ import congrasp
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.transport.ports import free_port
-from congrasp.services.serve.policy import Answer
+from congrasp.services.client.policy import Answer
 
 EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "ros2_node.py"
 STORE = get_typestore(Stores.ROS2_HUMBLE)

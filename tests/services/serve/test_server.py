@@ -23,13 +23,14 @@ from congrasp.common.errors import (
 )
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.request import GraspRequest
+from congrasp.common.task.constraints import PAPER
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.metrics import ServerMetrics, exposed
-from congrasp.services.serve.client import PolicyClient
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.requests import Query
@@ -39,7 +40,10 @@ from congrasp.services.train.presets import get_preset
 from tests.services.ops.test_metrics import scrape
 
 pytestmark = pytest.mark.timeout(300)
-CONFIG = dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
+_QUICKSTART = get_preset("quickstart")
+CONFIG = dataclasses.replace(
+    _QUICKSTART, network=NetworkConfig(hidden=(32,)), task=dataclasses.replace(_QUICKSTART.task, constraints=PAPER)
+)
 
 
 @pytest.fixture(scope="module")

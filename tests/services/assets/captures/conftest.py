@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from congrasp.common.task.constraint_sets import load as load_set
+from congrasp.common.task.sampling.sets import load as load_set
 from congrasp.services.assets.captures.build import Report
 from congrasp.services.cli.main import load
 

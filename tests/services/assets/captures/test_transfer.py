@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.bank import HEADINGS
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
-from congrasp.common.task.constraint_sets import bank_of
+from congrasp.common.task.sampling.build import HEADINGS
+from congrasp.common.task.sampling.sets import bank_of
+from congrasp.common.task.sampling.write_sets import describe
 from congrasp.services.assets.captures.fit import joint_positions
-from congrasp.services.grasp.constraint_sets import describe
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write
 

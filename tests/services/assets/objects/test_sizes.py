@@ -7,7 +7,7 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects.sizes import METRES, guessed_unit, metres_per_unit, sizes_by_unit
-from congrasp.services.viz.studio.app import MeshImporter
+from congrasp.services.studio.app import MeshImporter
 
 
 @pytest.mark.parametrize(

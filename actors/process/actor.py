@@ -1,0 +1,307 @@
+"""The actor process: pulls weights, steps environments, uploads rollouts, until the run ends."""
+
+import functools
+import threading
+import time
+import zlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from congrasp.actors.env import episode_fields
+from congrasp.actors.episode import episode_message
+from congrasp.actors.followed import Followed, Follower
+from congrasp.actors.physics import make_physics
+from congrasp.actors.process.failure_weights import FailureWeights
+from congrasp.actors.process.link import ActorLink, RunFinished, RunRestarted, Ticket
+from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
+from congrasp.actors.training_set import training_set
+from congrasp.common.config import RunConfig, run_config_from_json
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.io.journal import Journal
+from congrasp.common.policy.bundle import PolicyBundle, policy_spec, sample_action
+from congrasp.common.runtime.engines import PhysicsName
+from congrasp.common.runtime.stages import stage
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.types import Array
+from congrasp.common.transport.base import Transport
+from congrasp.common.wire.codec import Message, finite
+from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, TAUGHT
+
+_TICKET_SECONDS = 1.0
+_FLUSH_SECONDS = 2.0
+
+
+def run_actor(
+    transport: Transport,
+    *,
+    run: str,
+    actor: str,
+    stop: threading.Event,
+    physics: PhysicsName | None = None,
+    threads: int = 1,
+    patience: float = 60.0,
+    on_rollout: Callable[[dict[str, float]], None] = lambda values: None,
+    journal: Journal | None = None,
+) -> None:
+    """Acts for the learner of `run` until it ends or `stop` is set.
+
+    Args:
+      transport: connected to the learner.
+      run: name of the run.
+      actor: this actor's name, unique in the run; it also decides on its objects and random numbers.
+      stop: ends the actor between two rollouts.
+      physics: engine, where it is not to be the run's.
+      threads: threads of the `native` engine.
+      patience: seconds without a learner after which the actor gives up.
+      on_rollout: given the metrics of every rollout, its version among them.
+      journal: see `ActorLink`.
+
+    Raises:
+      CongraspError: the learner is gone, or refuses this actor's rollouts.
+    """
+    while not stop.is_set():
+        with ActorLink(transport, run, actor, patience=patience, journal=journal) as link:
+            try:
+                info = link.config(patience)
+                config = run_config_from_json(info.config)
+                _Actor(config, info.arrays, link, transport, physics or config.physics, threads, on_rollout).act(stop)
+                link.flush(_FLUSH_SECONDS)
+                return
+            except RunFinished:
+                link.flush(_FLUSH_SECONDS)
+                return
+            except RunRestarted:
+                continue
+
+
+def first_environments(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:
+    """The arrays of the first `count` environments of a rollout."""
+    return {
+        name: np.asarray(array[(slice(None),) * RECORDABLE[name].worlds_axis + (slice(count),)])
+        for name, array in arrays.items()
+    }
+
+
+class _Actor:
+    """Environments, policy and counters of one actor."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        arrays: tuple[str, ...],
+        link: ActorLink,
+        transport: Transport,
+        physics: PhysicsName,
+        threads: int,
+        on_rollout: Callable[[dict[str, float]], None],
+    ):
+        if unknown := set(arrays) - RECORDABLE.keys():
+            raise CongraspError(
+                f"The learner's algorithm needs arrays that actors do not record: {', '.join(sorted(unknown))}.",
+                "Start the actor with the version of congrasp that the learner has.",
+            )
+        self._config, self._arrays, self._link, self._transport = config, arrays, link, transport
+        self._hand = get_hand(config.task.hand)
+        self._number = zlib.crc32(link.actor.encode())
+        self._objects, bank = training_set(self._hand, config, self._number)
+        with stage("engine"):
+            self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
+        self._spec = policy_spec(config.task, config.network)
+        with stage("first episodes"):
+            self._worker = RolloutWorker(
+                self._hand,
+                config.task,
+                self._physics,
+                bank,
+                functools.partial(sample_action, self._spec.layout),
+                batch=config.environments,
+                # Another incarnation must not repeat the episodes of the one that it replaces.
+                seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
+                half_precision=config.half_observations,
+                staggered=True,
+                taught=not TAUGHT.keys().isdisjoint(arrays),
+                privileged=() if PRIVILEGED.keys().isdisjoint(arrays) else self._objects,
+            )
+        self._failures = self._failure_weights(bank)
+        self._on_rollout = on_rollout
+        self._bundle: PolicyBundle | None = None
+        self._rollouts = self._next_episode = 0
+        self._follower = Follower()
+
+    def act(self, stop: threading.Event) -> None:
+        """Rollouts until `stop` is set or the run ends."""
+        try:
+            self._warm_up(stop)
+            asked = time.monotonic()
+            while not stop.is_set():
+                ticket = self._link.acquire_ticket(_TICKET_SECONDS)
+                if ticket is None:
+                    continue
+                granted = time.monotonic()
+                if not self._refresh():
+                    self._link.give_back(ticket)
+                    stop.wait(_TICKET_SECONDS)
+                    continue
+                assert self._bundle is not None
+                self._rollout(self._bundle, ticket, _Since(asked, granted))
+                asked = time.monotonic()
+        finally:
+            self._physics.close()
+
+    def _failure_weights(self, bank: ConstraintBank) -> FailureWeights | None:
+        """Counts for the present objects, where the run draws them by failure."""
+        if not self._config.objects.by_failure:
+            return None
+        return FailureWeights(np.asarray(bank.weight), [obj.family for obj in self._objects])
+
+    def _renew_objects(self) -> None:
+        """Other objects in the place of all, and fresh episodes with them."""
+        self._number += 1
+        self._objects, bank = training_set(self._hand, self._config, self._number)
+        self._worker.replace_objects(self._objects, bank)
+        self._worker.restart()
+        self._follower.forget()
+        self._failures = self._failure_weights(bank)
+
+    def _warm_up(self, stop: threading.Event) -> None:
+        """Compiles before the first ticket is asked for, whose rollout would be too old by the time that it is made."""
+        while not self._refresh():
+            if stop.is_set():
+                return
+            if ticket := self._link.acquire_ticket(_TICKET_SECONDS):  # waits for the learner, but not for ever
+                self._link.give_back(ticket)
+        assert self._bundle is not None
+        self._configure(self._bundle.version)
+        parameters, steps = self._bundle.inference_parameters, self._config.rollout_steps
+        with stage("compile rollout"):
+            if self._physics.compiled:
+                self._worker.compile(parameters, steps)
+                return
+            for _ in range(2):  # the second time, environments have been restarted, which is traced apart
+                self._worker.collect(parameters, steps)
+                self._worker.restart()
+
+    def _configure(self, version: int) -> None:
+        """Sets the curriculum's weights and phase under the policy of this version."""
+        config = self._config
+        self._worker.configure(
+            config.curriculum.weights(config.task.reward, version), stationary=config.curriculum.stationary(version)
+        )
+
+    def _refresh(self) -> bool:
+        """Takes the newest policy; whether there is one at all."""
+        message = self._link.weights(-1 if self._bundle is None else self._bundle.version)
+        if message is not None:
+            bundle = PolicyBundle.from_message(message, "of the learner")
+            self._spec.require(bundle.spec, "of the learner")
+            self._bundle = bundle
+        return self._bundle is not None
+
+    def _rollout(self, bundle: PolicyBundle, ticket: Ticket, since: "_Since") -> None:
+        """Makes a rollout under a ticket and hands it over, with metrics and logs."""
+        config, before = self._config, self._worker.state
+        began = time.monotonic()
+        self._configure(bundle.version)
+        started_fresh = before is not None and bool(np.asarray(before.time)[0] == 0)
+        with stage("first rollout"):
+            rollout = jax.block_until_ready(self._worker.collect(bundle.inference_parameters, config.rollout_steps))
+        steps = config.rollout_steps * config.environments
+        taken = {name: getattr(rollout, name) for name in self._arrays}
+        episodes, left_out = countable(finished_episodes(rollout, config.task))
+        arrays = taken | episodes
+        if config.task.own_references:
+            self._worker.renew_references()
+        if self._failures is not None:
+            self._failures.add(episodes["episode/object_index"], episodes["episode/held"])
+            self._worker.weigh_objects(self._failures.weights)
+        meta = {"version": bundle.version, "schema": self._spec.schema, "steps": steps}
+        collected = time.monotonic()
+        self._link.upload(Message(arrays, meta), ticket)
+        ended = time.monotonic()
+        values = {
+            "steps_per_second": steps / (ended - began),
+            "share/waiting": (since.granted - since.asked) / (ended - since.asked),
+            "share/transport": (began - since.granted + ended - collected) / (ended - since.asked),
+            "rollouts": self._rollouts + 1.0,
+            "episodes_left_out": float(left_out),
+            **buffer_occupancy(np.asarray(rollout.occupancy)),
+            **(self._failures.metrics() if self._failures is not None else {}),
+        }
+        self._publish("metrics", Message({}, {"time": time.time(), "version": bundle.version, "values": values}))
+        self._on_rollout({"version": float(bundle.version), **values})
+        due, after = self._rollouts >= self._next_episode, self._worker.state
+        assert after is not None
+        if episode := self._follower.add(rollout.trace, before if started_fresh else None, after, due=due):
+            self._publish_episode(bundle, rollout, episode)
+            self._next_episode = self._rollouts + config.episode_every
+        if config.log_rollout_every and self._rollouts % config.log_rollout_every == 0:
+            self._publish("rollout", self._sampled(bundle, taken))
+        self._rollouts += 1
+        if config.objects.renew_every and self._rollouts % config.objects.renew_every == 0:
+            self._renew_objects()
+
+    def _sampled(self, bundle: PolicyBundle, arrays: dict[str, Array]) -> Message:
+        """A rollout's first environments, with what a reader needs to take the arrays apart."""
+        meta = {
+            "time": time.time(),
+            "version": bundle.version,
+            "actor": self._link.actor,
+            "rollout": self._rollouts,
+            "hand": self._hand.name,
+            "control_dt": self._config.task.control_dt,
+            "layout": [[name, size] for name, size in self._spec.layout],
+            "environments": self._config.environments,
+        }
+        return Message(first_environments(arrays, self._config.log_rollout_worlds or self._config.environments), meta)
+
+    def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, episode: Followed) -> None:
+        """Environment 0's episode."""
+        episodes = dict(zip(episode_fields(self._config.task), np.asarray(rollout.episodes)[0], strict=True))
+        metrics = {name.removeprefix("episode/"): float(v) for name, v in episodes.items() if "episode/" in name}
+        obj = self._objects[episode.object_index]
+        meta = {
+            "time": time.time(),
+            "version": bundle.version,
+            "actor": self._link.actor,
+            "success": metrics["success"] > 0,
+            "metrics": metrics,
+        }
+        message = episode_message(
+            self._hand, self._config.task, episode.trace, episode.goal, episode.surface, obj, meta
+        )
+        self._publish("episode", message)
+
+    def _publish(self, kind: str, message: Message) -> None:
+        """Publishes a message for logs under this actor's name."""
+        # JSON has no NaN: one such number would cost the whole message.
+        message = Message(message.arrays, finite(message.meta))
+        self._transport.publish(self._link.keys.log(kind, "actor", self._link.actor), message)
+
+
+class _Since(NamedTuple):
+    """Times of one rollout, on the monotonic clock."""
+
+    asked: float
+    """The actor began to ask for a ticket."""
+    granted: float
+    """It had one, and goes on to take the newest weights."""
+
+
+def buffer_occupancy(occupancy: np.ndarray) -> dict[str, float]:
+    """Metrics of `Rollout.occupancy`: steps in which the engine had no room for contacts or rows, and the fullest."""
+    contacts, rows = occupancy.max(0)
+    return {
+        "overflow": float((occupancy > 1.0).any(-1).sum()),
+        "contacts_peak": float(contacts),
+        "rows_peak": float(rows),
+    }
+
+
+def countable(episodes: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
+    """The episodes whose metrics (E,) are all finite numbers, and how many are not: the learner takes no others."""
+    fine = np.isfinite(np.stack(list(episodes.values()))).all(0)
+    return {name: values[fine] for name, values in episodes.items()}, int((~fine).sum())

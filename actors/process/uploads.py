@@ -1,0 +1,184 @@
+"""Rollouts on their way to the learner: each is sent until it has an outcome, across restarts of the learner."""
+
+import itertools
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any, Literal, NamedTuple
+
+from congrasp.common.errors import CongraspError, RefusedError, TransportError
+from congrasp.common.io.journal import Journal
+from congrasp.common.transport.base import Transport
+from congrasp.common.wire.codec import Message
+
+Outcome = Literal["accepted", "duplicate", "stale", "refused"]
+"""Outcome of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""
+_BACKOFF = (0.1, 0.5)  # first and longest delay between two attempts, s
+_SLOWEST = 100e3  # bytes a second of a link that is waited for
+
+
+class _Upload(NamedTuple):
+    """A rollout in the queue."""
+
+    message: Message
+    outcome: "Future[Outcome]"
+
+
+class Uploads:
+    """Threads that send rollouts.
+
+    Attributes:
+      failure: why nothing is sent any more, if that is so; also set by the owner.
+      free: acquired by the owner for each rollout that it hands over; released when that one has its outcome.
+      closed: set once no more is sent.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        key: str,
+        on_reply: Callable[[Mapping[str, Any]], None],
+        *,
+        window: int,
+        max_refusals: int,
+        request_timeout: float,
+        patience: float,
+        journal: Journal | None,
+    ):
+        """Starts the threads.
+
+        Args:
+          transport: a connected transport.
+          key: what rollouts are sent to.
+          on_reply: given the state of the learner that comes with every answer.
+          window: rollouts on their way at a time.
+          max_refusals: rollouts refused in a row after which nothing more is sent.
+          request_timeout: seconds that sending may take, and more by the rollout's size.
+          patience: seconds without any answer after which the learner is given up.
+          journal: where each answer is written down.
+        """
+        self.failure: CongraspError | None = None
+        self.free = threading.Semaphore(window)
+        self.closed = threading.Event()
+        self._transport, self._key, self._on_reply = transport, key, on_reply
+        self._max_refusals, self._timeout, self._patience = max_refusals, request_timeout, patience
+        self._journal = journal
+        self._refusals = 0
+        self._queue: queue.SimpleQueue[_Upload | None] = queue.SimpleQueue()
+        self._pending: set[Future[Outcome]] = set()
+        for index in range(window):
+            threading.Thread(target=self._send_all, daemon=True, name=f"upload-{index}").start()
+
+    def put(self, message: Message) -> "Future[Outcome]":
+        """Sends a rollout in the background; returns its outcome to be."""
+        outcome = Future[Outcome]()
+        self._pending.add(outcome)
+        outcome.add_done_callback(self._pending.discard)
+        self._queue.put(_Upload(message, outcome))
+        return outcome
+
+    def start_over(self) -> None:
+        """Forgets failure and refusals."""
+        self.failure, self._refusals = None, 0
+
+    def wait(self, timeout: float) -> bool:
+        """Waits until every rollout has its outcome; False if that takes longer than `timeout` seconds."""
+        deadline = time.monotonic() + timeout
+        for outcome in list(self._pending):
+            try:
+                outcome.exception(max(0.0, deadline - time.monotonic()))
+            except TimeoutError:
+                return False
+        return True
+
+    def close(self) -> None:
+        """Stops sending; what has no outcome yet is given up."""
+        self.closed.set()
+        self._queue.put(None)
+
+    def _send_all(self) -> None:
+        """Sends rollouts from the queue until it is closed; one thread of `window`."""
+        while (upload := self._queue.get()) is not None:
+            message, outcome = upload
+            try:
+                outcome.set_result(self._deliver(message))
+            except CongraspError as error:
+                self.failure = self.failure or error
+                outcome.set_exception(error)
+            except Exception as error:  # an answer that is none: the thread must not die in silence
+                self.failure = CongraspError(f"The learner's answer cannot be understood: {error!r}.")
+                outcome.set_exception(self.failure)
+            finally:
+                self.free.release()
+        self._queue.put(None)
+
+    def _deliver(self, message: Message) -> Outcome:
+        """Sends one rollout until it has an outcome."""
+        answered = time.monotonic()
+        damaged = 0
+        # To send again what is still on its way would only fill a slow link; a dead one ends the query by itself.
+        timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience)
+        delays = backoff()
+        while not self.closed.is_set():
+            delay = next(delays)
+            try:
+                reply = self._transport.query(self._key, message, timeout=timeout)
+            except RefusedError as error:  # it arrived damaged, or the learner failed on it
+                damaged += 1
+                answered = time.monotonic()
+                if damaged >= self._max_refusals:
+                    return self._refused(str(error))
+            except TransportError as error:
+                check_timeout(answered, self._patience, error)
+            else:
+                answered = time.monotonic()
+                self._on_reply(reply.meta)
+                if self.failure:
+                    raise self.failure
+                outcome = reply.meta["outcome"]
+                if outcome != "retry" and self._journal is not None:
+                    who = {name: message.meta[name] for name in ("actor", "incarnation")}
+                    answer = {"answer": message.meta["sequence"], "outcome": outcome, "life": reply.meta["life"]}
+                    self._journal.write(**who, **answer)
+                if outcome == "refused":
+                    return self._refused(str(reply.meta["why"]))
+                if outcome != "retry":
+                    self._refusals = 0
+                    return outcome
+                delays = backoff()
+                delay = float(reply.meta["retry_after"])
+            self.closed.wait(delay)
+        raise TransportError("The link was closed before the rollout was acknowledged.")
+
+    def _refused(self, why: str) -> Outcome:
+        """Counts a refusal; too many in a row are the failure of the uploads."""
+        self._refusals += 1
+        if self._refusals >= self._max_refusals:
+            self.failure = CongraspError(
+                f"The learner refused {self._refusals} rollouts in a row: {why}",
+                "Start the actor with the version of congrasp that the learner has.",
+            )
+        return "refused"
+
+
+def check_timeout(answered: float, patience: float, error: TransportError) -> None:
+    """Raises `TransportError` if the learner's last answer was too long ago.
+
+    Args:
+      answered: when that was, on the monotonic clock.
+      patience: seconds after which it was too long ago.
+      error: what came instead of an answer.
+    """
+    if time.monotonic() - answered > patience:
+        raise TransportError(
+            f"The learner has not answered for {patience:g} s: {error}", "Start the actor again later."
+        ) from None
+
+
+def backoff() -> "itertools.chain[float]":
+    """Seconds to wait after the first, second, ... failed attempt."""
+    first, longest = _BACKOFF
+    growing: Callable[[int], float] = lambda index: min(longest, first * 2**index)  # noqa: E731
+    return itertools.chain(map(growing, range(10)), itertools.repeat(longest))

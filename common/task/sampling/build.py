@@ -1,0 +1,287 @@
+"""Builds constraint banks: resting poses, heading sets, reference poses and wrist trajectories of a pool of objects."""
+
+import functools
+import itertools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.outline import CENTER, Outline, outline
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.pool import object_scale
+from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
+from congrasp.common.runtime.parallel import parallel_map
+from congrasp.common.task.sampling.approach_paths import make_trajectories
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
+from congrasp.common.task.sampling.headings import (
+    INWARD,
+    Headings,
+    above,
+    max_width,
+    sample_headings,
+    within_reach,
+)
+from congrasp.common.task.sampling.kept import kept_bank
+from congrasp.common.task.types import Array
+
+HEADINGS = 256
+POSES = 20
+_CLOSED_TOGETHER = 16
+"""Objects around which hands close at once, so that an accelerator has enough to do."""
+_CLEARANCE = 0.02
+"""Metres over the table that every waypoint of a trajectory keeps."""
+SOFT = 0.002
+"""Metres that fingers may be in the table, which contacts are too soft to prevent."""
+_STEEPEST_UP = 0.1
+"""Largest upward component of a reference pose's approach direction."""
+
+
+def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
+    """Heading sets by the paper's rules, and procedural reference poses and trajectories, for a pool of objects.
+
+    Those of large pools are kept on disk.
+
+    Args:
+      hand: the hand.
+      task: geometry of the approach.
+      objects: N objects, in the hand's size already (`common.objects.pool.scale_objects`).
+      seed: of everything random.
+
+    Raises:
+      CongraspError: an object has no heading that the hand can reach in any resting pose.
+    """
+    return kept_bank(hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed))
+
+
+def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
+    """What `build_bank` returns."""
+    count, scale = len(objects), object_scale(hand, task)
+    seeds = [(seed, n) for n in range(count)]
+    rows = parallel_map(
+        headings_of,
+        itertools.repeat(task, count),
+        objects,
+        seeds,
+        itertools.repeat(None, count),
+        itertools.repeat(scale, count),
+        itertools.repeat(outline(hand), count),
+    )
+    rests = max(len(row["rest"]) for row in rows)
+    for row in rows:
+        fill = np.resize(np.arange(len(row["rest"])), rests)
+        row["rest"], row["has_affordance"] = row["rest"][fill], row["has_affordance"][fill]
+        row["heading_index"], row["heading_back"] = row["heading_index"][:, fill], row["heading_back"][:, fill]
+    columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    chosen = [columns.pop(f"chosen_{name}") for name in Headings._fields]
+    surfaces = [np.stack([getattr(obj, name) for obj in objects]).astype(np.float32) for name in ("points", "normals")]
+    key = jax.random.key(seed)
+    references = _references(hand, *surfaces, *chosen, columns["rest"], key, waypoints=task.trajectory_points)
+    own = {"weight": np.ones(count, np.float32), "renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
+    own["mass"] = np.array([obj.mass for obj in objects], np.float32)
+    return jax.device_put(ConstraintBank(**columns, **references, **own))
+
+
+@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
+def _references(
+    hand: Hand,
+    points: Array,
+    normals: Array,
+    position: Array,
+    direction: Array,
+    cross: Array,
+    rest: Array,
+    key: Array,
+    *,
+    waypoints: int,
+) -> dict[str, Array]:
+    """The bank's poses and trajectories: the hand closed around N objects (N, P, 3) at headings (N, V, M, 3)."""
+    poses = _closed(hand, points, normals, position, direction, cross)
+    shape = position.shape[:-1]
+    flat = Poses(*(field.reshape(-1, field.shape[-1]) for field in poses))
+    rest = jnp.repeat(rest, 2 * POSES, axis=0)
+    path, turns, valid = make_references(hand, flat, rest, key, waypoints)
+    return {
+        "pose_q": poses.q,
+        "pose_position": poses.position,
+        "pose_quaternion": poses.quaternion,
+        "trajectory_position": path.reshape(*shape, *path.shape[1:]),
+        "trajectory_quaternion": turns.reshape(*shape, *turns.shape[1:]),
+        "pose_valid": jnp.swapaxes(valid.reshape(*shape, -1), -1, -2),
+    }
+
+
+@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
+def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int) -> tuple[Array, Array, Array]:
+    """A trajectory to each of M reference poses, and where the two can be used.
+
+    Args:
+      hand: the hand.
+      poses: M poses.
+      rest: (M, R, 7) resting poses of their objects.
+      key: random key of the trajectories.
+      waypoints: K.
+
+    Returns:
+      Trajectories (M, K, 3) and (M, K, 4), and (M, R) bool.
+    """
+    path, turns = make_trajectories(hand, poses.position, poses.quaternion, key, waypoints=waypoints)
+    room = height_over_table(hand, poses.q, path, turns, rest) > -SOFT
+    return path, turns, clear_of_table(hand, poses.quaternion, path, rest) & room
+
+
+def height_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
+    """(M, R) m, how high the lowest of a hand's capsules stays over the table on the way to each of M reference poses.
+
+    Args:
+      hand: the hand.
+      q: (M, F) finger angles of the poses.
+      path: (M, K, 3) wrist waypoints, in the object frame.
+      turns: (M, K, 4).
+      rest: (M, R, 7) resting poses of the objects.
+    """
+    return jax.lax.map(lambda row: _height_on_the_way(hand, *row), (q, path, turns, rest), batch_size=2048)
+
+
+def _height_on_the_way(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
+    """(R,) m, `height_over_table` of one reference."""
+    ends = kinematics.capsules(hand, kinematics.link_transforms(hand, q)).reshape(-1, 3)
+    ends = rotations.transform(path, turns, jnp.broadcast_to(ends, (len(path), *ends.shape)))
+    up = rotations.to_matrix(rest[:, 3:])[:, None, None, 2]
+    height = jnp.sum(up * ends, -1) + rest[:, None, None, 2] - np.repeat(hand.capsule_radii, 2)
+    return jnp.min(height, (1, 2))
+
+
+def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> Array:
+    """(M, R) bool: a reference pose's approach comes from above or level, and its whole trajectory stays in the air.
+
+    Args:
+      hand: its heading axis is used.
+      quaternion: (M, 4) wrist orientations of the poses, in the object frame.
+      path: (M, K, 3) wrist waypoints.
+      rest: (M, R, 7) resting poses of the objects.
+    """
+    heading = rotations.rotate(
+        quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), (*quaternion.shape[:-1], 3))
+    )
+    rising = jnp.einsum("mri,mi->mr", rotations.to_matrix(rest[..., 3:])[..., 2, :], heading)
+    return above_table(path, rest) & (rising < _STEEPEST_UP)
+
+
+def above_table(path: Array, rest: Array) -> Array:
+    """(M, R) bool: all waypoints (M, K, 3) of a wrist stay over the table in the resting poses (M, R, 7) of objects."""
+    up = rotations.to_matrix(rest[..., 3:])[..., 2, :]
+    return jnp.min(jnp.einsum("mri,mki->mrk", up, path), -1) + rest[..., 2] > _CLEARANCE
+
+
+def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Poses:
+    """Reference poses (N, V, M, ...) at headings (N, V, M, 3) by closing the hand around the objects."""
+
+    def of_object(row: tuple[Array, ...]) -> Poses:
+        points, normals, *headings = row
+        flat = closed_poses(hand, points, normals, *(field.reshape(-1, 3) for field in headings))
+        return Poses(*(field.reshape(2, POSES, -1) for field in flat))
+
+    return jax.lax.map(of_object, (points, normals, *headings), batch_size=min(_CLOSED_TOGETHER, len(points)))
+
+
+def headings_of(
+    task: TaskConfig,
+    obj: GraspObject,
+    seed: tuple[int, int],
+    given: Headings | None = None,
+    scale: float = 1.0,
+    hand: Outline = CENTER,
+) -> dict[str, np.ndarray]:
+    """What NumPy finds out about one object; resting poses without a reachable heading are left out.
+
+    Args:
+      task: geometry of the approach.
+      obj: the object.
+      seed: of its headings.
+      given: `HEADINGS` headings to take instead of sampled ones.
+      scale: of the object; the rules' lengths follow it, so that a larger hand gets the headings of the smaller object.
+      hand: what must stay clear of the table.
+
+    Raises:
+      CongraspError: it is too wide (`TooWideError`), or can be approached in none of its resting poses.
+    """
+    rng = np.random.default_rng(seed)
+    inward, width = scale * INWARD, max_width(hand, scale)
+    whole, graspable = (
+        given or sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width)
+        for use in (False, True)
+    )
+    assert whole is not None, "only the graspable region may be out of reach"
+    sets = [whole, graspable or whole]
+    own = CENTER if task.headings == "center" else hand
+    # Captured headings may be off by a centimetre, and a hand held what they are of.
+    regions = [None, obj.non_graspable_points if graspable is not None and given is None else None]
+    found = [
+        within_reach(headings, obj.points, obj.rest_poses, own, avoid)
+        for headings, avoid in zip(sets, regions, strict=True)
+    ]
+    reachable = np.stack([fine for _, fine in found])
+    if task.headings == "above" and reachable[0].any():
+        steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
+        reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
+    usable = np.flatnonzero(reachable[0].any(-1))
+    if len(usable) == 0:
+        raise CongraspError(
+            f"The object '{obj.name}' cannot be approached in any of its resting poses.",
+            "Scale it, or leave it out.",
+        )
+    reachable, rest = reachable[:, usable], obj.rest_poses[usable]
+    index = np.array([[_repeated(row) for row in region] for region in reachable])
+    back = np.array(
+        [
+            [np.linalg.norm(cleared[rest].position - headings.position, axis=-1) for rest in usable]
+            for headings, (cleared, _) in zip(sets, found, strict=True)
+        ]
+    )
+    chosen = [_spread(rng, region) for region in reachable]
+    at = [
+        np.stack([cleared[usable[r]].position[h] for r, h in zip(*some, strict=True)])
+        for some, (cleared, _) in zip(chosen, found, strict=True)
+    ]
+    keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
+    avoid = obj.non_graspable_points[keep]
+    floats = {
+        "points": obj.points[keep],
+        "rest": rest,
+        **{f"heading_{name}": np.stack([getattr(s, name) for s in sets]) for name in Headings._fields},
+        "heading_back": np.take_along_axis(back, index, -1),
+        "chosen_position": np.stack(at),
+        "chosen_direction": np.stack([s.direction[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
+        "chosen_cross": np.stack([s.cross[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
+    }
+    return {
+        **{name: value.astype(np.float32) for name, value in floats.items()},
+        "avoid": avoid,
+        "heading_index": index.astype(np.int32),
+        "has_affordance": (graspable is not None) & avoid.any() & reachable[1].any(-1),
+    }
+
+
+def _repeated(which: np.ndarray) -> np.ndarray:
+    """(H,) indices of what is true in (H,), repeated; zeros where nothing is."""
+    indices = np.flatnonzero(which)
+    return np.resize(indices, HEADINGS) if len(indices) else np.zeros(HEADINGS, int)
+
+
+def _spread(rng: np.random.Generator, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Resting poses (M,) and headings (M,) of reference poses, as many for each resting pose that allows any (R, H).
+
+    Where none does, every heading is as likely as another.
+    """
+    rests = np.flatnonzero(allowed.any(1)) if allowed.any() else np.arange(len(allowed))
+    rests = np.resize(rng.permutation(rests), POSES)
+    weights = allowed[rests] if allowed.any() else np.ones((POSES, allowed.shape[1]))
+    return rests, np.array([rng.choice(len(row), p=row / row.sum()) for row in weights])

@@ -1,0 +1,53 @@
+"""Constraint banks of large pools, kept on disk: they follow from objects, hand and task, and take long to build."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+
+import congrasp.common
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.spec import Hand
+from congrasp.common.io.caches import keep, read_kept, source_digest
+from congrasp.common.io.files import cache_folder
+from congrasp.common.objects import store
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.wire.codec import Message
+
+LEAST_OBJECTS = 64
+"""Pools from this size on are worth a file."""
+MOST_FILES = 8
+"""Banks that are kept; that of 800 objects has some 50 MB."""
+_IRRELEVANT = (
+    *("reward", "control", "mass_range", "friction_range", "gain_range", "hold_steps", "drop_height", "disturbed"),
+    *("p_", "observation", "history", "sensing"),
+)
+"""Beginnings of the names of settings that no bank depends on."""
+
+
+def kept_bank(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, build: Callable[[], ConstraintBank]
+) -> ConstraintBank:
+    """Returns the bank that `build` makes of these arguments, from disk if it was made before."""
+    if len(objects) < LEAST_OBJECTS:
+        return build()
+    path = cache_folder("banks") / f"{_key(hand, task, objects, seed)}.safetensors"
+    if (message := read_kept(path)) and message.arrays.keys() == set(ConstraintBank._fields):
+        return jax.device_put(ConstraintBank(**message.arrays))
+    bank = build()
+    keep(path, Message({name: np.asarray(field) for name, field in bank._asdict().items()}), MOST_FILES)
+    return bank
+
+
+def _key(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> str:
+    """What a bank depends on, the code and the device's arithmetic included, as a file's name."""
+    code = source_digest(congrasp.common)
+    settings = {name: value for name, value in dataclasses.asdict(task).items() if not name.startswith(_IRRELEVANT)}
+    device = jax.local_devices()[0].device_kind
+    digests = [store.digest(obj) for obj in objects]
+    text = json.dumps([code, jax.__version__, device, hand.reference, settings, seed, digests])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

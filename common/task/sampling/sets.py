@@ -1,0 +1,190 @@
+"""Constraint sets as files: headings, reference poses and wrist trajectories of one object for one hand."""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from congrasp.common.config import Split
+from congrasp.common.described import check_arrays
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.inputs import file_name, read_file
+from congrasp.common.objects import store
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.sampling.bank import ConstraintBank, stacked
+from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode
+
+SUFFIX = ".constraints.safetensors"
+REGIONS = ("whole surface", "graspable region")
+"""The axis V: constraints for the whole surface, and for the graspable region alone."""
+FORMAT = 2
+_LARGEST = 100.0  # m or rad
+_MASS = 0.2  # kg of an object whose set is of a time when sets did not say it
+MEANING = {
+    "surface/points": "(P, 3) m, object frame",
+    "surface/minus": "(P,) bool, the point belongs to the avoid region",
+    "rest": "(R, 7) resting poses in the world, position (m) and quaternion; the table's top is at z = 0",
+    "heading/position": "(V, H, 3) m, object frame: where the hand's centre should be",
+    "heading/direction": "(V, H, 3) unit, object frame: the way the hand moves",
+    "heading/cross": "(V, H, 3) unit, object frame: along the hand's cross-finger axis",
+    "heading/allowed": "(V, R, H) bool, the table leaves room for the heading",
+    "heading/back": "(V, R, H) m by which the position moves back along the direction to stay clear of the table",
+    "pose/q": "(V, M, F) rad, finger joints",
+    "pose/position": "(V, M, 3) m, wrist in the object frame",
+    "pose/quaternion": "(V, M, 4) wrist frame to object frame",
+    "trajectory/position": "(V, M, K, 3) m, wrist waypoints in the object frame; trajectory m ends at pose m",
+    "trajectory/quaternion": "(V, M, K, 4) wrist frame to object frame",
+    "pose/allowed": "(V, R, M) bool, the table leaves room for the pose and its trajectory",
+    "heading/training": "(V, H) bool, the heading is for training (80 % are); the others are held out",
+    "pose/training": "(V, M) bool, the same for pose m and trajectory m (captured: 80 % of the data set's)",
+    "visual/vertices": "(n, 3) m, object frame",
+    "visual/faces": "(m, 3) indices of vertices",
+}
+
+
+def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
+    """The constraint bank that episodes are drawn from, of constraint sets of one hand.
+
+    Sets may differ in their numbers of resting poses, headings and references: they are repeated to the largest.
+
+    Args:
+      sets: N constraint sets.
+      split: takes all constraints, those for training, or those that are held out.
+
+    Raises:
+      CongraspError: the sets are of different hands or sizes, or one of them has no heading left.
+    """
+    first = sets[0]
+    for made in sets:
+        for key in ("hand", "finger_joints"):
+            if made.meta[key] != first.meta[key]:
+                raise CongraspError(
+                    f"The set of '{made.meta['object']}' is for the hand '{made.meta['hand']}', that of "
+                    f"'{first.meta['object']}' for '{first.meta['hand']}'.",
+                    "Use sets of one hand together.",
+                )
+        for name in ("surface/points", "trajectory/position"):
+            size, wanted = (m.arrays[name].shape[-2] for m in (made, first))
+            if size != wanted:
+                raise CongraspError(
+                    f"The sets of '{made.meta['object']}' and '{first.meta['object']}' differ in {name}: {size} and "
+                    f"{wanted}.",
+                    "Make them with the same settings.",
+                )
+    return stacked([_row(made, split) for made in sets])
+
+
+def _row(made: Message, split: Split) -> ConstraintBank:
+    """One set as a row of a constraint bank: what belongs to the split, in resting poses that allow a heading."""
+    arrays = made.arrays
+    heading, pose = (_allowed(made, kind, split) for kind in ("heading", "pose"))
+    usable = np.flatnonzero(heading[0].any(-1))
+    if len(usable) == 0:
+        raise CongraspError(
+            f"The constraint set of '{made.meta['object']}' has no heading ({split}) in any resting pose.",
+            "Leave it out, or take another split.",
+        )
+    heading, back = heading[:, usable], arrays["heading/back"][:, usable]
+    count = heading.shape[-1]
+    index = np.array([[np.resize(np.flatnonzero(row) if row.any() else [0], count) for row in v] for v in heading])
+    return ConstraintBank(
+        points=arrays["surface/points"],
+        avoid=arrays["surface/minus"],
+        rest=arrays["rest"][usable],
+        heading_position=arrays["heading/position"],
+        heading_direction=arrays["heading/direction"],
+        heading_cross=arrays["heading/cross"],
+        heading_index=index.astype(np.int32),
+        heading_back=np.take_along_axis(back, index, -1),
+        pose_q=arrays["pose/q"],
+        pose_position=arrays["pose/position"],
+        pose_quaternion=arrays["pose/quaternion"],
+        trajectory_position=arrays["trajectory/position"],
+        trajectory_quaternion=arrays["trajectory/quaternion"],
+        pose_valid=pose[:, usable],
+        has_affordance=arrays["surface/minus"].any() & heading[1].any(-1),
+        weight=np.float32(1.0),
+        mass=np.float32(made.meta.get("object_mass", _MASS)),
+        renewable=np.bool_(False),
+        grasps=np.zeros(2, int),
+    )
+
+
+def _allowed(made: Message, kind: Literal["heading", "pose"], split: Split) -> np.ndarray:
+    """(V, R, H or M) bool, the headings or references of a split for which the table leaves room."""
+    allowed, training = made.arrays[f"{kind}/allowed"], made.arrays[f"{kind}/training"]
+    return allowed & _belongs(training, split)[:, None]
+
+
+def _belongs(training: np.ndarray, split: Split) -> np.ndarray:
+    """(V, M) bool, what belongs to a split, of what is for training (V, M)."""
+    return {"all": np.ones_like(training), "training": training, "held-out": ~training}[split]
+
+
+def load(path: pathlib.Path) -> Message:
+    """Reads a set.
+
+    Raises:
+      CongraspError: no such file, another kind of file, or damaged content.
+    """
+    remedy = "Make it anew with 'congrasp constraints generate'."
+    try:
+        message = decode(read_file(path, MAX_MESSAGE))
+    except OSError as error:
+        raise CongraspError(f"The constraint set {path} cannot be read: {error.strerror}.", remedy) from None
+    except CongraspError as error:
+        raise CongraspError(f"{path} cannot be read as a constraint set: {error}", remedy) from None
+    if message.meta.get("kind") != "constraints" or message.meta.get("format") != FORMAT:
+        raise CongraspError(f"{path} is not a constraint set of this version of congrasp.", remedy)
+    if missing := sorted(MEANING.keys() - message.arrays.keys()):
+        raise CongraspError(f"The constraint set {path} lacks '{missing[0]}'.", remedy)
+    try:
+        _check(message)
+    except (CongraspError, ValueError) as error:
+        raise CongraspError(f"The constraint set {path} is damaged: {str(error).split('. ')[0]}.", remedy) from None
+    return message
+
+
+def _check(message: Message) -> None:
+    """An error for facts of another kind, and for arrays that are not what `MEANING` says."""
+    meta, sizes = message.meta, {"V": len(REGIONS), "F": len(_names(message.meta.get("finger_joints")))}
+    for name in ("object", "hand"):
+        file_name(meta.get(name), f"the {name} of a constraint set")
+    scale = meta.get("object_scale")
+    if not isinstance(scale, (int, float)) or not 0 < scale <= 100 or not isinstance(meta.get("object_digest"), str):
+        raise ValueError("its object_scale or object_digest is none")
+    mass = meta.get("object_mass", _MASS)
+    if isinstance(mass, bool) or not isinstance(mass, (int, float)) or not 0 < mass <= 1000:
+        raise ValueError("its object_mass is none")
+    if len(_names(meta.get("variants"))) != len(REGIONS):
+        raise ValueError(f"it has other variants than {', '.join(REGIONS)}")
+    sizes = check_arrays(message.arrays, MEANING, indices=("visual/faces",), largest=_LARGEST, sizes=sizes)
+    faces = message.arrays["visual/faces"]
+    if faces.min() < 0 or faces.max() >= sizes["n"]:
+        raise ValueError("visual/faces names vertices that are not there")
+
+
+def _names(value: Any) -> list[str]:
+    return value if isinstance(value, list) and all(isinstance(name, str) for name in value) else []
+
+
+def load_for(
+    folder: pathlib.Path, objects: Sequence[GraspObject], split: Split = "all"
+) -> tuple[list[GraspObject], list[Message]]:
+    """The objects that have a set with a heading of the split in a folder, and their sets.
+
+    Raises:
+      CongraspError: a set cannot be read, or was made for another object of the same name.
+    """
+    chosen, sets = [], []
+    for obj in objects:
+        path = folder / f"{obj.name}{SUFFIX}"
+        if path.is_file():
+            made = load(path)
+            if made.meta["object_digest"] != store.digest(obj):
+                raise CongraspError(f"{path} was made for another object '{obj.name}'.", "Name that object's folder.")
+            if _allowed(made, "heading", split)[0].any():
+                chosen.append(obj)
+                sets.append(made)
+    return chosen, sets

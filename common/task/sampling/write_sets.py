@@ -1,0 +1,175 @@
+"""Makes constraint sets, the files that `common.task.sampling.sets` reads, and describes them."""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands.spec import Hand
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import file_name
+from congrasp.common.objects import store
+from congrasp.common.objects.pool import object_scale, scale_objects
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.sampling.bank import ConstraintBank, rows_of
+from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.task.sampling.sets import FORMAT, MEANING, REGIONS, SUFFIX
+from congrasp.common.wire.codec import Message, encode
+
+_TRAINING = 0.8
+
+
+def make_sets(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, bank: ConstraintBank | None = None
+) -> list[Message]:
+    """The constraint set of each object, as training and evaluation make it.
+
+    Args:
+      hand: the hand.
+      task: geometry of the approach.
+      objects: the objects.
+      seed: of the constraints.
+      bank: of these objects in the hand's size, where it is there already; its reference poses are kept.
+
+    Raises:
+      CongraspError: an object has no heading that the hand can reach in any resting pose.
+    """
+    fitting = scale_objects(hand, task, objects)
+    rows = rows_of(bank or build_bank(hand, task, fitting, seed))
+    scale = object_scale(hand, task)
+    return [
+        set_of(
+            hand,
+            rows[n],
+            fitting[n],
+            seed,
+            {"object_scale": scale, "object_digest": store.digest(obj)},
+        )
+        for n, obj in enumerate(objects)
+    ]
+
+
+def set_of(
+    hand: Hand,
+    row: ConstraintBank,
+    obj: GraspObject,
+    seed: int,
+    about: dict[str, Any] | None = None,
+    *,
+    pose_training: np.ndarray | None = None,
+    heading_training: np.ndarray | None = None,
+) -> Message:
+    """The constraint set of one object.
+
+    Args:
+      hand: the hand.
+      row: of the constraint bank, without the axis of the objects.
+      obj: the object.
+      seed: of the constraints.
+      about: further facts for the file.
+      pose_training: (M,) bool, the references for training; by default the first 80 %, as in evaluations
+        (`services.evaluate.references`).
+      heading_training: (H,) bool, the headings for training; by default 80 % that are drawn from the seed.
+    """
+    # The bank fills an object's resting poses up to the most of any object by repeating them.
+    again = np.flatnonzero((row.rest[1:] == row.rest[0]).all(-1))
+    rests = int(again[0]) + 1 if len(again) else len(row.rest)
+    allowed = np.zeros((len(REGIONS), rests, row.heading_position.shape[1]), bool)
+    back = np.zeros(allowed.shape, np.float32)
+    for v, r in np.ndindex(allowed.shape[:2]):
+        if v == 0 or row.has_affordance[r] or not row.avoid.any():
+            allowed[v, r, row.heading_index[v, r]] = True
+            back[v, r, row.heading_index[v, r]] = row.heading_back[v, r]
+    if pose_training is None:
+        pose_training = for_training(row.pose_q.shape[1])
+    if heading_training is None:
+        heading_training = for_training(row.heading_position.shape[1], seed)
+    arrays = {
+        "surface/points": row.points,
+        "surface/minus": row.avoid,
+        "rest": row.rest[:rests],
+        "heading/position": row.heading_position,
+        "heading/direction": row.heading_direction,
+        "heading/cross": row.heading_cross,
+        "heading/allowed": allowed,
+        "heading/back": back,
+        "pose/q": row.pose_q,
+        "pose/position": row.pose_position,
+        "pose/quaternion": row.pose_quaternion,
+        "trajectory/position": row.trajectory_position,
+        "trajectory/quaternion": row.trajectory_quaternion,
+        "pose/allowed": row.pose_valid[:, :rests],
+        "heading/training": _twice(heading_training),
+        "pose/training": _twice(pose_training),
+        "visual/vertices": np.asarray(obj.visual_vertices, np.float32),
+        "visual/faces": np.asarray(obj.visual_faces, np.int32),
+    }
+    meta: dict[str, Any] = {
+        "kind": "constraints",
+        "format": FORMAT,
+        "hand": hand.name,
+        "hand_reference": hand.reference,
+        "object": obj.name,
+        "object_digest": store.digest(obj),
+        "object_scale": 1.0,
+        "object_mass": float(obj.mass),
+        "seed": seed,
+        "variants": list(REGIONS),
+        "finger_joints": [joint.name for joint in hand.joints],
+        "quaternions": "(w, x, y, z)",
+        "object_frame": "origin at the centre of mass, orientation of the object file, lengths times object_scale",
+        "arrays": MEANING,
+        **(about or {}),
+    }
+    return Message(arrays, meta)
+
+
+def for_training(count: int, seed: int | None = None) -> np.ndarray:
+    """(count,) bool, true for 80 % (rounded up): drawn from the seed, or the first ones without one."""
+    order = np.arange(count) if seed is None else np.random.default_rng(seed).permutation(count)
+    return np.asarray(order < np.ceil(_TRAINING * count))
+
+
+def _twice(training: np.ndarray) -> np.ndarray:
+    """(V, M) of (M,): the same in both regions."""
+    return np.tile(training, (len(REGIONS), 1))
+
+
+def save(constraints: Message, folder: pathlib.Path) -> pathlib.Path:
+    """Writes a set under its object's name; returns the file."""
+    path = folder / f"{file_name(constraints.meta['object'], 'a constraint set')}{SUFFIX}"
+    write_atomically(path, encode(constraints))
+    return path
+
+
+def _scale_text(scale: float) -> str:
+    """How much larger than its file the object is; empty where it is not."""
+    return "" if scale == 1.0 else f", {scale:g} times as large, for this hand"
+
+
+def describe(constraints: Message) -> dict[str, str]:
+    """What a set holds, as text by name."""
+    arrays, meta = constraints.arrays, constraints.meta
+    allowed, poses = arrays["heading/allowed"], arrays["pose/allowed"]
+    waypoints = arrays["trajectory/position"]
+    length = np.linalg.norm(np.diff(waypoints, axis=2), axis=-1).sum(-1)
+    rows = {
+        "hand": f"{meta['hand']}, {len(meta['finger_joints'])} finger joints",
+        "object": f"{meta['object']} ({meta['object_digest']}){_scale_text(meta['object_scale'])}",
+        "avoid region": f"{arrays['surface/minus'].mean():.0%} of {len(arrays['surface/points'])} surface points",
+        "headings": f"{allowed.shape[2]} for each of: {', '.join(meta['variants'])}",
+        "reference poses": f"{poses.shape[2]} for each",
+        "wrist trajectories": f"as many, {waypoints.shape[2]} waypoints, "
+        f"{100 * length.min():.0f} to {100 * length.max():.0f} cm long; each ends at its pose",
+    }
+    if "source" in meta:
+        rows["captured"] = f"{meta['source']}: {', '.join(meta['demonstrations'])}"
+    for r, rest in enumerate(arrays["rest"]):
+        counts = [
+            f"{region}: {int(allowed[v, r].sum())} headings, {int(poses[v, r].sum())} poses"
+            for v, region in enumerate(meta["variants"])
+        ]
+        rows[f"resting pose {r + 1}"] = f"{100 * rest[2]:.1f} cm high; the table leaves on the {'; '.join(counts)}"
+    return rows

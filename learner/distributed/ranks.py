@@ -1,0 +1,334 @@
+"""Several learner processes, the ranks of one run: who is there, what they agree on, and the devices they share.
+
+Arrays are reduced by XLA (`collectives`) between one device of each rank. In addition the ranks talk over plain TCP
+with rank 0 in the middle: an update begins when all of them have a batch, they end together, they see each other's
+metrics, and a rank that dies or falls silent ends the others with one line, also those that sit in a collective.
+The two ports of the coordinator have no authentication, as JAX's own has none: keep them inside the cluster.
+"""
+
+import collections
+import contextlib
+import json
+import os
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NoReturn
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
+from congrasp.learner.distributed.collectives import AXIS
+
+JOIN_SECONDS = 300.0
+"""Seconds within which all ranks must have come."""
+ROUND_SECONDS = 300.0
+"""Seconds that an update, or an exchange between ranks that are alive, may take."""
+_SILENCE_SECONDS = 20.0
+_HEARTBEAT_SECONDS = 2.0
+_RELAY_SECONDS = 2.0  # that rank 0 lives on, so that JAX does not abort the others before they have printed why
+_LENGTH = struct.Struct("!Q")
+_META = "meta"
+
+
+def end_process(text: str, code: int = TransportError.exit_code) -> NoReturn:
+    """Prints the reason in one line and ends the process at once.
+
+    Its main thread may wait for a rank that will never come, and so would JAX at an orderly exit, only to abort then.
+    """
+    with contextlib.suppress(OSError):  # the disk that they are written to may be full
+        sys.stdout.flush()
+        print(f"congrasp: error: {text}", file=sys.stderr, flush=True)
+    os._exit(code)
+
+
+class _Link:
+    """Messages over a TCP connection; silence for too long is an `OSError`, as its end is."""
+
+    def __init__(self, connection: socket.socket):
+        connection.settimeout(_SILENCE_SECONDS)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket, self._file, self._lock = connection, connection.makefile("rb"), threading.Lock()
+
+    def send(self, message: Message) -> None:
+        # Meta data as an array: a header's length is limited.
+        meta = np.frombuffer(json.dumps(message.meta).encode(), np.uint8)
+        data = encode(Message({**message.arrays, _META: meta}))
+        with self._lock:
+            self._socket.sendall(_LENGTH.pack(len(data)) + data)
+
+    def receive(self) -> Message:
+        (length,) = _LENGTH.unpack(self._read(_LENGTH.size))
+        if length > MAX_MESSAGE:
+            raise ConnectionError(f"a message of {length} bytes")
+        arrays = dict(decode(self._read(length)).arrays)
+        return Message(arrays, json.loads(arrays.pop(_META).tobytes()))
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+    def _read(self, length: int) -> bytes:
+        data = self._file.read(length)
+        if len(data) < length:
+            raise ConnectionError("the connection ended")
+        return data
+
+
+class Ranks:
+    """This process among the learner's ranks; by default it is alone.
+
+    They agree in rounds. Each posts an entry, and all are given the list of entries, in rank order, once all are there,
+    or at once when somebody posts an urgent one (the entries that are missing are None then).
+
+    Attributes:
+      rank: number of this process.
+      count: number of ranks.
+      mesh: a device of every rank along `learner.distributed.collectives.AXIS`; None if this process is alone.
+    """
+
+    def __init__(
+        self,
+        rank: int = 0,
+        count: int = 1,
+        links: Mapping[int, _Link] | None = None,
+        on_lost: Callable[[str], object] = end_process,
+    ):
+        """Watches over the links: to every other rank on rank 0, to rank 0 elsewhere."""
+        self.rank, self.count = rank, count
+        self.mesh: Mesh | None = None
+        self._links = dict(links or {})
+        self._on_lost = on_lost
+        self._changed = threading.Condition()
+        self._round = self._deciding = 0
+        self._entries: dict[int, Message] = {}
+        self._decisions: collections.deque[Message] = collections.deque()
+        self._leaving = threading.Event()
+        self._lost = threading.Event()
+        for peer, link in self._links.items():
+            threading.Thread(target=self._listen, args=(peer, link), daemon=True, name=f"rank-{peer}").start()
+        if self._links:
+            threading.Thread(target=self._beat, daemon=True, name="rank-heartbeat").start()
+
+    @classmethod
+    def join(cls, rank: int, count: int, coordinator: str, on_lost: Callable[[str], object] = end_process) -> "Ranks":
+        """Meets the other ranks; to be called before anything else wakes JAX up.
+
+        Args:
+          rank: number of this process.
+          count: number of ranks.
+          coordinator: `host:port` of rank 0, which listens there (JAX) and at the next port (the ranks).
+          on_lost: given the reason when another rank is lost; it should not return.
+
+        Raises:
+          CongraspError: the numbers or the address make no sense, or the port is in use.
+          TransportError: not all ranks came in time.
+        """
+        if not 0 <= rank < count:
+            raise CongraspError(f"There is no rank {rank} of {count}.", "Ranks are numbered from 0.")
+        if count == 1:
+            return cls()
+        host, _, port = coordinator.rpartition(":")
+        if not host or not port.isdecimal() or not 0 < int(port) < 65535:
+            raise CongraspError(f"'{coordinator}' is no address of rank 0.", "Give --coordinator HOST:PORT.")
+        # All interfaces unless it is the loopback: rank 0 may not know itself by the name that others know it by.
+        bind = host if host in ("localhost", "127.0.0.1") else ""
+        deadline = time.monotonic() + JOIN_SECONDS
+        if rank == 0:
+            links = _gather(count, bind, int(port) + 1, deadline)
+        else:
+            links = {0: _reach(rank, count, host, int(port) + 1, deadline)}
+        ranks = cls(rank, count, links, on_lost)
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        jax.config.update("jax_enable_preemption_service", False)  # it would take SIGTERM for itself
+        jax.distributed.initialize(
+            coordinator,
+            count,
+            rank,
+            local_device_ids=[0],
+            initialization_timeout=int(JOIN_SECONDS),
+            coordinator_bind_address=f"{bind or '[::]'}:{port}",
+            shutdown_timeout_seconds=int(_SILENCE_SECONDS),
+        )
+        first = {device.process_index: device for device in reversed(jax.devices())}
+        ranks.mesh = Mesh(np.array([first[number] for number in range(count)]), (AXIS,))
+        return ranks
+
+    def post(
+        self, entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None, *, urgent: bool = False
+    ) -> None:
+        """Puts this rank's entry (JSON) into the round; a second one replaces it, one that is late is ignored."""
+        frame = Message(arrays or {}, {"round": self._round, "urgent": urgent, "entry": entry})
+        if self.rank == 0:
+            self._collect(0, frame)
+        else:
+            with contextlib.suppress(OSError):  # whoever listens to the link sees its end
+                self._links[0].send(frame)
+
+    def poll(self, timeout: float) -> Message | None:
+        """The round's decision: `entries` in its meta data and the arrays of rank 0; None if there is none in time."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._decisions, timeout):
+                return None
+            self._round += 1
+            return self._decisions.popleft()
+
+    def exchange(self, entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None) -> Message:
+        """A whole round: every rank calls this, and all are given everyone's entries, and the arrays of rank 0."""
+        self.post(entry, arrays)
+        decision = self.poll(ROUND_SECONDS)
+        if decision is None:
+            raise TransportError(f"The {self.count} ranks did not come together within {ROUND_SECONDS:.0f} s.")
+        return decision
+
+    @contextlib.contextmanager
+    def watchdog(self) -> Iterator[None]:
+        """A deadline around code with collectives, which would wait for ever for a rank that does not come."""
+        if self.count == 1:
+            yield
+            return
+        text = f"The ranks did not get through an update within {ROUND_SECONDS:.0f} s; rank {self.rank} stops."
+        timer = threading.Timer(ROUND_SECONDS, self._on_lost, (text,))
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+
+    def close(self) -> None:
+        """Leaves the run cleanly: all ranks call this, and from then on the end of another rank is no failure."""
+        if self.count == 1 or self._leaving.is_set():
+            return
+        self.exchange({"bye": True})
+        self._leaving.set()
+        jax.distributed.shutdown()
+
+    def fail(self, error: BaseException) -> None:
+        """Tells the others why this rank ends, unless all leave cleanly or the cause is another rank's end."""
+        if self.count == 1 or self._leaving.is_set():
+            return
+        if not isinstance(error, CongraspError) and self._lost.wait(_RELAY_SECONDS):
+            time.sleep(_SILENCE_SECONDS)  # a collective broke because a peer is gone, which is being reported right now
+        self._leaving.set()
+        reason = str(error) or type(error).__name__
+        for link in self._links.values():
+            with contextlib.suppress(OSError):
+                link.send(Message(meta={"lost": f"Rank {self.rank} ended: {reason}"}))
+
+    def _collect(self, rank: int, frame: Message) -> None:
+        """On rank 0: takes an entry in, and sends the decision around when it is made."""
+        with self._changed:
+            if frame.meta["round"] != self._deciding:
+                return
+            self._entries[rank] = frame
+            if len(self._entries) < self.count and not frame.meta["urgent"]:
+                return
+            entries = [self._entries[r].meta["entry"] if r in self._entries else None for r in range(self.count)]
+            arrays = self._entries[0].arrays if 0 in self._entries else {}
+            decision = Message(arrays, {"round": self._deciding, "entries": entries})
+            self._deciding += 1
+            self._entries = {}
+            for link in self._links.values():
+                with contextlib.suppress(OSError):
+                    link.send(decision)
+            self._decide(decision)
+
+    def _decide(self, decision: Message) -> None:
+        with self._changed:
+            if all(entry and entry.get("bye") for entry in decision.meta["entries"]):
+                self._leaving.set()
+            self._decisions.append(decision)
+            self._changed.notify_all()
+
+    def _listen(self, peer: int, link: _Link) -> None:
+        """Takes in what a peer sends, until the peer is gone."""
+        try:
+            while True:
+                message = link.receive()
+                if "lost" in message.meta:
+                    return self._lose(message.meta["lost"], peer)
+                if "entry" in message.meta:
+                    self._collect(peer, message)
+                elif "entries" in message.meta:
+                    self._decide(message)
+        except TimeoutError:
+            self._lose(f"Rank {peer} has been silent for {_SILENCE_SECONDS:.0f} s", peer)
+        except (OSError, CongraspError, KeyError, ValueError):
+            self._lose(f"Rank {peer} ended", peer)
+
+    def _lose(self, what: str, peer: int) -> None:
+        if self._leaving.is_set() or self._lost.is_set():
+            return
+        self._lost.set()
+        others = [link for number, link in self._links.items() if number != peer]
+        for link in others:
+            with contextlib.suppress(OSError):
+                link.send(Message(meta={"lost": what}))
+        if self.rank == 0:
+            time.sleep(_RELAY_SECONDS)
+        self._on_lost(f"{what.rstrip('.')}. Rank {self.rank} cannot go on alone: start all ranks with --resume.")
+
+    def _beat(self) -> None:
+        while not self._leaving.wait(_HEARTBEAT_SECONDS):
+            for link in self._links.values():
+                with contextlib.suppress(OSError):
+                    link.send(Message())
+
+
+def _gather(count: int, bind: str, port: int, deadline: float) -> dict[int, _Link]:
+    """On rank 0: the links to all others."""
+    try:
+        server = socket.create_server((bind, port))
+    except OSError as error:
+        raise CongraspError(
+            f"Rank 0 cannot listen at port {port}: {error.strerror}.", "Choose another --coordinator HOST:PORT."
+        ) from None
+    links: dict[int, _Link] = {}
+    with server:
+        while len(links) < count - 1:
+            server.settimeout(max(0.1, deadline - time.monotonic()))
+            try:
+                link = _Link(server.accept()[0])
+                hello = link.receive().meta
+            except TimeoutError:
+                if time.monotonic() < deadline:
+                    continue
+                missing = sorted(set(range(1, count)) - links.keys())
+                raise TransportError(f"Ranks {missing} of {count} did not come within {JOIN_SECONDS:.0f} s.") from None
+            except (OSError, CongraspError, KeyError, ValueError):
+                continue
+            if hello.get("ranks") == count and hello.get("rank") in range(1, count):
+                links[hello["rank"]] = link
+            else:
+                with contextlib.suppress(OSError):
+                    link.send(Message(meta={"lost": f"Rank 0 expects {count} ranks, and no {dict(hello)}"}))
+                link.close()
+    return links
+
+
+def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Link:
+    """Elsewhere: the link to rank 0."""
+    while True:
+        try:
+            link = _Link(socket.create_connection((host, port), timeout=5.0))
+            link.send(Message(meta={"rank": rank, "ranks": count}))
+            return link
+        except OSError as error:
+            if time.monotonic() > deadline:
+                raise TransportError(
+                    f"Rank 0 does not answer at {host}:{port}: {error}.", "Name its host and port with --coordinator."
+                ) from None
+            time.sleep(0.5)
+
+
+def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> tuple[int, str] | None:
+    """The first rank whose entry ends training, and its reason."""
+    return next(((rank, entry["end"]) for rank, entry in enumerate(entries) if entry and entry.get("end")), None)

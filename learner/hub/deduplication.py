@@ -1,0 +1,100 @@
+"""Sequence deduplication: which rollouts of an actor's incarnation were decided on, so that none is taken twice."""
+
+import collections
+import dataclasses
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from congrasp.common.wire.messages import RolloutHeader
+from congrasp.learner.hub.rate_limit import certificate
+from congrasp.learner.hub.staleness import Owner
+
+_INCARNATIONS = 1024  # whose sequences are kept
+_WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another
+_GAP = 1 << 16  # rollouts that one gap counts at most; an actor that makes its numbers up has no more to count
+
+
+@dataclasses.dataclass
+class Sequences:
+    """An incarnation's sequence numbers that were decided on: all below `next` but those skipped, and `ahead`."""
+
+    next: int = 0
+    ahead: set[int] = dataclasses.field(default_factory=set)
+    refused: set[int] = dataclasses.field(default_factory=set)
+    """Those among them that were refused, as far as they are recent; the others were accepted."""
+    skipped: int = 0
+    """Sequence numbers below `next` that never came."""
+    rollouts: int = 0
+    """Accepted ones."""
+    version: int = -1
+    """Of the newest accepted one."""
+
+    def __contains__(self, sequence: int) -> bool:
+        return sequence < self.next or sequence in self.ahead
+
+    def add(self, header: RolloutHeader, accepted: bool) -> None:
+        """Notes the decision on a rollout."""
+        if accepted:
+            self.rollouts += 1
+            self.version = header.version
+        else:
+            self.refused.add(header.sequence)
+        self.ahead.add(header.sequence)
+        if len(self.ahead) > _WINDOW:
+            self.skipped += min(_GAP, min(self.ahead) - self.next)
+            self.next = min(self.ahead)
+        while self.next in self.ahead:
+            self.ahead.remove(self.next)
+            self.next += 1
+        if len(self.refused) > _WINDOW:
+            self.refused.remove(min(self.refused))
+
+    @property
+    def missing(self) -> int:
+        """Sequence numbers below the highest that are not decided on."""
+        ahead = max(self.ahead, default=self.next - 1) + 1 - self.next - len(self.ahead)
+        return self.skipped + min(_GAP, ahead)
+
+
+class SequenceTable:
+    """The sequences of every incarnation that was seen, up to a number."""
+
+    def __init__(self) -> None:
+        """Knows none."""
+        self._known: collections.OrderedDict[Owner, Sequences] = collections.OrderedDict()
+        self._forgotten_missing = 0
+
+    def of(self, owner: Owner) -> Sequences:
+        """An incarnation's sequences; others are forgotten for it where there are too many."""
+        sequences = self._known.setdefault(owner, Sequences())
+        self._known.move_to_end(owner)
+        if len(self._known) > _INCARNATIONS:
+            # Whoever has many incarnations displaces his own, so that nobody makes the learner forget another's.
+            mine = (of for of in self._known if of != owner and certificate(of[0]) == certificate(owner[0]))
+            self._forgotten_missing += self._known.pop(next(mine, next(iter(self._known)))).missing
+        return sequences
+
+    def get(self, owner: Owner) -> Sequences | None:
+        """An incarnation's sequences, if it was seen."""
+        return self._known.get(owner)
+
+    @property
+    def missing(self) -> int:
+        """Sequence numbers below the highest of each incarnation that are not decided on."""
+        return self._forgotten_missing + sum(each.missing for each in self._known.values())
+
+    def durable(self, waiting: Collection[tuple[Owner, int]]) -> dict[str, Any]:
+        """What a checkpoint must keep, as JSON; rollouts that wait for an update count as not decided on."""
+        rows = []
+        for owner, known in self._known.items():
+            queued = {sequence for of, sequence in waiting if of == owner}
+            start = min(queued | {known.next})
+            decided = set(range(start, known.next)) | known.ahead
+            rows.append([*owner, start, sorted(decided - queued), sorted(known.refused), known.skipped])
+        return {"forgotten_missing": self._forgotten_missing, "sequences": rows}
+
+    def restore(self, durable: Mapping[str, Any]) -> None:
+        """Goes on from what `durable` returned."""
+        self._forgotten_missing = durable["forgotten_missing"]
+        for actor, incarnation, start, ahead, refused, skipped in durable["sequences"]:
+            self._known[actor, incarnation] = Sequences(start, set(ahead), set(refused), skipped)

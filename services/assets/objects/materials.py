@@ -1,0 +1,167 @@
+"""Masses by material: densities, and which things of a material are hollow."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.shapes import tessellate
+from congrasp.common.objects.spec import GraspObject
+
+DENSITIES = (500.0, 2500.0)
+"""kg/m^3 between which the mass of a thing of unknown material is kept."""
+PER_SURFACE = 4.0
+"""kg of a thing of unknown material for each m^2 of its surface: 2 mm of wall at 2,000 kg/m^3."""
+HEAVIEST_GUESS = 0.5
+"""kg, the most that a thing of unknown material is taken for."""
+_SHEET = 5e-4
+"""Metres of mean thickness below which an open mesh is a sheet without thickness."""
+
+
+class Material(NamedTuple):
+    """A material of household things. Wall and thickest are this project's: those of ordinary cups, bottles, boxes."""
+
+    density: float
+    """kg/m^3."""
+    wall: float
+    """m, wall of a hollow thing."""
+    thickest: float
+    """m, mean thickness (see `mean_thickness`) above which a thing is hollow."""
+    source: str
+    """Source of the density."""
+
+
+_CALLISTER = "Callister and Rethwisch, Materials Science and Engineering, table B.1"
+_CRC = "CRC Handbook of Chemistry and Physics, Density of Various Solids"
+_WOOD = "USDA Forest Service, Wood Handbook, FPL-GTR-282, table 5-3"
+MATERIALS: Mapping[str, Material] = {
+    "aluminium": Material(2700.0, 0.0015, 0.008, f"{_CALLISTER}: alloy 6061"),
+    "cardboard": Material(690.0, 0.0015, 0.003, f"{_CRC}: cardboard"),
+    "ceramic": Material(2400.0, 0.004, 0.008, f"{_CRC}: porcelain, 2,300 to 2,500"),
+    "cork": Material(240.0, 0.01, np.inf, f"{_CRC}: cork, 220 to 260"),
+    "glass": Material(2500.0, 0.003, 0.008, f"{_CALLISTER}: soda-lime glass"),
+    "paper": Material(900.0, 0.001, np.inf, f"{_CRC}: paper, 700 to 1,150"),
+    "plastic": Material(1050.0, 0.002, 0.006, f"{_CALLISTER}: polystyrene, 1,040 to 1,050"),
+    "rubber": Material(1100.0, 0.003, 0.015, f"{_CRC}: rubber, soft commercial"),
+    "steel": Material(7850.0, 0.001, 0.012, f"{_CALLISTER}: plain carbon steel"),
+    "wood": Material(640.0, 0.01, np.inf, f"{_WOOD}: American beech, 12 % moisture"),
+}
+"""Materials by name."""
+
+
+class Weight(NamedTuple):
+    """Mass properties of a body."""
+
+    mass: float
+    """kg."""
+    center: np.ndarray
+    """(3,) m, centre of mass."""
+    inertia: np.ndarray
+    """(3, 3) kg.m^2 about the centre of mass."""
+
+
+def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
+    """Material of each part, from a name, or from PART=NAME for each, separated by commas; a bare name is for the rest.
+
+    Args:
+      text: such as "steel" or "head=steel,handle=wood".
+      parts: names of the object's parts, in the order of the result.
+
+    Raises:
+      CongraspError: unknown material or part, or a part without material.
+    """
+    named = dict(_entry(entry) for entry in text.split(","))
+    if unknown := sorted(named.keys() - {"", *parts}):
+        raise CongraspError(f"--material names the part '{unknown[0]}'.", f"The parts are: {', '.join(parts)}.")
+    missing = [part for part in parts if part not in named and "" not in named]
+    if missing:
+        raise CongraspError(f"--material leaves out the part '{missing[0]}'.", f"Add {missing[0]}=NAME.")
+    return tuple(named[part if part in named else ""] for part in parts)
+
+
+def _entry(text: str) -> tuple[str, Material]:
+    """Part (empty for the rest) and material of one entry of `--material`."""
+    part, _, name = text.strip().rpartition("=")
+    if name not in MATERIALS:
+        raise CongraspError(f"--material is '{name}'.", f"Materials: {', '.join(MATERIALS)}.")
+    return part, MATERIALS[name]
+
+
+def mean_thickness(mesh: trimesh.Trimesh) -> float:
+    """2 V / A in metres: of a wall its thickness, of a long rod half its diameter, of a ball a third of it.
+
+    An open mesh encloses the volume of the cones from its middle to its triangles.
+    """
+    corners = mesh.triangles - mesh.triangles.mean((0, 1))
+    return 2 * abs(float(np.linalg.det(corners).sum()) / 6) / float(mesh.area)
+
+
+def hollow(mesh: trimesh.Trimesh, material: Material) -> bool:
+    """True for a body that weighs its wall alone: thicker than things of its material are, or a sheet."""
+    thickness = mean_thickness(mesh)
+    return thickness > material.thickest or (not mesh.is_volume and thickness < _SHEET)
+
+
+def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> Weight:
+    """Mass properties of bodies side by side, each solid or `hollow`.
+
+    Args:
+      bodies: surfaces, m, in one frame. A thin shell is solid: its walls have two sides, which enclose the material.
+      materials: of each.
+    """
+    weights = [_weigh(body, material) for body, material in zip(bodies, materials, strict=True)]
+    mass = sum(weight.mass for weight in weights)
+    center = sum((weight.mass * weight.center for weight in weights), np.zeros(3)) / mass
+    inertia = np.zeros((3, 3))
+    for weight in weights:
+        offset = weight.center - center
+        inertia += weight.inertia + weight.mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+    return Weight(mass, center, inertia)
+
+
+def _weigh(mesh: trimesh.Trimesh, material: Material) -> Weight:
+    """Mass properties of one body; those of an open one are distributed over its surface."""
+    if hollow(mesh, material):
+        return _on_surface(mesh, material.wall * material.density * float(mesh.area))
+    if not mesh.is_volume:
+        return _on_surface(mesh, mean_thickness(mesh) * float(mesh.area) / 2 * material.density)
+    properties = mesh.mass_properties
+    mass = material.density * float(properties["volume"])
+    inertia = np.asarray(properties["inertia"]) * (mass / float(properties["mass"]))
+    return Weight(mass, np.asarray(properties["center_mass"]), inertia)
+
+
+def _on_surface(mesh: trimesh.Trimesh, mass: float) -> Weight:
+    """Mass properties of a mass that is evenly spread over a surface."""
+    share = mesh.area_faces / mesh.area
+    center = share @ mesh.triangles.mean(1)
+    corners = mesh.triangles - center
+    total = corners.sum(1)
+    # The integral of x x^T over a triangle is A / 12 (the sum of v v^T over its corners + s s^T of their sum).
+    second = np.einsum("f,fki,fkj->ij", share, corners, corners) + np.einsum("f,fi,fj->ij", share, total, total)
+    second *= mass / 12
+    return Weight(mass, center, np.trace(second) * np.eye(3) - second)
+
+
+def guessed_mass(volume: float, area: float) -> float:
+    """Mass in kg of a thing of unknown material, by its volume (m^3) and surface (m^2)."""
+    low, high = (density * volume for density in DENSITIES)
+    return min(max(PER_SURFACE * area, low), high, HEAVIEST_GUESS)
+
+
+def with_mass(obj: GraspObject, mass: float | None, material: str) -> GraspObject:
+    """The object with another mass, and an inertia in proportion.
+
+    Args:
+      obj: an object of convex pieces, each of which is solid or `hollow`.
+      mass: kg.
+      material: see `materials_of`; for the mass, where none is given.
+    """
+    if mass is None and material:
+        of_part = materials_of(material, obj.part_names)
+        bodies = [trimesh.Trimesh(*tessellate(piece), process=False) for piece in obj.pieces]
+        mass = weigh(bodies, [of_part[piece.part] for piece in obj.pieces]).mass
+    return obj if mass is None else dataclasses.replace(obj, mass=mass, inertia=obj.inertia * mass / obj.mass)

@@ -1,0 +1,197 @@
+"""A policy's memory of one episode, and the queries that it makes of it; needs nothing but numpy."""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from congrasp.common.errors import LayoutError, RefusedError
+from congrasp.common.request import GraspRequest
+from congrasp.common.wire.codec import Message
+from congrasp.services.client.policy import Answer, Policy, State
+
+_REQUIRED = ("surface", "q", "wrist", "object_pose")
+_MEASURED = ("q", "u", "object_position", "object_quaternion")
+_READ = (*_MEASURED, "q_target", "u_target")
+_LONGEST = 64  # control steps that a policy may look back
+
+
+class EpisodePolicy(Policy):
+    """A `Policy` whose subclass answers one query at a time (`services.serve.requests` has their form)."""
+
+    def __init__(self) -> None:
+        self._episode: dict[str, np.ndarray] | None = None
+        self._constraints: list[str] = []
+        self._time = 0
+        self._packer: _Packer | None = None
+        self._past: list[Mapping[str, np.ndarray]] = []  # readings of the control steps before this one, newest first
+
+    def _query(self, query: Message) -> Message:
+        """The reply to a query.
+
+        Raises:
+          TransportError: see `Policy.act`.
+        """
+        raise NotImplementedError
+
+    def reset(self, request: GraspRequest) -> None:
+        """See `Policy.reset`."""
+        self._episode, self._packer = _episode_fields(request), None
+        self._constraints, self._time, self._past = list(request.constraints), 0, []
+
+    def act(self, state: State) -> Answer:
+        """See `Policy.act`."""
+        (answer,) = self._ask(self._begun(), [state])
+        known = {**self._begun(), **state}
+        reading = {name: _numbers(name, known[name]) for name in _READ}
+        self._past = [reading, *self._past[: _LONGEST - 1]]
+        self._begun().update(q_target=answer.q_target, u_target=answer.u_target)
+        self._time += 1
+        return answer
+
+    def act_each(self, states: Sequence[State]) -> list[Answer]:
+        """See `Policy.act_each`."""
+        if not states:
+            raise RefusedError("There is no state to act in.", "Give one or more.")
+        if self._packer is None:
+            self._ask(self._begun(), states[:1])
+        most = self._packer.most if self._packer else 1
+        if len(states) > most:
+            raise RefusedError(f"These are {len(states)} states.", f"The policy takes {most} at a time.")
+        return self._ask(self._begun(), states)
+
+    def close(self) -> None:
+        """See `Policy.close`."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _begun(self) -> dict[str, np.ndarray]:
+        """The fields of the episode."""
+        if self._episode is None:
+            raise RefusedError("There is no episode yet.", "Begin one with reset.")
+        return self._episode
+
+    def _ask(self, episode: Mapping[str, np.ndarray], states: Sequence[State]) -> list[Answer]:
+        """The answers to one query, which is made anew if the layout of packed ones has changed."""
+        began = time.perf_counter()
+        try:
+            reply, parts = self._exchange(episode, states)
+        except LayoutError:
+            if self._packer is None:
+                raise
+            self._packer = None  # another server has taken the place of the one that this layout was of
+            reply, parts = self._exchange(episode, states)
+        version, server_ms = int(reply.meta["version"]), float(reply.meta["total_ms"])
+        spent = 1e3 * (time.perf_counter() - began)
+        return [
+            Answer(q_target, u_target, action, version, tuple(active), spent, server_ms)
+            for action, q_target, u_target, active in zip(*parts, reply.meta["active"], strict=True)
+        ]
+
+    def _exchange(self, episode: Mapping[str, np.ndarray], states: Sequence[State]) -> tuple[Message, list[Any]]:
+        """A query of names at an episode's begin, which is checked field by field; packed ones from then on.
+
+        A query of names says nothing of the past: where a policy that looks back comes into an episode that goes on, it
+        only brings the layout.
+
+        Returns:
+          The reply; the actions, finger targets and wrist targets.
+        """
+        meta = {"constraints": self._constraints}
+        now = {"time": np.asarray(self._time, np.float32), "table": np.asarray(True)}
+        if self._packer is None:
+            arrays = {name: _numbers(name, value) for name, value in {**episode, **now, **states[0]}.items()}
+            reply = self._query(Message(arrays, {**meta, "layout": True}))
+            self._packer = _Packer(reply.meta, episode, len(reply.arrays["q_target"]))
+            if len(states) == 1 and not (self._past and self._packer.looks_back):
+                return reply, [[reply.arrays[name]] for name in ("action", "q_target", "u_target")]
+        now |= {name: episode[name] for name in ("q_target", "u_target")}
+        reply = self._query(self._packer.pack([{**now, **state} for state in states], self._past, meta))
+        return reply, self._packer.unpack(reply)
+
+
+class _Packer:
+    """Queries as vectors, most of which stays the same for an episode.
+
+    Attributes:
+      most: states that the policy takes in one query.
+      looks_back: whether it sees control steps before the present one.
+    """
+
+    def __init__(self, layout: Mapping[str, Any], episode: Mapping[str, np.ndarray], fingers: int):
+        self._digest, self._fields, self._fingers = layout["layout"], layout["fields"], fingers
+        self.most = int(layout.get("states", 1))
+        self._past = {name: self._fields[f"past_{name}"][1] for name in _READ if f"past_{name}" in self._fields}
+        self.looks_back = bool(self._past)
+        self._episode = np.zeros(layout["size"], np.float32)
+        points = self._fields["surface_points"][1]
+        for name, value in episode.items():
+            if name in ("surface_points", "surface_minus") and len(value) != points:
+                value = value[np.arange(points) * len(value) // points]
+            self._write(self._episode, name, value)
+
+    def pack(self, states: Sequence[State], past: Sequence[State], meta: Mapping[str, Any]) -> Message:
+        """The episode's query in each of several states, after the control steps of `past`, newest first.
+
+        Where a policy looks back beyond the episode's begin, all was as at the begin.
+        """
+        vectors = np.tile(self._episode, (len(states), 1))
+        for vector, state in zip(vectors, states, strict=True):
+            if lacking := [name for name in _MEASURED if name not in state]:
+                raise RefusedError(f"The query lacks the field '{lacking[0]}'.")
+            for name, value in state.items():
+                self._write(vector, name, _numbers(name, value))
+            for name, steps in self._past.items():
+                rows = [_numbers(name, reading[name]) for reading in (past or [state])[:steps]]
+                self._write(vector, f"past_{name}", np.stack(rows + rows[-1:] * (steps - len(rows))))
+        return Message({"packed": vectors}, {**meta, "layout": self._digest})
+
+    def unpack(self, reply: Message) -> list[np.ndarray]:
+        """Action, finger targets and wrist targets, of each state."""
+        return np.split(reply.arrays["packed"], [-self._fingers - 6, -6], 1)
+
+    def _write(self, vector: np.ndarray, name: str, value: np.ndarray) -> None:
+        """Puts a field's numbers into their place in a vector."""
+        if name not in self._fields:
+            raise RefusedError(f"The query has an unknown field '{name}'.", f"Known: {', '.join(self._fields)}.")
+        offset, *shape = self._fields[name]
+        if list(value.shape) != shape:
+            raise RefusedError(f"The field '{name}' has shape {value.shape}; it must be {tuple(shape)}.")
+        vector[offset : offset + math.prod(shape)] = value.ravel()
+
+
+def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
+    """The fields of a query that stay the same for an episode, and the first targets."""
+    lacking = [f"'{name}'" for name in _REQUIRED if getattr(request, name) is None]
+    if lacking or request.wrist is None or request.object_pose is None:
+        raise RefusedError(f"The request lacks {' and '.join(lacking)}.", "A control loop begins from where all is.")
+    if request.above:
+        raise RefusedError("The request is for a hand from above.", "Give the heading's direction to a control loop.")
+    given: dict[str, Any] = {
+        "q_initial": request.q,
+        "q_target": request.q,
+        "u_target": np.zeros(6),
+        "base_position": request.wrist[0],
+        "base_quaternion": request.wrist[1],
+        "object_position_initial": request.object_pose[0],
+        "object_quaternion_initial": request.object_pose[1],
+        "surface_points": request.surface,
+        **({} if request.avoid is None else {"surface_minus": request.avoid}),
+        **{f"{name}_{field}": value for name, own in request.constraints.items() for field, value in own.items()},
+    }
+    return {name: _numbers(name, value) for name, value in given.items()}
+
+
+def _numbers(name: str, value: Any) -> np.ndarray:
+    """A field's value as bool where it is that, else as float32."""
+    try:
+        array = np.asarray(value)
+        return array if array.dtype == bool else array.astype(np.float32)
+    except (TypeError, ValueError):
+        raise RefusedError(f"The field '{name}' is no array of numbers.") from None

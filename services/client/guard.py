@@ -1,0 +1,311 @@
+"""What stands between a policy and a robot: a command every tick, whatever the policy does or fails to do.
+
+The policy is asked in a thread of its own, so that no network holds the control loop up. Needs nothing but numpy.
+"""
+
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+from typing import Literal, NamedTuple, Self
+
+import numpy as np
+
+from congrasp.common.errors import CongraspError, RefusedError, TransportError
+from congrasp.common.request import GraspRequest
+from congrasp.services.client.limits import JointLimits, Limiter, as_numbers
+from congrasp.services.client.policy import Answer, Policy, State
+
+Fallback = Literal["freeze", "open"]
+Mode = Literal["follow", "hold", "freeze", "open"]
+_END = 2.0  # seconds that the asking thread has to end
+
+
+@dataclasses.dataclass
+class Counters:
+    """What has happened since the guard was made."""
+
+    steps: int = 0
+    """Commands."""
+    follow: int = 0
+    """Commands that followed an answer that was fresh."""
+    hold: int = 0
+    """Commands that held the last target, for want of one."""
+    fallback: int = 0
+    """Commands of the fallback."""
+    answers: int = 0
+    """Answers that were taken."""
+    late: int = 0
+    """Steps in which no answer came, neither of this one's state nor of an earlier one's."""
+    stale: int = 0
+    """Answers that were thrown away because their state was too old."""
+    invalid: int = 0
+    """Answers that were thrown away because they were not finite or misshapen."""
+    lost: int = 0
+    """Queries without an answer."""
+    refused: int = 0
+    """Queries that the policy refused."""
+    not_finite: int = 0
+    """Commands with a measurement or target that was not finite or misshapen."""
+    torque: int = 0
+    """Commands that the limits of torque drew back."""
+    speed: int = 0
+    """Commands that the limits of speed held back."""
+    position: int = 0
+    """Commands that the limits of position held back."""
+
+
+class Command(NamedTuple):
+    """What the robot is to do until the next one; all of it within the limits."""
+
+    q_target: np.ndarray
+    """(F,) finger joint targets, rad."""
+    u_target: np.ndarray
+    """(6,) wrist targets relative to the base: x, y, z in m, intrinsic x-y-z angles in rad."""
+    q_torque: np.ndarray
+    """(F,) N.m: the same, for a robot that is told torques."""
+    u_torque: np.ndarray
+    """(6,) N and N.m, likewise."""
+    mode: Mode
+    """`follow`: the policy's; `hold`: the last targets, until the policy answers again; `freeze` and `open`: the
+    fallback, until `reset`."""
+    answer: Answer | None
+    """The answer that it follows."""
+
+
+class Guard:
+    """A policy whose answers reach a robot only within limits and while they are fresh.
+
+    An answer is fresh when the state that it was asked with is at most `stale` old. While there is none, the last
+    targets are held; after `hold` seconds without one, the fallback is taken and kept until the next `reset`: `freeze`
+    keeps the targets, `open` opens the fingers as fast as the limits allow and keeps the wrist. The policy goes on
+    from the targets that were commanded, not from those that it wanted.
+
+    Attributes:
+      counters: what has happened.
+      trouble: why the last query had no answer; empty while it has, also during a fallback, which goes on asking.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        limits: JointLimits,
+        open_pose: np.ndarray,
+        *,
+        period: float = 0.01,
+        wait: float = 0.006,
+        stale: float = 0.05,
+        hold: float = 0.5,
+        fallback: Fallback = "freeze",
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        """Starts the thread that asks the policy; nothing else may ask it from now on.
+
+        Args:
+          policy: the policy.
+          limits: of the F finger joints, each of which has a motor, then the six wrist joints (`JointLimits.of_hand`).
+          open_pose: (F,) rad: what `open` opens to.
+          period: seconds between two steps.
+          wait: seconds of it that a step waits for its answer; the answer may also come in one of the next.
+          stale: seconds.
+          hold: seconds.
+          fallback: what follows.
+          clock: seconds, as `time.monotonic`.
+
+        Raises:
+          CongraspError: the limits and the open pose do not belong together, or a time is not positive.
+        """
+        fingers = len(limits.lower) - 6
+        if fingers < 1 or not np.isfinite(as_numbers(open_pose, fingers)).all():
+            raise CongraspError(
+                "The open pose must have a finite angle for each finger joint of the limits.",
+                "For a hand with fewer motors than joints, make limits of its joints by hand (docs/robots.md).",
+            )
+        if not (0.0 <= wait < period and 0.0 < stale <= hold):
+            raise CongraspError("The times must be: 0 <= wait < period, and 0 < stale <= hold.")
+        if fallback not in ("freeze", "open"):
+            raise CongraspError(f"The fallback is {ascii(fallback)[:40]}.", "It is freeze or open.")
+        self.counters, self.trouble = Counters(), ""
+        self._limits, self._open = limits, as_numbers(open_pose, fingers)
+        self._period, self._wait, self._stale, self._hold = period, wait, stale, hold
+        self._fallback, self._clock, self._fingers = fallback, clock, fingers
+        self._needed = {"q": fingers, "u": 6, "object_position": 3, "object_quaternion": 4}
+        self._limiter: Limiter | None = None
+        self._wanted, self._fresh = np.zeros(fingers + 6), clock()
+        self._answer: Answer | None = None
+        self._latched = False
+        self._asker = _Asker(policy)
+
+    def reset(self, request: GraspRequest, *, moved: bool = False) -> None:
+        """Begins an episode; what is under way of the one before counts no more.
+
+        Args:
+          request: see `Policy.reset`; the wrist's targets start from its `wrist`, where the hand must be, and those of
+            the fingers go on from the last command. The first episode's start from its `q`.
+          moved: somebody else has moved the fingers since the last command: they, too, start from `q`.
+
+        Raises:
+          CongraspError: its `q` is not a finite angle for each finger joint.
+        """
+        start = np.append(as_numbers(request.q, self._fingers), np.zeros(6))
+        if self._limiter is not None and not moved and np.isfinite(start).all():
+            start[: self._fingers] = self._limiter.target[: self._fingers]
+        self._limiter = Limiter(self._limits, start, period=self._period)
+        self._wanted, self._fresh = self._limiter.target, self._clock()
+        self._answer, self._latched = None, False
+        self._asker.begin(request)
+
+    def step(self, state: State) -> Command:
+        """The next command; returns after `wait` seconds at most, and raises nothing for what is wrong with a state.
+
+        Args:
+          state: see `Policy.act`; what it lacks counts as not measured, but for velocities, which are then taken as 0.
+
+        Raises:
+          RefusedError: there is no episode yet.
+        """
+        if self._limiter is None:
+            raise RefusedError("There is no episode yet.", "Begin one with reset.")
+        now = self._clock()
+        targets = dict(zip(("q_target", "u_target"), np.split(self._limiter.target, [self._fingers]), strict=True))
+        lacking = {name: np.full(size, np.nan) for name, size in self._needed.items() if name not in state}
+        self._take(self._asker.exchange({**state, **lacking, **targets}, now, self._wait))
+        mode = self._mode()
+        if mode == "open":
+            self._wanted = np.append(self._open, self._limiter.target[self._fingers :])
+        elif mode != "follow":
+            self._wanted = self._limiter.target
+        limited = self._limiter.limit(self._wanted, *self._measured(state), now)
+        for name in ("steps", mode if mode in ("follow", "hold") else "fallback", *limited.by):
+            setattr(self.counters, name, getattr(self.counters, name) + 1)
+        (q_target, u_target), (q_torque, u_torque) = (np.split(x, [self._fingers]) for x in limited[:2])
+        answer = self._answer if mode == "follow" else None
+        return Command(q_target, u_target, q_torque, u_torque, mode, answer)
+
+    def close(self) -> None:
+        """Ends the asking thread, and closes the policy."""
+        self._asker.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _take(self, outcome: "_Outcome | None") -> None:
+        """Takes an answer over if it is fresh and finite, and counts it otherwise."""
+        if outcome is None:
+            self.counters.late += 1
+            return
+        answer, asked = outcome
+        if isinstance(answer, TransportError):
+            self.trouble = str(answer)
+            self.counters.refused += isinstance(answer, RefusedError)
+            self.counters.lost += not isinstance(answer, RefusedError)
+            return
+        wanted = np.append(as_numbers(answer.q_target, self._fingers), as_numbers(answer.u_target, 6))
+        if not np.isfinite(wanted).all():
+            self.counters.invalid += 1
+        elif not 0.0 <= self._clock() - asked <= self._stale:
+            self.counters.stale += 1
+        else:
+            self._wanted, self._answer, self._fresh, self.trouble = wanted, answer, asked, ""
+            self.counters.answers += 1
+
+    def _mode(self) -> Mode:
+        """What the next command does."""
+        age = self._clock() - self._fresh
+        if self._latched or not 0.0 <= age <= self._hold:
+            self._latched = True
+            return self._fallback
+        return "follow" if self._answer is not None and age <= self._stale else "hold"
+
+    def _measured(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities (F + 6,) of a state; velocities that it lacks are zero."""
+        sizes = {"q": self._fingers, "u": 6}
+        position = [as_numbers(state.get(name), size) for name, size in sizes.items()]
+        velocity = [as_numbers(state.get(f"{name}_velocity", np.zeros(size)), size) for name, size in sizes.items()]
+        return np.concatenate(position), np.concatenate(velocity)
+
+
+_Outcome = tuple[Answer | TransportError, float]
+"""An answer or why there is none, and when its state was taken."""
+
+
+class _Asker:
+    """Asks a policy in a thread: one query at a time, and of an older episode nothing comes back."""
+
+    def __init__(self, policy: Policy):
+        self._policy = policy
+        self._changed = threading.Condition()
+        self._request: GraspRequest | None = None
+        self._question: tuple[State, float] | None = None
+        self._outcome: _Outcome | None = None
+        self._episode, self._busy, self._closed = 0, False, False
+        self._thread = threading.Thread(target=self._work, daemon=True, name="guard")
+        self._thread.start()
+
+    def begin(self, request: GraspRequest) -> None:
+        """Begins an episode."""
+        with self._changed:
+            self._episode += 1
+            self._busy = self._busy and self._question is None
+            self._request, self._question, self._outcome = request, None, None
+
+    def exchange(self, state: State, now: float, timeout: float) -> _Outcome | None:
+        """Asks with a state, unless a query is under way, and gives the newest outcome that is known in time.
+
+        Args:
+          state: the state.
+          now: when it was taken.
+          timeout: seconds to wait.
+
+        Returns:
+          An outcome that was not given before, of this state or of an earlier one.
+        """
+        with self._changed:
+            earlier, self._outcome = self._outcome, None
+            if not self._busy:
+                self._question, self._busy = (state, now), True
+                self._changed.notify_all()
+            self._changed.wait_for(lambda: self._outcome is not None, timeout)
+            outcome, self._outcome = self._outcome or earlier, None
+            return outcome
+
+    def close(self) -> None:
+        """Ends the thread, unless a query holds it up, and closes the policy."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(_END)
+        self._policy.close()
+
+    def _work(self) -> None:
+        """Asks what there is to ask, until closed."""
+        begun = 0  # the last episode with an answer
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._question is not None or self._closed)
+                if self._closed or self._question is None:
+                    return
+                (state, asked), episode, request = self._question, self._episode, self._request
+                self._question = None
+            answer = self._answer(request if episode != begun else None, state)
+            begun = begun if isinstance(answer, TransportError) else episode
+            with self._changed:
+                self._busy = False
+                if episode == self._episode:
+                    self._outcome = answer, asked
+                self._changed.notify_all()
+
+    def _answer(self, request: GraspRequest | None, state: State) -> Answer | TransportError:
+        """The policy's answer; whatever goes wrong with it is an error like any other."""
+        try:
+            if request is not None:
+                self._policy.reset(request)
+            answer = self._policy.act(state)
+            return answer if isinstance(answer, Answer) else TransportError("The policy's answer is none.")
+        except TransportError as error:
+            return error
+        except Exception as error:
+            return TransportError(f"The policy failed: {type(error).__name__}: {error}")

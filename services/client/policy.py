@@ -1,0 +1,90 @@
+"""What a control loop asks of a policy, wherever it is; needs nothing but numpy."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol, Self
+
+import numpy as np
+
+from congrasp.common.request import GraspRequest
+
+State = Mapping[str, np.ndarray]
+"""Hand and object now, by field; see `Policy.act`."""
+
+
+class Answer(NamedTuple):
+    """What the policy wants next."""
+
+    q_target: np.ndarray
+    """(F,) finger joint targets, rad."""
+    u_target: np.ndarray
+    """(6,) virtual wrist targets relative to the base: x, y, z in m, then intrinsic x-y-z angles in rad."""
+    action: np.ndarray
+    """(M + 6,) the policy's raw action."""
+    version: int
+    """Version of the policy that answered."""
+    active: tuple[str, ...]
+    """Which constraints are active and why, in sentences."""
+    round_trip_ms: float
+    """From asking to the answer."""
+    server_ms: float
+    """The share of it that checking and inference took, where the policy is."""
+
+
+class Policy(Protocol):
+    """Joint targets for one hand and object, one control step after the other.
+
+    It remembers what an episode started from and the previous targets. `PolicyClient` queries a server, `LocalPolicy`
+    computes in this process; checks, messages and answers are the same.
+
+    Frames: everything in the world frame but `u` (relative to the base, which is the wrist's pose at `reset`) and the
+    constraints and surface points (object frame). Metres, radians, newtons; quaternions (w, x, y, z).
+    """
+
+    def reset(self, request: GraspRequest) -> None:
+        """Begins an episode; constraints and arrays are checked by the first `act`.
+
+        Args:
+          request: with `surface`, `q`, `wrist` (the base from now on) and `object_pose`, the goal arrays of its
+            constraints, and `avoid` if the affordance is among them.
+
+        Raises:
+          RefusedError: the request lacks one of them, or holds what is no array of numbers.
+        """
+        ...
+
+    def act(self, state: State) -> Answer:
+        """Joint targets for the present state.
+
+        Args:
+          state: `q`, `u`, `object_position`, `object_quaternion`, `table`; where there are sensors also `q_velocity`,
+            `u_velocity`, `object_velocity`, `object_angular_velocity`, `contact_force`, `contact_position` and
+            `contact_found`, by the names and shapes of `common.task.types.SceneState` without the batch axis.
+
+        Raises:
+          RefusedError: the request or the state is bad. Its subclasses in `common.errors` tell what a program can act
+            on: an unknown constraint, a contradiction, an overloaded server, a deadline that passed there.
+          TransportError: there is no response from the server.
+        """
+        ...
+
+    def act_each(self, states: Sequence[State]) -> list[Answer]:
+        """Joint targets for each of several states, as `act` would give them now; the episode does not go on.
+
+        For planners that weigh candidates: one query for all of them costs a small part of one for each.
+
+        Args:
+          states: see `act`; 1 to 64. One may also have its own `time` in control steps, and `q_target` and `u_target`,
+            from which its targets go on.
+
+        Raises:
+          TransportError: see `act`; if one state is bad, none gets an answer.
+        """
+        ...
+
+    def close(self) -> None:
+        """Ends the connection, if there is one."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *exception: object) -> None: ...

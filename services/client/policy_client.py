@@ -1,0 +1,54 @@
+"""The client of a policy server, for a robot's control loop: needs nothing but numpy and zenoh."""
+
+import os
+import secrets
+
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import Keys
+from congrasp.common.wire.codec import Message
+from congrasp.services.client.episode import EpisodePolicy
+
+
+class PolicyClient(EpisodePolicy):
+    """The `Policy` of a server."""
+
+    def __init__(
+        self,
+        connect: str,
+        run: str = "policy",
+        *,
+        hand: str = "human",
+        timeout: float = 1.0,
+        wait: float = 10.0,
+        certs: str | os.PathLike[str] | None = None,
+    ):
+        """Connects; when the server goes away and comes back, so does the connection.
+
+        Args:
+          connect: the server's endpoint, such as tcp/10.0.0.7:7457.
+          run: name under which the server serves.
+          hand: name of the hand that is to be controlled; a server with another hand's policy refuses.
+          timeout: seconds that one call may take.
+          wait: seconds to wait for the server to appear.
+          certs: folder of a client's certificate, for a server that asks for one.
+
+        Raises:
+          TransportError: there is no response.
+        """
+        super().__init__()
+        self._transport = urls.connect(connect, "client", certs=certs, wait=wait)
+        self._keys, self._hand, self._timeout = Keys(run), hand, timeout
+        self._act_key = self._keys.act_for(urls.name_on_wire(secrets.token_hex(4), certs, "client"))
+
+    def health(self) -> dict[str, object]:
+        """Readiness, version, hand and queue of the server."""
+        return dict(self._transport.query(self._keys.health, Message({}, {}), timeout=self._timeout).meta)
+
+    def close(self) -> None:
+        """Disconnects."""
+        self._transport.close()
+
+    def _query(self, query: Message) -> Message:
+        """The server's reply."""
+        meta = {"hand": self._hand, "timeout": self._timeout, **query.meta}
+        return self._transport.query(self._act_key, Message(query.arrays, meta), timeout=self._timeout)

@@ -1,0 +1,102 @@
+"""What a page shows of a request, as JSON."""
+
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from congrasp.actors.initial import initial_hand
+from congrasp.common import rotations
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.resting import rest_tilts
+from congrasp.common.task.constraints import get_constraint, optional
+from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.common.task.types import Goal, Surface
+from congrasp.services.grasp.grasper import surface_of
+from congrasp.services.studio.state import Studio
+
+
+def describe(studio: Studio) -> dict[str, Any]:
+    """Everything that a page shows of a request; object frame but for the resting pose."""
+    resolution = studio.resolution
+    goal = resolution.goal
+    obj, hand = studio.obj, studio.hand
+    return {
+        "hand": hand.name,
+        "object": {
+            "name": obj.name,
+            "size_cm": [round(100 * float(side), 1) for side in np.ptp(obj.visual_vertices, axis=0)],
+            "mass_g": round(1000 * obj.mass),
+            "faces": len(studio.canvas.faces),
+            "tilts_deg": np.degrees(rest_tilts(obj)).round().tolist(),
+        },
+        "rest": {"index": studio.rest, **_pose(obj.rest_poses[studio.rest])},
+        "asked": sorted(studio.asked),
+        "known": [constraint.name for constraint in optional(studio.task)],
+        "others": [_toggles(hand, name, fields) for name, fields in studio.others.items()],
+        "arrow": {name: part.tolist() for name, part in studio.arrow._asdict().items()},
+        "roll_deg": round(float(np.degrees(studio.arrow.roll(studio.up))), 1),
+        "active": {
+            "masks": {block: bool(on) for block, on in goal.active.items()},
+            "position": goal["heading"].position.tolist(),
+            "direction": goal["heading"].direction.tolist(),
+            "overruled": bool(resolution.redirected)
+            or any("heading" in get_constraint(name).overrides for name in studio.asked),
+        },
+        "explanation": studio.explanation,
+        "trouble": studio.trouble,
+        "start": _frames(_start(hand, studio.task, *_batch_of_one(studio, goal))),
+        "pose": None if studio.pose is None else _ghost(hand, studio.pose),
+        "path": None if studio.path is None else np.asarray(studio.path.position).tolist(),
+        "painted": studio.canvas.paint.version,
+        "avoid_share": round(float(studio.canvas.avoid.mean()), 3),
+    }
+
+
+def _toggles(hand: Hand, name: str, fields: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """A constraint without tools of its own, as the page shows it."""
+    constraint = get_constraint(name)
+    labels = constraint.labels(hand)
+    shown = {field: dict(zip(labels[field], fields[field].tolist(), strict=True)) for field in labels}
+    return {"name": name, "title": constraint.title, "flags": shown}
+
+
+def _ghost(hand: Hand, pose: Poses) -> dict[str, Any]:
+    """Link frames (L, 3), (L, 4) of a reference pose in the object frame."""
+    return _frames(_links(hand, *(np.asarray(field, np.float32) for field in pose)))
+
+
+def _frames(links: tuple[jax.Array, jax.Array]) -> dict[str, Any]:
+    """Link frames (L, 3), (L, 4) as JSON."""
+    return {"position": np.asarray(links[0]).tolist(), "quaternion": np.asarray(links[1]).tolist()}
+
+
+def _batch_of_one(studio: Studio, goal: Goal) -> tuple[Goal, Surface, np.ndarray]:
+    """The goal, the object's surface and its resting pose (7,), with a batch axis."""
+    rest = np.asarray(studio.obj.rest_poses[studio.rest], np.float32)
+    return jax.tree.map(lambda array: np.asarray(array)[None], (goal, surface_of(studio.task, studio.obj), rest))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _start(hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Link frames (L, 3), (L, 4) in the world from which a grasp begins."""
+    q, position, quaternion = initial_hand(hand, task, goal, surface, rest)
+    return _links(hand, q[0], position[0], quaternion[0])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _links(hand: Hand, q: jax.Array, position: jax.Array, quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Link frames (L, 3), (L, 4) of finger angles (F,) and a wrist pose (3,), (4,), in the pose's frame."""
+    local = kinematics.link_poses(hand, q)
+    turn = jnp.broadcast_to(quaternion, local[1].shape)
+    return rotations.compose_pose(jnp.broadcast_to(position, local[0].shape), turn, *local)
+
+
+def _pose(row: np.ndarray) -> dict[str, list[float]]:
+    """A pose (7,) as JSON."""
+    return {"position": row[:3].tolist(), "quaternion": row[3:].tolist()}

@@ -1,0 +1,105 @@
+"""A motion as a file that the browser saves: data, pictures and videos."""
+
+import pathlib
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message
+from congrasp.services.export.motion_file import motion_of_episode, save_motion
+from congrasp.services.export.motion_formats import FORMATS, export_motions
+from congrasp.services.record.channels import JsonChannels
+from congrasp.services.record.scene import episode_entries
+from congrasp.services.record.writer import LogWriter
+from congrasp.services.studio.arrow import vector
+from congrasp.services.studio.server import Download
+from congrasp.services.viz.render import render_episode_frames, save_episode_video
+from congrasp.services.viz.scene import Camera
+from congrasp.services.viz.sheets import png_of
+
+DATA = ("npz", "mcap", *FORMATS)
+"""What a motion can be saved as at once."""
+DRAWN = ("mp4", "png")
+"""What is drawn first, which takes a while."""
+_PICTURE, _VIDEO = (1280, 720), (854, 480)  # pixels
+
+
+def data_file(episode: Message, key: str, kind: str) -> Download:
+    """A motion as a file of one of `DATA`; what is a folder comes as a zip archive.
+
+    Raises:
+      CongraspError: there is no such kind, or a package for it is absent.
+    """
+    if kind not in DATA:
+        raise CongraspError(f"A motion cannot be saved as '{kind[:20]}'.", f"Choose from: {', '.join(DATA)}.")
+    with tempfile.TemporaryDirectory(prefix="congrasp-export-") as folder:
+        path = pathlib.Path(folder) / f"motion{FORMATS.get(kind, f'.{kind}')}"
+        try:
+            if kind == "npz":
+                save_motion(path, motion_of_episode(episode))
+            elif kind == "mcap":
+                writer = LogWriter(pathlib.Path(folder), "motion", run="studio")
+                writer.write(*episode_entries("studio", episode, 0, 0, JsonChannels()))
+                writer.close()
+                path = writer.files[0]
+            else:
+                export_motions([motion_of_episode(episode)], kind, path)
+        except ModuleNotFoundError as error:
+            raise CongraspError(
+                f"This needs the package '{error.name}'.", "Run: pip install 'congrasp[export]'"
+            ) from None
+        if path.is_dir():
+            path = pathlib.Path(shutil.make_archive(str(path), "zip", path))
+        suffix = f".{kind}" if kind in ("npz", "mcap") else FORMATS[kind] or f"-{kind}.zip"
+        return Download(_name(episode, key, suffix), path.read_bytes())
+
+
+def drawing(
+    episode: Message, key: str, kind: str, view: Mapping[str, Any], frame: int, progress: Callable[[float], None]
+) -> Download:
+    """A motion as MP4, or one of its frames as PNG, as the page shows it.
+
+    Args:
+      episode: the motion.
+      key: its number, for the file's name.
+      kind: one of `DRAWN`.
+      view: the page's camera: position and target (3,) in the world, m, and its vertical field_of_view in degrees.
+      frame: control step of the PNG.
+      progress: told how much is done, from 0 to 1.
+
+    Raises:
+      CongraspError: something of that cannot be.
+    """
+    if kind not in DRAWN:
+        raise CongraspError(f"A motion cannot be drawn as '{str(kind)[:20]}'.", f"Choose from: {', '.join(DRAWN)}.")
+    camera = _camera(view)
+    if kind == "png":
+        if not isinstance(frame, int) or not 0 <= frame < len(episode.arrays["table"]):
+            raise CongraspError(f"The motion has no frame {ascii(frame)[:20]}.")
+        (image,) = render_episode_frames(episode, [frame], _PICTURE, camera)
+        return Download(_name(episode, key, f"-{frame}.png"), png_of(image))
+    with tempfile.TemporaryDirectory(prefix="congrasp-video-") as folder:
+        path = pathlib.Path(folder) / "motion.mp4"
+        save_episode_video(path, episode, _VIDEO, camera, progress)
+        return Download(_name(episode, key, ".mp4"), path.read_bytes())
+
+
+def _camera(view: Mapping[str, Any]) -> Camera:
+    """The page's camera."""
+    if not isinstance(view, Mapping):
+        raise CongraspError("The camera must have a position, a target and a field of view.")
+    position, target = (vector(f"camera's {name}", view.get(name)) for name in ("position", "target"))
+    angle = float(vector("camera's field of view", [view.get("field_of_view"), 0.0, 0.0])[0])
+    if np.linalg.norm((target - position)[:2]) < 1e-6 or not 1 <= angle <= 120:
+        raise CongraspError("The camera looks straight down, or its field of view is not 1 to 120 degrees.")
+    return Camera(position, target, angle)
+
+
+def _name(episode: Message, key: str, suffix: str) -> str:
+    """Name of a motion's file."""
+    number = "".join(c if c.isalnum() else "-" for c in key)[-40:]
+    return f"{episode.meta['object']}-{number}{suffix}"

@@ -1,0 +1,158 @@
+"""Grasps of a policy as the studio asks for them: exactly as drawn, and close to it where that fails."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from congrasp.actors.attempts import Attempts, Outcome
+from congrasp.actors.initial import RequestedEpisodes
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.request import GraspRequest
+from congrasp.common.runtime.parallel import cores
+from congrasp.common.task.constraints import get_constraint, known, require_known
+from congrasp.common.task.constraints.priority import explain
+from congrasp.common.wire.codec import Message
+from congrasp.services.grasp.grasper import costs, repeated, surface_of
+from congrasp.services.serve.server import Source
+from congrasp.services.studio.diagnosis import why_nothing_held
+from congrasp.services.studio.jobs import Progress
+
+ATTEMPTS = 8
+"""Grasps side by side: the one that was drawn, and others near it."""
+HOLD_SECONDS = 2.0
+_ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
+"""How far the others are from what was drawn: m, rad, rad (one standard deviation)."""
+_OTHER = 2.0
+"""What it costs not to be the one that was drawn, beside the costs of `services.grasp.grasper`."""
+
+
+class PolicyGrasping:
+    """A policy of a file or of a run that is being trained; every grasp is one of its newest weights."""
+
+    def __init__(self, source: Source, name: str, *, threads: int = 0):
+        """Loads the policy; compiles nothing yet.
+
+        Args:
+          source: where its weights come from.
+          name: how the page calls it.
+          threads: of the physics; 0 takes one a core.
+
+        Raises:
+          CongraspError: there is none.
+        """
+        first = source(-1)
+        if first is None:
+            raise CongraspError(
+                f"There is no policy of {name} yet.", "Start the studio when the run has published one."
+            )
+        self._source, self._name, self._policy = source, name, first
+        self._trouble = ""
+        self.hand = get_hand(first.spec.hand)
+        self.task = dataclasses.replace(first.task, end_when_fallen=False)
+        hold = max(self.task.hold_steps, round(HOLD_SECONDS / self.task.control_dt))
+        self._attempts = Attempts(self.hand, self.task, first, hold=hold, threads=threads or cores())
+        self._compiled = False
+
+    def newest(self) -> dict[str, Any]:
+        """Source and version; `trouble` says why newer weights were not taken."""
+        return {"source": self._name, "version": self._policy.version, "trouble": self._trouble}
+
+    def refresh(self) -> None:
+        """Takes newer weights, if there are any that fit."""
+        try:
+            newer = self._source(self._policy.version)
+            if newer is not None:
+                self._attempts.renew(newer)
+                self._policy = newer
+            self._trouble = ""
+        except TransportError:
+            self._trouble = "The learner is disconnected; these are its last weights."
+        except CongraspError as error:
+            self._trouble = str(error)
+
+    def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
+        """The episode of the grasp that was drawn if it holds, else of the best of those near it.
+
+        Its meta `note` says which it is; where none held, why.
+        """
+        first_time = not self._compiled
+        progress("compiling: the first grasp takes some seconds more" if first_time else "newest weights", 0.02)
+        self.refresh()
+        require_known(request.constraints, self.task)
+        outcome, aside = self._attempt(obj, request, lambda share: progress("grasping", share))
+        self._compiled = True
+        index = _best(outcome, tuple(request.constraints), self.task.approach_steps - 1)
+        about = {"actor": "studio", "note": _note(outcome, index, aside)}
+        episode = self._attempts.episode(outcome, index, surface_of(self.task, obj), obj, about)
+        if (outcome.metrics["held"] > 0).any():
+            return episode
+
+        def held(weaker: GraspRequest, without: str) -> int:
+            """How many attempts hold under a weaker request."""
+            text = f"nothing held; without the {get_constraint(without).title}"
+            found, _ = self._attempt(obj, weaker, lambda share: progress(text, share))
+            return int((found.metrics["held"] > 0).sum())
+
+        asked = tuple(name for name in request.constraints if get_constraint(name).optional)
+        note = why_nothing_held(
+            episode,
+            request,
+            explain(asked, bool(outcome.redirected[index])),
+            held,
+            attempts=ATTEMPTS,
+            drop_height=self.task.drop_height,
+        )
+        return Message(episode.arrays, {**episode.meta, "note": note})
+
+    def _attempt(
+        self, obj: GraspObject, request: GraspRequest, progress: Callable[[float], None]
+    ) -> tuple[Outcome, np.ndarray]:
+        """Outcome of a request and of others near it, and how far (B,) in m each is beside it."""
+        episodes, aside = _episodes(self.hand, self.task, obj, request)
+        steps = self._attempts.steps
+        return self._attempts.run(obj, episodes, lambda step: progress(step / steps)), aside
+
+
+def _episodes(
+    hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest
+) -> tuple[RequestedEpisodes, np.ndarray]:
+    """`ATTEMPTS` episodes, the first as drawn; and how far (B,) in m each is beside that."""
+    rng = np.random.default_rng(0)
+    drawn = repeated(hand, task, obj, request, ATTEMPTS)
+    goal = drawn.goal
+    others = np.arange(ATTEMPTS) > 0
+    shift = (rng.normal(0.0, _ASIDE, (ATTEMPTS, 3)) * others[:, None]).astype(np.float32)
+    tilt, roll = (rng.normal(0.0, sigma, ATTEMPTS) * others for sigma in (_TILT, _ROLL))
+    direction, cross = goal["heading"].direction, goal["heading"].cross
+    third = np.cross(direction, cross)
+    way = rng.uniform(0.0, 2 * np.pi, ATTEMPTS)
+    axis = np.cos(way)[:, None] * cross + np.sin(way)[:, None] * third
+    turn = Rotation.from_rotvec(tilt[:, None] * axis + roll[:, None] * direction)
+    turned = {"direction": turn.apply(direction).astype(np.float32), "cross": turn.apply(cross).astype(np.float32)}
+    goal = goal.replace("heading", **turned)
+    for constraint in known(task):
+        if "position" in constraint.arrays:
+            place = goal[constraint.name].position
+            goal = goal.replace(constraint.name, position=place + shift.reshape(-1, *[1] * (place.ndim - 2), 3))
+    return drawn._replace(goal=goal), np.linalg.norm(shift, axis=-1)
+
+
+def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int) -> int:
+    """The one that was drawn, unless another is clearly better: it holds, or keeps to the constraints."""
+    return int(np.argmin(costs(outcome, constraints, removal) + _OTHER * (np.arange(ATTEMPTS) > 0)))
+
+
+def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
+    """Why another grasp than the drawn one is shown; empty if it is that one, or none held."""
+    held = outcome.metrics["held"] > 0
+    if held.any() and index:
+        why = "did better" if held[0] else "held, which what was drawn did not"
+        return f"Of {ATTEMPTS - 1} others near what was drawn, this one {why}: {1000 * aside[index]:.0f} mm beside it."
+    return ""

@@ -1,0 +1,325 @@
+"""One user's studio with its policy, objects and motions, beside the window on a training: what the page talks to."""
+
+import functools
+import json
+import pathlib
+import tempfile
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from congrasp.common.config import TaskConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.request import GraspRequest
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.objects.sizes import METRES
+from congrasp.services.studio.catalogue import Catalogue, Importer, Uploads
+from congrasp.services.studio.description import describe
+from congrasp.services.studio.files import DATA, DRAWN, data_file, drawing
+from congrasp.services.studio.history import ACTIONS, History
+from congrasp.services.studio.jobs import Jobs, Progress
+from congrasp.services.studio.lanes import for_page
+from congrasp.services.studio.motions import Motions
+from congrasp.services.studio.recordings import Recordings
+from congrasp.services.studio.server import Download, Get, Picture, Post
+from congrasp.services.studio.state import Studio
+from congrasp.services.studio.thumbnails import Thumbnails
+from congrasp.services.studio.training import TrainingWindow
+from congrasp.services.viz.shapes import skin_colours
+
+_DRAWING = "drawing"
+"""What a job says it made when that is a picture or a video, and no motion."""
+
+
+class Grasping(Protocol):
+    """A policy that can be asked for a grasp."""
+
+    hand: Hand
+    task: TaskConfig
+
+    def newest(self) -> dict[str, Any]:
+        """Where the policy comes from and its version, after a look for newer weights."""
+
+    def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
+        """The episode of a grasp."""
+
+
+class Session:
+    """Everything behind the page; its routes are `gets` and `posts`."""
+
+    def __init__(
+        self,
+        hands: Mapping[str, Callable[[], Grasping]],
+        objects: Catalogue,
+        importer: Importer,
+        window: TrainingWindow | None = None,
+        recordings: Recordings | None = None,
+    ):
+        """Loads the first hand's policy and the first object.
+
+        Args:
+          hands: by name, what loads a policy.
+          objects: what can be chosen.
+          importer: makes objects of uploaded meshes.
+          window: what is known of a run, or None.
+          recordings: its episodes on disk, or None.
+        """
+        self._hands, self._objects = hands, objects
+        self._window, self._recordings = window, recordings
+        self._folder = tempfile.TemporaryDirectory(prefix="congrasp-view-")
+        self._uploads = Uploads(pathlib.Path(self._folder.name), objects, importer)
+        self._lock = threading.RLock()
+        self._jobs, self._motions, self._thumbnails = Jobs(), Motions(), Thumbnails()
+        self._drawn: Download | None = None
+        self._hand = next(iter(hands))
+        self._object, self._shown = objects.names[0], 0
+        self._take_hand(hands[self._hand](), objects.get(self._object))
+        describe(self._studio)  # compiles the rules
+        self.gets: dict[str, Get] = {
+            "/api/state": lambda query: self.state(),
+            "/api/job": lambda query: self._jobs.state(),
+            "/api/hand": lambda query: hand_message(query.get("name", self._hand)),
+            "/api/object": lambda query: self.mesh(),
+            "/api/rest": lambda query: self.rest_picture(query.get("index", "")),
+            "/api/paint": lambda query: Message({"avoid": self._studio.canvas.paint.shown}, {}),
+            "/api/motion": lambda query: for_page(self.motion(query.get("id", ""))),
+            "/api/export": lambda query: self.export(query.get("id", ""), query.get("kind", "")),
+            "/api/drawn": lambda query: self.drawn(),
+            "/api/training": lambda query: self.training(query.get("names", "")),
+            "/api/episodes": lambda query: self.episodes_around(query.get("time", ""), query.get("seconds", "")),
+        }
+        self.posts: dict[str, Post] = {"/api/do": self._do, "/api/upload": self._upload}
+
+    def close(self) -> None:
+        """Ends what runs, and removes uploaded meshes."""
+        self._jobs.close()
+        self._folder.cleanup()
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows of studio, policy, objects, motions and job."""
+        with self._lock:
+            upload = self._uploads.of(self._object)
+            return {
+                "studio": describe(self._studio),
+                "history": self._history.view(),
+                "hands": list(self._hands),
+                "hand": self._hand,
+                "objects": self._objects.names,
+                "chosen": self._object,
+                "shown": self._shown,
+                "upload": None if upload is None else upload.view(),
+                "notes": [] if upload is None else upload.notes,
+                "policy": self._grasping.newest(),
+                "motions": self._motions.view(),
+                "training": self._window is not None,
+                "recordings": self._recordings is not None,
+                "saves": [*DRAWN, *DATA],
+                "drawn": DRAWN,
+                "job": self._jobs.state(),
+            }
+
+    def mesh(self) -> Message:
+        """The object's mesh that is painted on."""
+        with self._lock:
+            canvas, name = self._studio.canvas, self._studio.obj.name
+        own = {} if canvas.colours is None else {"colours": canvas.colours}
+        return Message({"vertices": canvas.vertices, "faces": canvas.faces, **own}, {"name": name})
+
+    def rest_picture(self, index: str) -> Picture:
+        """The object in one of its resting poses, from 0."""
+        with self._lock:
+            obj = self._studio.obj
+        return self._thumbnails.picture(obj, int(index) if index.isdecimal() and len(index) < 6 else -1)
+
+    def motion(self, key: str) -> Message:
+        """A motion: one of the studio, `actor:NAME` for an actor's newest episode, `record:ID` for a recorded one."""
+        kind, _, name = key.partition(":")
+        if kind == "actor" and self._window is not None:
+            return self._window.episode(name)
+        if kind == "record" and self._recordings is not None:
+            return self._recordings.episode(name)
+        with self._lock:
+            return self._motions.get(key)
+
+    def export(self, key: str, kind: str) -> Download:
+        """A motion as a file of one of `DATA`."""
+        return data_file(self.motion(key), key, kind)
+
+    def drawn(self) -> Download:
+        """The picture or video that was drawn last; a CongraspError if there is none."""
+        if self._drawn is None:
+            raise CongraspError("Nothing has been drawn yet.", "Save a motion as mp4 or png.")
+        return self._drawn
+
+    def training(self, names: str) -> dict[str, Any]:
+        """What the window shows; `names`: curves, separated by commas."""
+        if self._window is None:
+            raise CongraspError("The studio follows no run.", "Start it with --connect, or with --recordings.")
+        return self._window.view([name for name in names.split(",") if name])
+
+    def episodes_around(self, time: str, seconds: str) -> dict[str, Any]:
+        """Episodes that were recorded around a time."""
+        if self._recordings is None:
+            raise CongraspError("No recordings were named.", "Start the studio with --recordings FOLDER.")
+        try:
+            when, around = float(time), float(seconds)
+        except ValueError:
+            raise CongraspError("A search for episodes needs two numbers: time and seconds.") from None
+        reach, episodes = self._recordings.around(when, min(max(around, 0.1), 3600.0))
+        return {"seconds": reach, "episodes": episodes}
+
+    def _do(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
+        """One action of the user; answers with the new state."""
+        try:
+            request = json_object(body)
+            action = request.pop("action")
+        except (ValueError, KeyError, RecursionError):
+            raise CongraspError("The request is not a JSON object with an 'action'.") from None
+        with self._lock:
+            actions: dict[str, Callable[..., Any]] = {
+                "hand": self._choose_hand,
+                "object": self._choose_object,
+                "unit": self._choose_unit,
+                "grasp": self._grasp,
+                "draw_motion": self._draw_motion,
+                "delete": lambda id: self._motions.delete(str(id)),
+                "undo": self._history.undo,
+                "redo": self._history.redo,
+                **{name: functools.partial(self._history.do, name) for name in ACTIONS},
+            }
+            if not isinstance(action, str) or action not in actions:
+                raise CongraspError(f"The studio cannot do '{str(action)[:40]}'.", f"It can: {', '.join(actions)}.")
+            try:
+                actions[action](**request)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise CongraspError(f"'{action}' takes other values ({error}).") from None
+        return self.state()
+
+    def _upload(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
+        """A mesh to import; its object is chosen when that is done, unless several units would do."""
+        upload = self._uploads.take(query.get("name", ""), body)
+        with self._lock:
+            if upload.unit:
+                return self._import(upload.path.name, lambda: self._uploads.load(upload, upload.unit))
+            self._jobs.require_idle()
+            self._uploads.pending = upload
+            return self._jobs.state()
+
+    def _choose_unit(self, unit: str) -> None:
+        """Imports the uploaded mesh anew in another unit."""
+        upload, replaces = self._uploads.of(self._object), "" if self._uploads.pending else self._object
+        if upload is None or unit not in METRES:
+            raise CongraspError(f"The unit cannot be '{str(unit)[:20]}'.", "Open a mesh, then choose m, cm, mm or in.")
+        self._import(upload.path.name, lambda: self._uploads.load(upload, unit, replaces))
+
+    def _import(self, file: str, load: Callable[[], str]) -> dict[str, Any]:
+        """Begins an import, which returns the object's name; shows the object."""
+
+        def work(progress: Progress) -> None:
+            """Imports it."""
+            progress(f"importing {file}: repair and convex pieces, up to a minute", 0.1)
+            name = load()
+            with self._lock:
+                self._show(name)
+
+        return self._jobs.start(f"importing {file}", work)
+
+    def _choose_hand(self, name: str) -> None:
+        """Loads the policy of another hand."""
+        if name not in self._hands:
+            raise CongraspError(f"There is no policy for the hand '{name}'.", f"There is: {', '.join(self._hands)}.")
+
+        def work(progress: Progress) -> None:
+            """Loads it."""
+            progress(f"loading the policy of the hand {name}", 0.2)
+            grasping = self._hands[name]()
+            with self._lock:
+                self._hand = name
+                self._take_hand(grasping, self._studio.obj)
+
+        self._jobs.start(f"loading the policy of the hand {name}", work)
+
+    def _take_hand(self, grasping: Grasping, obj: GraspObject) -> None:
+        """A studio for a policy's hand."""
+        self._grasping = grasping
+        self._studio = Studio(grasping.hand, grasping.task, obj)
+        self._history = History(self._studio)
+
+    def _choose_object(self, name: str) -> None:
+        """Makes or imports another object."""
+
+        def work(progress: Progress) -> None:
+            """Makes it."""
+            progress(f"loading {name}", 0.2)
+            self._objects.get(name)
+            with self._lock:
+                self._show(name)
+
+        if name not in self._objects.names:
+            self._objects.get(name)
+        self._jobs.start(f"loading {name}", work)
+        self._uploads.pending = None
+
+    def _show(self, name: str) -> None:
+        """Puts an object that is there into the studio."""
+        self._studio.take(self._objects.get(name))
+        self._history = History(self._studio)
+        self._object, self._shown = name, self._shown + 1
+
+    def _grasp(self) -> None:
+        """Begins the grasp that is requested; its motion is kept."""
+        request, obj = self._studio.request, self._studio.labelled
+        grasping = self._grasping
+
+        def work(progress: Progress) -> str:
+            """Grasps; returns the motion's key."""
+            episode = grasping.grasp(obj, request, progress)
+            with self._lock:
+                return self._motions.keep(episode)
+
+        self._jobs.start("grasping", work)
+
+    def _draw_motion(self, id: str, kind: str, camera: Mapping[str, Any], frame: int = 0) -> None:
+        """Begins to draw a motion as one of `DRAWN`; `drawn` then has it."""
+        key = str(id)
+        episode = self.motion(key)
+
+        def work(progress: Progress) -> str:
+            """Draws it."""
+            self._drawn = drawing(
+                episode, key, kind, camera, frame, lambda share: progress(f"drawing the {kind}", share)
+            )
+            return _DRAWING
+
+        self._jobs.start(f"drawing the {kind}", work)
+
+
+def hand_message(name: str) -> Message:
+    """A hand's skin (see `common.hands.skin`), and its links' names."""
+    hand = get_hand(name)
+    skin = skin_of(hand)
+    links, weights = skin.influences()
+    arrays = {
+        "skin_points": skin.points,
+        "skin_normals": skin.normals,
+        "skin_faces": skin.faces,
+        "skin_joints": links.astype(np.int32),
+        "skin_weights": weights,
+        "skin_origins": skin.origins.astype(np.float32),
+        "skin_colours": skin_colours(skin),
+    }
+    return Message(arrays, {"hand": name, "links": [link.name for link in hand.links]})
+
+
+def json_object(body: bytes) -> dict[str, Any]:
+    """A JSON object; a ValueError for anything else."""
+    value = json.loads(body)
+    if not isinstance(value, dict):
+        raise ValueError("not an object")
+    return value

@@ -1,0 +1,305 @@
+"""Lift and pushes: the frame's profile, forces in every engine, what the policy sees, and what counts as survival."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from congrasp.actors import stress as protocols
+from congrasp.actors.attempts import Attempts
+from congrasp.actors.env import GraspEnv, Settings
+from congrasp.actors.initial import RequestedEpisodes
+from congrasp.actors.physics.mjx import MjxPhysics
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.rollout import RolloutWorker
+from congrasp.actors.stress import Frame, Protocol
+from congrasp.common import rotations
+from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.distance import distance_field
+from congrasp.common.task import plausibility
+from congrasp.common.task.constraints import CONSTRAINTS, optional
+from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.task.types import Surface
+from congrasp.services.train.command import untrained
+from tests import draws, scripted
+
+HAND = get_hand("human")
+WITHOUT_MESHES = set(protocols.ASSESSED) - {"hand_mesh_mm"}
+"""What is measured of a hand whose file has no visual meshes."""
+TASK = TaskConfig(
+    **{f"p_{constraint.name}": 0.0 for constraint in CONSTRAINTS if constraint.optional},
+    approach_steps=50,
+    back_off_range=(0.15, 0.15),
+    initial_speed=0.0,
+    preshape=False,
+    end_when_fallen=False,
+)
+OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "cylinder"])]
+BATCH = 2
+
+
+def protocol(height: float = 0.15, start: int = 0, masses: tuple[float, ...] = (0.2, 0.4)) -> Protocol:
+    steps = protocols.lift_steps(TASK, height)
+    return Protocol(np.float32(start), np.float32(height), np.float32(start + steps), np.array(masses, np.float32))
+
+
+def frames(height: float) -> Frame:
+    """The carried frame at every step from the table's removal to the end of the lift."""
+    time = TASK.approach_steps + np.arange(200, dtype=np.float32)
+    found = _frame(protocol(height), time)
+    return Frame(*(np.asarray(field)[: protocols.lift_steps(TASK, height) + 1] for field in found))
+
+
+_frame = jax.jit(lambda protocol, time: protocols.frame(protocol, TASK, time))
+
+
+def test_the_lift_is_of_15_cm_at_30_cm_a_second():
+    found = frames(0.15)
+    # 3 m/s^2 for 0.1 s (1.5 cm), 0.3 m/s for 0.4 s, 3 m/s^2 downwards for 0.1 s; then 0.1 s of rest.
+    assert len(found.height) == 71
+    at = [0, 5, 10, 30, 50, 55, 60, 70]
+    heights = [0, 0.00375, 0.015, 0.075, 0.135, 0.14625, 0.15, 0.15]
+    np.testing.assert_allclose(found.height[at], heights, atol=1e-6)
+    np.testing.assert_allclose(found.speed[at], [0, 0.15, 0.3, 0.3, 0.3, 0.15, 0, 0], atol=1e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.005, 0.5))
+def test_every_lift_is_smooth_and_ends_where_it_should(height):
+    found = frames(height)
+    assert found.height[-1] == pytest.approx(height, abs=1e-5) and abs(found.speed[-1]) < 1e-4
+    assert found.speed.max() <= protocols.LIFT_SPEED + 1e-5 and (np.diff(found.height) > -1e-6).all()
+    assert np.abs(np.diff(found.speed)).max() <= protocols.LIFT_ACCELERATION * TASK.control_dt + 1e-4
+    way = 0.5 * TASK.control_dt * (found.speed[1:] + found.speed[:-1])
+    # Where the speed has a kink within a step, the trapezoid is off by a dt^2 / 8 at most.
+    kink = protocols.LIFT_ACCELERATION * TASK.control_dt**2 / 8
+    np.testing.assert_allclose(np.diff(found.height), way, atol=kink + 1e-6)
+
+
+def test_pushes_follow_one_another_along_the_axes_of_the_world():
+    steps, first = protocols.push_steps(TASK), TASK.approach_steps + protocols.lift_steps(TASK)
+    index, scale = np.array([1]), np.array([1.5], np.float32)
+    forces = [
+        np.asarray(protocols.push(protocol(), TASK, np.array([time]), index, scale))[0]
+        for time in [0, first - 1, *(first + steps * np.arange(12) + steps // 2), first + 12 * steps]
+    ]
+    assert not np.any([forces[0], forces[1], forces[-1]])
+    half = 0.5 * 9.81 * 0.4 * 1.5
+    directions = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]
+    np.testing.assert_allclose(forces[2:8], half * np.array(directions), rtol=1e-5)
+    np.testing.assert_allclose(forces[8:14], 1.0 * np.array(directions), rtol=1e-5)
+    assert protocols.stress_steps(TASK) == protocols.lift_steps(TASK) + 12 * steps == 70 + 12 * 25
+
+
+@functools.cache
+def start():
+    """Two objects at rest, with the hand far above them and not quite aligned."""
+    fresh = draws.sample(HAND, TASK, build_bank(HAND, TASK, OBJECTS, 0), jax.random.key(1), BATCH)
+    rest = np.array([obj.rest_poses[0] for obj in OBJECTS], np.float32)
+    aligned = Rotation.from_quat(fresh.reset_state.base_quaternion, scalar_first=True)
+    turns = (aligned * Rotation.from_euler("x", [[20], [-40]], degrees=True)).as_quat(scalar_first=True)
+    state = fresh.reset_state._replace(
+        object_index=np.arange(BATCH),
+        object_position=rest[:, :3],
+        object_quaternion=rest[:, 3:],
+        base_position=rest[:, :3] + [0.0, 0.0, 0.4],
+        base_quaternion=turns.astype(np.float32),
+        q=np.tile(HAND.q_open, (BATCH, 1)),
+    )
+    return fresh._replace(reset_state=jax.tree.map(jnp.asarray, state))
+
+
+def falls(physics, force: np.ndarray, steps: int = 10):
+    """Objects after `steps` control steps without a table under a force, and without one before."""
+    target = np.concatenate([np.zeros((BATCH, 6)), np.tile(HAND.q_open, (BATCH, 1))], 1).astype(np.float32)
+    state = physics.start(start().reset_state)
+    step = jax.jit(physics.step) if physics.compiled else physics.step
+    for _ in range(steps):
+        state, after = step(state, target, np.zeros(BATCH, bool), force)
+    return after
+
+
+def check_fall(physics):
+    """A free object under gravity and a force moves by (f / m + g) t^2 / 2, and does not turn."""
+    force = np.array([[0.6, -0.4, 1.0], [0.0, 0.8, -0.5]], np.float32)
+    after = falls(physics, force)
+    masses = np.array([obj.mass for obj in OBJECTS])[:, None]
+    seconds = 10 * TASK.control_dt
+    expected = (force / masses + [0.0, 0.0, -9.81]) * seconds
+    np.testing.assert_allclose(after.object_velocity, expected, rtol=0.01, atol=0.01)
+    np.testing.assert_allclose(after.object_angular_velocity, 0.0, atol=0.02)
+
+
+def test_native_pushes_with_a_force_and_forgets_it_at_a_reset():
+    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+    check_fall(physics)
+    after = falls(physics, np.zeros((BATCH, 3), np.float32))
+    np.testing.assert_allclose(after.object_velocity[:, :2], 0.0, atol=1e-3)
+    state = start().reset_state
+    target = np.concatenate([np.zeros((BATCH, 6)), np.tile(HAND.q_open, (BATCH, 1))], 1)
+    physics.step(None, target, np.zeros(BATCH, bool), np.full((BATCH, 3), 5.0))
+    physics.reset(None, np.ones(BATCH, bool), state)
+    _, after = physics.step(None, target, np.zeros(BATCH, bool))
+    np.testing.assert_allclose(after.object_velocity[:, :2], 0.0, atol=1e-3)
+    physics.close()
+
+
+def test_mjx_gets_the_same_force(monkeypatch):
+    """What MJX makes of `xfrc_applied` is MuJoCo's; compiling it takes over a minute."""
+    monkeypatch.setattr("congrasp.actors.physics.mjx.mjx.step", lambda model, data: data)
+    physics, force = MjxPhysics(HAND, TASK, OBJECTS), np.array([[0.6, -0.4, 1.0], [0.0, 0.8, -0.5]], np.float32)
+    state = physics.start(start().reset_state)
+    target = np.zeros((BATCH, 6 + len(HAND.joints)), np.float32)
+    pushed, _ = jax.jit(physics.step)(state, target, np.zeros(BATCH, bool), force)
+    expected = np.zeros_like(pushed.data.xfrc_applied)
+    expected[:, physics._object_body, :3] = force
+    np.testing.assert_array_equal(pushed.data.xfrc_applied, expected)
+
+
+def test_warp_pushes_with_the_same_force():
+    warp = pytest.importorskip("congrasp.actors.physics.warp")
+    check_fall(warp.WarpPhysics(HAND, TASK, OBJECTS, mesh_slots=0))
+
+
+def lifted(action: np.ndarray, protocol: Protocol | None, steps: int):
+    """Scenes and their carried frames after each step of one action, from the table's removal on."""
+    task = dataclasses.replace(TASK, approach_steps=0)
+    physics = NativePhysics(HAND, task, OBJECTS, 1)
+    env, conditions = GraspEnv(HAND, task, physics), start()
+    conditions = conditions._replace(hold=jnp.full(BATCH, steps))
+    configured = Settings(task.reward, task.control, protocol)
+    physics.start(conditions.reset_state)
+    state = env.with_scene(env.state_of(conditions, None), physics.read(None))
+    decide = jax.jit(lambda state: env.targets(state, action, configured))
+    advance = jax.jit(lambda state, target, after: env.advance(state, target, after, configured))
+    seen = []
+    for _ in range(steps):
+        target, command = decide(state)
+        _, after = physics.step(None, *command)
+        state, _ = advance(state, target, after)
+        seen.append((state.scene[0], state.scene[1], state.frame, after))
+    physics.close()
+    return seen
+
+
+def test_a_lift_is_unseen_by_the_policy_and_takes_the_wrist_along():
+    action = np.zeros((BATCH, len(HAND.joints) + 6), np.float32)
+    masses = tuple(obj.mass for obj in OBJECTS)
+    still = lifted(action, None, 215)
+    moving = lifted(action, protocol(start=145, masses=masses), 215)  # when the wrist has come to its guidance
+    for (scene, features, frame, after), (other, others, none, _) in zip(moving, still, strict=True):
+        assert not np.any(none.height)
+        # What is seen is the same within half a millimetre: targets are held for a control step each.
+        np.testing.assert_allclose(features.wrist_position, others.wrist_position, atol=5e-4)
+        np.testing.assert_allclose(scene.u, other.u, atol=1e-3)
+        np.testing.assert_allclose(scene.u_velocity[:, :3], other.u_velocity[:, :3], atol=0.01)
+        # The object falls, in the world; the frame leaves it below.
+        below = np.asarray(after.object_position) - np.asarray(frame.height)[:, None] * [0.0, 0.0, 1.0]
+        np.testing.assert_allclose(scene.object_position, below, atol=1e-6)
+    assert np.asarray(moving[-1][2].height) == pytest.approx(0.15, abs=1e-6)
+    risen = rotations.rotate(start().reset_state.base_quaternion, moving[-1][3].u[:, :3] - still[-1][3].u[:, :3])
+    np.testing.assert_allclose(risen, np.tile([0.0, 0.0, 0.15], (BATCH, 1)), atol=5e-4)
+
+
+def test_pushes_reach_the_object_through_the_environment():
+    action = np.zeros((BATCH, len(HAND.joints) + 6), np.float32)
+    masses = np.array([obj.mass for obj in OBJECTS], np.float32)
+    begin = protocol(masses=tuple(masses))._replace(push_start=np.float32(2))
+    velocity = np.array([np.asarray(after.object_velocity) for *_, after in lifted(action, begin, 12)])
+    np.testing.assert_allclose(velocity[1, :, 0], 0.0, atol=1e-3)
+    np.testing.assert_allclose(velocity[11, :, 0], 0.5 * 9.81 * 10 * TASK.control_dt, rtol=0.02)
+    np.testing.assert_allclose(velocity[11, :, 1], 0.0, atol=5e-3)
+
+
+def worker(task: TaskConfig, **arguments) -> RolloutWorker:
+    physics = NativePhysics(HAND, task, OBJECTS, 1)
+    bank, act = build_bank(HAND, task, OBJECTS, 0), scripted.close(HAND, task)
+    return RolloutWorker(HAND, task, physics, bank, act, batch=4, seed=0, half_precision=False, **arguments)
+
+
+def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
+    task = dataclasses.replace(TASK, approach_steps=20, hold_steps=10, hold_steps_max=10)
+    plain, *probed = worker(task), worker(task, probe=plausibility.sample), worker(task, probe=plausibility.sample)
+    after = protocols.stress_steps(task)
+    for each in probed:
+        each.adjust(protocol=protocols.stress(task, OBJECTS, 10), probe_data=distance_field(OBJECTS))
+    ended, measured = probed
+    measured.state = measured.state._replace(after=jnp.full(4, after))
+    bare, one, other = (each.collect(None, 30) for each in (plain, ended, measured))
+    np.testing.assert_array_equal(one.action, other.action)
+    np.testing.assert_array_equal(one.episodes, other.episodes)
+    np.testing.assert_array_equal(bare.action, one.action)
+    # A program without the probe may round otherwise, and what is left of two lengths is as wrong as these are.
+    np.testing.assert_allclose(bare.episodes, one.episodes, rtol=1e-5, atol=1e-6)
+    assert one.terminal[-1].all() and one.has_episode.all() and other.has_episode.all() and not other.terminal.any()
+    rest = measured.collect(None, after)
+    np.testing.assert_array_equal(rest.episodes, one.episodes)
+    assert not rest.has_episode.any() and rest.terminal[-1].all() and not rest.terminal[:-1].any()
+    samples = jax.tree.map(lambda *x: np.concatenate(x), other.probed, rest.probed)
+    found = protocols.assess(samples, np.ones(4, bool), task, 10)
+    assert set(found) == WITHOUT_MESHES and all(np.isfinite(value).all() for value in found.values())
+    short = protocols.assess(other.probed, np.ones(4, bool), task, 10)
+    assert np.isnan(short["push_survival"]).all() and short["wrist_speed"] == pytest.approx(found["wrist_speed"])
+    for each in (plain, ended, measured):
+        each.physics.close()
+
+
+def path(**moves: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """The way of one grasp whose object moves (m) and turns (degrees) against the wrist at some of the steps."""
+    steps = protocols.stress_steps(TASK) + 1
+    position, angle = np.zeros((steps, 1, 3)), np.zeros(steps)
+    for step, (metres, degrees) in moves.items():
+        position[int(step[1:]) :, 0, 1] += metres
+        angle[int(step[1:]) :] += degrees
+    return position, Rotation.from_euler("z", angle[:, None], degrees=True).as_quat(scalar_first=True)[:, None]
+
+
+@pytest.mark.parametrize(
+    ("moves", "survived"),  # lift, pushes by weight, all pushes
+    [
+        ({}, (1, 1, 1)),
+        ({"s30": (0.051, 0.0)}, (0, 0, 0)),
+        ({"s100": (0.051, 0.0)}, (1, 0, 0)),
+        ({"s300": (0.0, 15.1)}, (1, 1, 0)),
+        ({"s30": (0.03, 10.0), "s100": (0.03, 10.0), "s300": (0.03, 10.0)}, (1, 1, 1)),  # each from where it began
+        ({"s300": (0.03, 8.0), "s310": (0.03, 0.0), "s320": (-0.03, 0.0)}, (1, 1, 0)),  # at any time
+    ],
+)
+def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
+    found = protocols.survival(*path(**moves), np.array([True]), TASK)
+    assert tuple(found[name][0] for name in protocols.SURVIVAL) == survived
+    lost = protocols.survival(*path(**moves), np.array([False]), TASK)
+    assert not any(lost[name][0] for name in protocols.SURVIVAL)
+
+
+def test_attempts_with_a_lift_end_higher_in_the_world():
+    task = dataclasses.replace(TASK, approach_steps=60, hold_steps=5)
+    policy = untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,))))
+    obj, count = OBJECTS[1], task.surface_points
+    drawn = draws.sample(HAND, task, build_bank(HAND, task, [obj], 0), jax.random.key(0), 2)
+    rest = np.concatenate([drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1)
+    surface = Surface(np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1)))
+    asked = {constraint.name: np.zeros(2, bool) for constraint in optional(task)}
+    attempts = Attempts(HAND, task, policy, hold=5, threads=1, lift=0.06)
+    outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
+    attempts.close()
+    lift = protocols.lift_steps(task, 0.06)
+    assert attempts.steps == 60 + lift + 5 == len(outcome.trace.q)
+    dt = task.control_dt
+    assert attempts.phases == {"grasp": 0.0, "lift": 60 * dt, "hold": pytest.approx((60 + lift) * dt)}
+    assert set(outcome.metrics) > WITHOUT_MESHES
+    way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[59]
+    slid = (outcome.trace.u[-1] - outcome.trace.u[59])[:, :3]
+    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[60:, :, 2], axis=0).max() < 0.02)
+    # The untrained hand leaves the object, and the table under it stands: it is where it was, and not held.
+    assert outcome.trace.table.all() and not outcome.metrics["held"].any()
+    assert (outcome.trace.object_position[-1, :, 2] > 0.5 * rest[:, 2]).all()
+    np.testing.assert_allclose(np.linalg.norm(way, axis=-1), np.linalg.norm(slid, axis=-1), atol=1e-5)

@@ -1,0 +1,65 @@
+"""A headless browser for the tests of the page; what it saw is kept in test-results/ where a test fails."""
+
+import os
+import pathlib
+import re
+import shutil
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[3]
+RESULTS = ROOT / "test-results"
+SIZE = {"width": 1280, "height": 760}
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium, drawing without a graphics card."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
+    with playwright.sync_playwright() as running:
+        own = pathlib.Path(running.chromium.executable_path)
+        found = next(filter(None, map(shutil.which, BROWSERS)), None) or (str(own) if own.exists() else None)
+        if found is None:
+            pytest.skip("there is no browser here (tests/install_browser.sh installs one)")
+        started = running.chromium.launch(executable_path=found, args=ARGUMENTS)
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def page(browser: Any, request: pytest.FixtureRequest, tmp_path: pathlib.Path) -> Iterator[Any]:
+    """A page whose console must stay empty: errors and warnings there fail the test."""
+    context = browser.new_context(viewport=SIZE, accept_downloads=True)
+    context.set_default_timeout(60_000)
+    # Without a picture of every frame, which costs more than drawing them: a failure keeps the last one.
+    context.tracing.start(screenshots=bool(os.environ.get("KEEP_TRACES")), snapshots=True)
+    opened = context.new_page()
+    messages: list[str] = []
+    opened.on(
+        "console", lambda message: messages.append(message.text) if message.type in ("error", "warning") else None
+    )
+    opened.on("pageerror", lambda error: messages.append(str(error)))
+    opened.messages = messages
+    yield opened
+    # Chromium itself warns when a frame is read back from a processor that draws.
+    messages[:] = [text for text in messages if "GL Driver Message" not in text]
+    if messages or getattr(request.node, "failed", True) or os.environ.get("KEEP_TRACES"):
+        name = re.sub(r"\W+", "-", request.node.name)
+        RESULTS.mkdir(exist_ok=True)
+        opened.screenshot(path=RESULTS / f"{name}.png")
+        context.tracing.stop(path=RESULTS / f"{name}.zip")
+    context.close()
+    assert messages == getattr(opened, "expected", [])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Any:
+    """Tells the fixture whether its test failed."""
+    report = yield
+    if report.when == "call":
+        item.failed = report.failed  # type: ignore[attr-defined]
+    return report

@@ -1,0 +1,101 @@
+"""The policy behind the studio: newest weights, and which of the grasps near what was drawn is shown."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from congrasp.actors.attempts import Outcome
+from congrasp.actors.stress import ASSESSED
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.services.studio import grasping
+from congrasp.services.studio.grasping import ATTEMPTS, PolicyGrasping
+from congrasp.services.studio.state import Studio
+from tests.studio import objects
+
+SHIPPED = bundles.load(policy_file(None))
+
+
+class Source:
+    """Gives what it is told to."""
+
+    def __init__(self) -> None:
+        self.next: Callable[[], PolicyBundle | None] = lambda: SHIPPED
+
+    def __call__(self, version: int) -> PolicyBundle | None:
+        return self.next()
+
+
+def outcome(held: list[int], error: list[float]) -> Outcome:
+    names = ("success", "held", "heading_rad", "heading_m", "moved_at_removal", "force_link_max")
+    metrics = {name: np.zeros(ATTEMPTS) for name in (*names, *ASSESSED)}
+    metrics["success"][held] = metrics["held"][held] = 1.0
+    metrics["heading_rad"][: len(error)] = error
+
+    class Trace:
+        object_position = np.zeros((3, ATTEMPTS, 3))
+        table = np.array([[1] * ATTEMPTS, [1] * ATTEMPTS, [0] * ATTEMPTS])
+
+    none = np.zeros(ATTEMPTS, bool)
+    return Outcome(None, none, ~none, metrics, Trace())  # type: ignore[arg-type]
+
+
+def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused() -> None:
+    source = Source()
+    policy = PolicyGrasping(source, "the run 'r'")
+    newer = dataclasses.replace(SHIPPED, version=SHIPPED.version + 5)
+    source.next = lambda: newer
+    policy.refresh()
+    assert policy.newest() == {"source": "the run 'r'", "version": SHIPPED.version + 5, "trouble": ""}
+    other = dataclasses.replace(newer, spec=dataclasses.replace(newer.spec, hand="allegro"))
+    source.next = lambda: other
+    policy.refresh()
+    assert policy.newest()["version"] == newer.version and "allegro" in policy.newest()["trouble"]
+
+    def away() -> PolicyBundle | None:
+        raise TransportError("nobody is there")
+
+    source.next = away
+    policy.refresh()
+    assert "disconnected" in policy.newest()["trouble"]
+    source.next = lambda: None
+    policy.refresh()
+    assert policy.newest()["trouble"] == ""
+    with pytest.raises(CongraspError, match="no policy of the run 'r' yet"):
+        PolicyGrasping(source, "the run 'r'")
+
+
+def test_what_was_drawn_is_tried_first_and_the_others_are_near_it() -> None:
+    policy = PolicyGrasping(Source(), "file")
+    studio = Studio(policy.hand, policy.task, objects().get("mug"))
+    episodes, aside = grasping._episodes(policy.hand, policy.task, studio.labelled, studio.request)
+    goal = episodes.goal["heading"]
+    np.testing.assert_allclose(goal.position[0], studio.arrow.position, atol=1e-6)
+    np.testing.assert_allclose(goal.direction[0], studio.arrow.direction, atol=1e-6)
+    assert aside[0] == 0 and (aside[1:] > 0).all() and aside.max() < 0.04
+    cosine = goal.direction @ studio.arrow.direction
+    assert (cosine > np.cos(0.5)).all() and cosine[1:].max() < 1 - 1e-6
+    np.testing.assert_allclose((goal.direction * goal.cross).sum(-1), 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("held", "error", "index", "says"),
+    [
+        ([0, 1, 2], [0.1, 0.0, 0.0], 0, ""),
+        ([0, 1, 2], [1.5, 1.5, 0.0], 2, "this one did better"),
+        ([3], [0.0], 3, "this one held, which what was drawn did not"),
+        ([], [0.0], 0, ""),
+    ],
+)
+def test_what_was_drawn_is_shown_unless_another_is_clearly_better(
+    held: list[int], error: list[float], index: int, says: str
+) -> None:
+    found = outcome(held, error)
+    removal = int(found.trace.table[:, 0].sum()) - 1
+    assert grasping._best(found, (), removal) == index
+    assert says in grasping._note(found, index, np.full(ATTEMPTS, 0.004))
+    assert bool(says) == bool(grasping._note(found, index, np.full(ATTEMPTS, 0.004)))

@@ -1,0 +1,266 @@
+"""The page's server answers its own page alone, and any request with a result or a message."""
+
+import http.client
+import io
+import json
+import pathlib
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import decode
+from congrasp.services.cli.main import main
+from congrasp.services.export.motion_file import load_motion
+from congrasp.services.record.reader import read_episodes
+from congrasp.services.studio import files
+from congrasp.services.studio.catalogue import Uploads
+from congrasp.services.studio.server import PageServer
+from congrasp.services.studio.session import Session
+from tests import studio as made_up
+
+
+class Page:
+    """Asks as a browser does."""
+
+    def __init__(self, port: int):
+        self.port = port
+
+    def ask(self, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        kind = {"Content-Type": "application/json"} if method == "POST" else {}
+        connection.request(method, path, body or None, {**kind, **{k.replace("_", "-"): v for k, v in headers.items()}})
+        answer = connection.getresponse()
+        found = answer.status, answer.read()
+        connection.close()
+        return found
+
+    def do(self, action: str, **values: Any) -> dict[str, Any]:
+        code, found = self.ask("POST", "/api/do", json.dumps({"action": action, **values}).encode())
+        assert code == 200
+        return json.loads(found)
+
+    def wait(self) -> dict[str, Any]:
+        deadline = time.monotonic() + 30
+        while (job := json.loads(self.ask("GET", "/api/job")[1]))["running"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        return job
+
+
+@pytest.fixture(scope="module")
+def grasping() -> made_up.MadeUpGrasping:
+    return made_up.MadeUpGrasping()
+
+
+@pytest.fixture(scope="module")
+def page(grasping: made_up.MadeUpGrasping) -> Iterator[Page]:
+    session: Session = made_up.session(grasping, window=made_up.window(5))
+    server = PageServer(session.gets, session.posts, "127.0.0.1", 0)
+    yield Page(server.port)
+    server.close()
+    session.close()
+
+
+def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: Page) -> None:
+    assert b"<title>congrasp" in page.ask("GET", "/")[1]
+    assert page.ask("GET", "/static/gl.js")[0] == 200
+    for path in ("/static/../server.py", "/static/%2e%2e/server.py", "/etc/passwd", "/static/", "/api/none"):
+        assert page.ask("GET", path)[0] == 404, path
+
+
+def test_other_sites_are_turned_away(page: Page) -> None:
+    assert page.ask("GET", "/api/state", Host="evil.example:80")[0] == 403
+    assert page.ask("GET", "/api/state", Origin="http://evil.example")[0] == 403
+    body = json.dumps({"action": "fill", "avoid": True}).encode()
+    assert page.ask("POST", "/api/do", body, Content_Type="text/plain")[0] == 403
+    assert page.ask("POST", "/api/do", body, Origin="http://evil.example")[0] == 403
+    assert (
+        page.ask("GET", "/api/state", Host=f"localhost:{page.port}", Origin=f"http://localhost:{page.port}")[0] == 200
+    )
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        (b"", "JSON"),
+        (b"[1]", "JSON"),
+        (b"[" * 100_000, "JSON"),
+        (b'{"action": ["fill"]}', "cannot do"),
+        (b'{"action": "set_rest_pose", "rest": 0.5}', "no resting pose '0.5'"),
+        (b'{"action": "set_rest_pose", "rest": "upright"}', "no resting pose 'upright'"),
+        (b'{"action": "draw", "points": "along"}', "'draw' takes other values"),
+        (b'{"action": "draw", "points": [[0, 0, 0], [1]]}', "'draw' takes other values"),
+        (b'{"action": "draw", "points": [[1e308, 0, 0], [-1e308, 0, 0]]}', "within"),
+        (b'{"action": "paint", "points": [["x", 0, 0]], "radius": 0.01, "avoid": true}', "'paint' takes other values"),
+        (b'{"action": "set_heading", "position": [1e308, 0, 0], "direction": [0, 0, 1]}', "within"),
+        (b'{"action": "explode"}', "cannot do 'explode'"),
+        (b'{"action": "view"}', "cannot do 'view'"),
+        (b'{"action": "set_roll", "turns": 2}', "other values"),
+        (b'{"action": "object", "name": "moon"}', "no object 'moon'"),
+        (b'{"action": "unit", "unit": "cm"}', "Open a mesh"),
+        (b'{"action": "draw_motion", "id": "7", "kind": "png", "camera": {}}', "no motion '7'"),
+        (b'{"action": "ask", "constraint": "x", "on": true}', "no constraint 'x'"),
+    ],
+)
+def test_wrong_requests_are_answered_with_a_message(page: Page, body: bytes, says: str) -> None:
+    code, found = page.ask("POST", "/api/do", body)
+    assert code == 200 and says in json.loads(found)["error"]
+
+
+def test_too_much_or_of_no_length_is_refused_before_it_is_read(page: Page) -> None:
+    for length in (str(1 << 40), "-5", "many", "9" * 5000):
+        assert page.ask("POST", "/api/upload?name=a.stl", b"", Content_Length=length)[0] == 413
+
+
+def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasping, tmp_path: pathlib.Path) -> None:
+    page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, avoid=True)
+    page.do("grasp")
+    assert page.wait()["error"] == ""
+    assert tuple(grasping.asked[-1][1].constraints) == ("heading", "affordance")
+    motions = json.loads(page.ask("GET", "/api/state")[1])["motions"]
+    assert motions[0]["held"] and motions[0]["steps"] == made_up.STEPS
+    played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])
+    assert played.arrays["lane/affordance/met"].shape == (made_up.STEPS,)
+    for kind in ("npz", "mcap"):
+        (tmp_path / f"m.{kind}").write_bytes(page.ask("GET", f"/api/export?id={motions[0]['id']}&kind={kind}")[1])
+    motion = load_motion(tmp_path / "m.npz")
+    np.testing.assert_array_equal(motion.link_position, played.arrays["link_position"])
+    (episode,) = read_episodes(tmp_path / "m.mcap")
+    np.testing.assert_array_equal(episode.arrays["link_position"], played.arrays["link_position"])
+    assert b"Choose from: npz, mcap, glb" in page.ask("GET", "/api/export?id=1&kind=docx")[1]
+
+
+def test_a_fault_inside_is_shown_and_the_studio_continues(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+    grasping.fails = "the hand fell off"
+    page.do("grasp")
+    job = page.wait()
+    grasping.fails = ""
+    assert "the hand fell off" in job["error"] and "fault of congrasp" in job["error"]
+    page.do("grasp")
+    assert page.wait()["error"] == ""
+
+
+def test_a_mesh_becomes_an_object_and_an_empty_file_is_refused(page: Page) -> None:
+    code, found = page.ask("POST", "/api/upload?name=nothing.stl", b"", Content_Type="application/octet-stream")
+    assert code == 200 and "nothing.stl is empty" in json.loads(found)["error"]
+    code, _ = page.ask("POST", "/api/upload?name=..%2Fx.stl", b"solid", Content_Type="application/octet-stream")
+    assert code == 200 and page.wait()["error"] == ""
+    state = json.loads(page.ask("GET", "/api/state")[1])
+    assert state["studio"]["object"]["name"] == state["chosen"] == "bottle_5"
+    assert state["upload"]["unit"] == "m" and state["upload"]["file"] == "x.stl"
+
+
+def test_a_mesh_of_unknown_unit_waits_for_it_and_may_get_another(page: Page) -> None:
+    def state() -> dict[str, Any]:
+        return json.loads(page.ask("GET", "/api/state")[1])
+
+    before = state()
+    page.ask("POST", "/api/upload?name=unknown.stl", b"solid", Content_Type="application/octet-stream")
+    waiting = state()
+    assert waiting["chosen"] == before["chosen"] and waiting["shown"] == before["shown"]
+    assert {unit["unit"]: unit["size"] for unit in waiting["upload"]["units"]} == {
+        "m": "0.9 x 0.9 x 3 m",
+        "cm": "0.9 x 0.9 x 3 cm",
+        "mm": "0.9 x 0.9 x 3 mm",
+        "in": "2.29 x 2.29 x 7.62 cm",
+    }
+    assert [unit["unit"] for unit in waiting["upload"]["units"] if unit["possible"]] == ["cm", "in"]
+    names, sizes = [], []
+    for unit in ("cm", "in"):
+        page.do("unit", unit=unit)
+        assert page.wait()["error"] == ""
+        found = state()
+        assert found["upload"]["unit"] == unit
+        names.append(found["chosen"])
+        sizes.append(max(found["studio"]["object"]["size_cm"]))
+    assert sizes[1] / sizes[0] == pytest.approx(2.54, rel=0.05)
+    assert names[0] == names[1] and found["objects"].count(names[0]) == 1  # it took the place of the first
+    page.do("object", name="mug")
+    assert page.wait()["error"] == "" and state()["upload"] is None
+
+
+def test_a_second_mesh_of_the_same_name_does_not_touch_the_first(tmp_path: pathlib.Path) -> None:
+    uploads = Uploads(tmp_path, made_up.objects(), made_up.MadeUpImporter())
+    first, second = uploads.take("model.stl", b"first"), uploads.take("model.stl", b"second")
+    assert (first.path.read_bytes(), second.path.read_bytes()) == (b"first", b"second")
+    assert first.view()["file"] == second.view()["file"] == "model.stl"
+    with pytest.raises(CongraspError, match=r"^model\.txt is not an STL file"):
+        uploads.take("model.txt", b"first")
+
+
+def test_a_mesh_that_comes_during_a_job_is_refused(
+    page: Page, grasping: made_up.MadeUpGrasping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, free, grasp = threading.Event(), threading.Event(), grasping.grasp
+
+    def wait(*asked: Any) -> Any:
+        begun.set()
+        assert free.wait(30)
+        return grasp(*asked)
+
+    monkeypatch.setattr(grasping, "grasp", wait)
+    before = json.loads(page.ask("GET", "/api/state")[1])["upload"]
+    page.do("grasp")
+    assert begun.wait(30)
+    for name in ("x.stl", "unknown.stl"):
+        answer = page.ask("POST", f"/api/upload?name={name}", b"solid", Content_Type="application/octet-stream")[1]
+        assert "Please wait" in json.loads(answer)["error"]
+    free.set()
+    assert page.wait()["error"] == ""
+    assert json.loads(page.ask("GET", "/api/state")[1])["upload"] == before
+
+
+def test_a_motion_may_be_named_by_a_number(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)])
+    page.do("grasp")
+    number = int(page.wait()["made"])
+    camera = {"position": [0.5, 0.5, 0.5], "target": [0.0, 0.0, 0.0], "field_of_view": 40.0}
+    page.do("draw_motion", id=number, kind="png", camera=camera)
+    assert page.wait()["error"] == ""
+    page.do("delete", id=number)
+    assert str(number) not in [one["id"] for one in json.loads(page.ask("GET", "/api/state")[1])["motions"]]
+
+
+def test_resting_poses_have_thumbnails_and_edits_are_undone(page: Page) -> None:
+    before = page.do("set_rest_pose", rest=1)
+    assert before["studio"]["rest"]["index"] == 1 and before["history"]["undo"] == "resting pose"
+    assert page.do("undo")["studio"]["rest"]["index"] == 0
+    assert page.do("redo")["studio"]["rest"]["index"] == 1
+    code, picture = page.ask("GET", "/api/rest?index=1")
+    assert code == 200 and Image.open(io.BytesIO(picture)).size == (150, 112)
+    assert picture != page.ask("GET", "/api/rest?index=0")[1]
+    assert b"no resting pose 100" in page.ask("GET", "/api/rest?index=99")[1]
+    assert page.do("object", name="mug")["history"] and page.wait()["error"] == ""
+    assert page.do("undo")["history"] == {"undo": "", "redo": ""}  # nothing of the object before
+
+
+def test_a_run_is_shown_beside_the_studio(page: Page) -> None:
+    view = json.loads(page.ask("GET", "/api/training?names=episode/return")[1])
+    assert list(view["curves"]) == ["episode/return"] and len(view["actors"]) == 5
+    played = decode(page.ask("GET", "/api/motion?id=actor:a003")[1])
+    assert played.meta["object"] == "thing-3"
+    assert "recordings" in json.loads(page.ask("GET", "/api/episodes?time=1&seconds=1")[1])["error"]
+
+
+def test_a_busy_port_and_an_open_interface_are_refused_in_one_line(
+    page: Page, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(CongraspError, match="--port"):
+        PageServer({}, {}, "127.0.0.1", page.port)
+    for arguments, says in (
+        (["--host", "0.0.0.0"], "could be reached from other machines"),
+        (["--policy", "a.safetensors", "--connect", "tcp/127.0.0.1:1"], "Give one of --policy and --connect"),
+        (["--policy", "nowhere.safetensors"], "nowhere.safetensors"),
+        (["--objects", "/nowhere"], "/nowhere"),
+        (["--recordings", "/nowhere"], "/nowhere"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(["view", "--port", "0", *arguments])
+        error = capsys.readouterr().err
+        assert end.value.code == 2 and says in error and error.count("\n") == 1, error

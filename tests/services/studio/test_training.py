@@ -1,0 +1,215 @@
+"""What is known of a run: curves, a hundred actors, and episodes found by their time."""
+
+import pathlib
+import struct
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import MCAP0_MAGIC
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.recorder import Recorder
+from congrasp.services.studio.recordings import MOST, Recordings
+from congrasp.services.studio.training import FIRST, Curve, Follower, TrainingWindow, labels_of
+from tests import studio as made_up
+from tests.studio import BEGIN, DIP
+
+KEYS = Keys("made-up")
+
+
+def test_a_window_shows_a_hundred_actors_with_their_newest_episodes() -> None:
+    window = made_up.window(actors=100)
+    view = window.view()
+    assert len(view["actors"]) == 100
+    row = view["actors"][4]
+    assert (row["id"], row["lag"], row["steps_per_second"], row["success"]) == ("a004", 1, 1004.0, 0.0)
+    assert row["object"] == "thing-4" and row["alive"]
+    assert window.episode("a004").meta["object"] == "thing-4"
+    assert view["constraints"]["pose"] == 0.5 and view["counters"]["granted"] == 3
+    with pytest.raises(CongraspError, match="a999"):
+        window.episode("a999")
+
+
+def test_success_is_shown_for_every_constraint_of_the_learners_metrics() -> None:
+    window, key = made_up.window(actors=0), KEYS.log("metrics", "learner", "0")
+    assert list(window.view()["constraints"]) == ["heading", "pose"]
+    window.take(key, Message({}, {"time": BEGIN, "update": 60, "values": {"success/fingers": 0.25}}), time.time())
+    assert window.view()["constraints"]["fingers"] == 0.25
+
+
+def test_an_actors_newer_episode_takes_the_place_of_the_one_before() -> None:
+    window = made_up.window(actors=2)
+    newer = made_up.actor_episode(77)
+    window.take(KEYS.log("episode", "actor", "a001"), newer, time.time())
+    assert window.episode("a001") is newer
+    assert [row["episodes"] for row in window.view()["actors"]] == [1, 2]
+
+
+def test_actors_that_are_gone_are_forgotten_after_a_while_and_an_absent_learner_is_shown() -> None:
+    window = made_up.window(actors=3)
+    now = time.time()
+    window.take_status(made_up.status(2), now + 5)
+    assert [row["alive"] for row in window.view()["actors"]] == [True, True, False]
+    window.take_status(made_up.status(2), now + 60)
+    assert [row["id"] for row in window.view()["actors"]] == ["a000", "a001"]
+    window.take_status(None, now + 61)
+    assert window.view()["phase"] == "disconnected" and window.view()["version"] == 12
+
+
+def test_thinned_curves_keep_every_dip() -> None:
+    window = made_up.window(actors=0, updates=5000)
+    curve = window.view(["episode/success"], points=100)["curves"]["episode/success"]
+    assert len(curve["steps"]) <= 100
+    assert curve["values"][curve["steps"].index(DIP)] == 0.1
+    assert curve["times"][curve["steps"].index(DIP)] == BEGIN + 10 * DIP
+
+
+def test_a_run_that_went_back_to_a_checkpoint_overwrites_its_curve() -> None:
+    curve = Curve()
+    for step, value in ((1, 0.1), (2, 0.2), (3, 0.3), (2, 0.9)):
+        curve.add(step, value, 10.0 * step)
+    assert (curve.steps, curve.values) == ([1, 2], [0.1, 0.9])
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Message({}, {"values": {"x": "high"}, "update": 1}),
+        Message({}, {"values": 3}),
+        Message({}, {}),
+        Message({"link_position": np.zeros((1, 1, 3))}, {}),
+    ],
+)
+def test_damaged_messages_are_counted_and_change_nothing(message: Message) -> None:
+    window = TrainingWindow("made-up")
+    for kind in ("metrics", "event", "episode"):
+        window.take(KEYS.log(kind, "learner", "0"), message, 0.0)
+    assert window.damaged == 3 and window.view()["names"] == {}
+
+
+def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_go() -> None:
+    hub = MemoryHub()
+    learner, mine = MemoryTransport(hub), MemoryTransport(hub)
+    learner.serve(KEYS.status, lambda key, request: Message({}, made_up.status(2) | {"queue": {"length": 0, "limit": 4}}
+                  | {"ledger": dict.fromkeys(("granted", "running", "redeemed", "returned", "expired", "accepted",
+                                              "consumed", "dropped", "queued"), 0)}))  # fmt: skip
+    window = TrainingWindow("made-up")
+    follower = Follower(mine, window, every=0.05)
+    stop = threading.Event()
+    try:
+        deadline = time.monotonic() + 10
+        while not (window.view()["curves"] and window.view()["version"] == 12 and len(window.view()["actors"]) == 2):
+            assert time.monotonic() < deadline
+            learner.publish(KEYS.log("metrics", "learner", "0"), made_up.metrics(1))
+            stop.wait(0.05)
+        assert window.view()["phase"] == "training"
+        learner.close()
+        while window.view()["phase"] != "disconnected":
+            assert time.monotonic() < deadline
+            stop.wait(0.05)
+    finally:
+        follower.close()
+
+
+def test_episodes_around_a_time_come_from_finished_and_from_growing_files(tmp_path: pathlib.Path) -> None:
+    when = BEGIN + 10 * DIP
+    made_up.record(tmp_path, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
+    recordings = Recordings(tmp_path)
+    reach, rows = recordings.around(when, 5.0)
+    assert reach == 5.0
+    assert [row["actor"] for row in rows] == ["a002", "a003"]
+    assert recordings.episode(rows[1]["id"]).meta["object"] == "thing-3"
+    # The same of a file whose writer was killed: it has no index.
+    file = next(tmp_path.glob("*.mcap"))
+    cut = tmp_path / f"{file.name}.part"
+    cut.write_bytes(file.read_bytes()[:-200])
+    file.unlink()
+    assert [row["actor"] for row in recordings.around(when, 5.0)[1]] == ["a002", "a003"]
+    # Where there is none, the nearest are found.
+    reach, rows = recordings.around(when - 90, 3.0)
+    assert reach == 15.0 and [row["actor"] for row in rows] == ["a001"]
+    with pytest.raises(CongraspError, match="not among those"):
+        recordings.episode("nothing")
+
+
+def test_damage_to_a_finished_file_costs_no_more_than_what_is_damaged(tmp_path: pathlib.Path, caplog: Any) -> None:
+    made_up.record(tmp_path, [(BEGIN + n, n) for n in range(3)])
+    file = next(tmp_path.glob("*.mcap"))
+    intact = file.read_bytes()
+    made_up.record(tmp_path, [(BEGIN + 700 + n, n) for n in range(3, 6)])
+
+    def found(place: int) -> list[str]:
+        file.write_bytes(intact[:place] + bytes([intact[place] ^ 1]) + intact[place + 1 :])
+        return [row["actor"] for row in Recordings(tmp_path).around(BEGIN, 1000.0)[1]]
+
+    everyone = [f"a{n:03d}" for n in range(6)]
+    (summary_start,) = struct.unpack_from("<Q", intact, len(intact) - len(MCAP0_MAGIC) - 20)
+    assert all(found(place) == everyone for place in range(summary_start, len(intact) - len(MCAP0_MAGIC), 241))
+    caplog.clear()
+    assert found(intact.index(b"zstd") + 400) == everyone[3:]
+    assert f"{file} is damaged in 1 place" in caplog.text
+
+
+def test_of_many_episodes_the_nearest_are_taken(tmp_path: pathlib.Path) -> None:
+    made_up.record(tmp_path, [(BEGIN + n, n) for n in range(MOST + 5)])
+    _, rows = Recordings(tmp_path).around(BEGIN, 1000.0)
+    assert [row["actor"] for row in rows] == [f"a{n:03d}" for n in range(MOST)]
+
+
+def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.Path) -> None:
+    transport = MemoryTransport(MemoryHub())
+    with Recorder(transport, "made-up", tmp_path) as recorder:
+        for update in range(40):
+            transport.publish(KEYS.log("metrics", "learner", "0"), made_up.metrics(update))
+        reported = {"time": BEGIN, "version": 39, "values": {"rollouts": 12.0, "steps_per_second": 800.0, "x": 1.0}}
+        transport.publish(KEYS.log("metrics", "actor", "a003"), Message({}, reported))
+        told = {"time": BEGIN + 400, "level": "info", "text": "The run is complete after 40 updates."}
+        transport.publish(KEYS.log("event", "learner", "0"), Message({}, told))
+        deadline = time.monotonic() + 10
+        while recorder.messages < 42:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+    made_up.record(tmp_path, [(BEGIN, 3), (BEGIN + 5, 3), (BEGIN + 6, 4)])
+    window = TrainingWindow("made-up")
+    window.load(tmp_path)
+    assert [row["id"] for row in window.view()["actors"]] == ["a003", "a004"]
+    assert window.episode("a004").meta["object"] == "thing-4"
+    assert window.curve("episode/success").values[DIP] == 0.1
+    assert window.curve("episode/success").times[DIP] == BEGIN + 10 * DIP
+    # A run that is over is shown whole: its last state, and no learner is missed.
+    view = window.view()
+    assert view["phase"] == "recorded" and view["last"]["update"] == 39 and view["last"]["success"] == 0.78
+    assert list(view["curves"]) == list(dict.fromkeys((*FIRST, *view["names"]))) and len(view["curves"]) == 6
+    assert [event["text"] for event in view["events"]] == ["The run is complete after 40 updates."]
+    row = view["actors"][0]
+    assert (row["version"], row["rollouts"], row["steps_per_second"]) == (39, 12.0, 800.0)
+
+
+def test_a_finished_run_stays_finished_when_its_learner_has_gone() -> None:
+    window = made_up.window(actors=2)
+    window.take_status(made_up.status(2) | {"finished": True}, time.time())
+    window.take_status(None, time.time())
+    view = window.view()
+    assert view["phase"] == "finished" and len(view["curves"]) == 6 and view["version"] == 12
+
+
+def test_curves_have_the_titles_and_units_of_the_figures_and_their_order() -> None:
+    found = labels_of(
+        ["term/force_excess", "episode/heading_rad", "staleness_mean", "update_seconds", "episode/success"]
+    )
+    units = {name: label["unit"] for name, label in found.items()}
+    assert units == {
+        "episode/success": "share of episodes",
+        "staleness_mean": "versions",
+        "term/force_excess": "reward",
+        "episode/heading_rad": "rad",
+        "update_seconds": "s",
+    }
+    assert list(found)[:2] == ["episode/success", "staleness_mean"]
+    assert not any({"_", "/"} & set(label["title"]) for label in found.values())

@@ -1,0 +1,70 @@
+"""Rooms know only those below them, and no module needs itself to be imported."""
+
+import ast
+import itertools
+import pathlib
+from collections.abc import Iterator, Sequence
+
+ROOT = pathlib.Path(__file__).parents[1]
+FOLDERS = ("common", "actors", "learner", "services")
+KNOWN = {"common": set(), "actors": {"common"}, "learner": {"common"}, "services": {"common", "actors", "learner"}}
+
+
+def imported(body: Sequence[ast.stmt]) -> Iterator[str]:
+    """Names of modules and of what is taken from them, as far as importing a module imports them."""
+    for node in body:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.dump(node.test):
+            yield from itertools.chain(imported(node.body), imported(node.orelse))
+        elif isinstance(node, ast.Try):
+            yield from imported(node.body)
+
+
+def graph(everything: bool) -> dict[str, set[str]]:
+    """Modules by those that they import: at once, or `everything` that stands anywhere in them."""
+    paths = {path: ".".join(("congrasp", *path.relative_to(ROOT).with_suffix("").parts)) for f in FOLDERS
+             for path in (ROOT / f).rglob("*.py")}  # fmt: skip
+    names = {name.removesuffix(".__init__") for name in paths.values()}
+    found = {}
+    for path, name in paths.items():
+        tree = ast.parse(path.read_text())
+        body = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)] if everything else tree.body
+        targets = (t if t in names else t.rpartition(".")[0] for t in imported(body))
+        found[name.removesuffix(".__init__")] = {target for target in targets if target in names}
+    return found
+
+
+def test_every_import_of_ours_exists():
+    """Those in functions, too, which nothing finds before they run; mypy takes what it does not find for granted."""
+    names = graph(everything=False).keys() | {"congrasp"}
+    for path in (path for folder in (*FOLDERS, "tests", "examples") for path in (ROOT / folder).rglob("*.py")):
+        body = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.stmt)]
+        ours = [target for target in imported(body) if target.startswith("congrasp")]
+        assert not [t for t in ours if t not in names and t.rpartition(".")[0] not in names], path
+
+
+def test_no_folder_imports_backwards():
+    for module, targets in graph(everything=True).items():
+        folder = module.split(".")[1]
+        assert {target.split(".")[1] for target in targets} <= KNOWN[folder] | {folder}, module
+
+
+def test_no_two_services_import_each_other():
+    edges = {
+        (module.split(".")[2], target.split(".")[2])
+        for module, targets in graph(everything=False).items()
+        for target in targets
+        if module.startswith("congrasp.services.") and target.startswith("congrasp.services.")
+    }
+    assert not [(a, b) for a, b in edges if a < b and (b, a) in edges]
+
+
+def test_no_module_needs_itself():
+    """Kahn's algorithm takes away modules of which nothing is left that they import: a cycle would remain."""
+    left = graph(everything=False)
+    while free := [module for module, targets in left.items() if not targets & left.keys()]:
+        left = {module: targets for module, targets in left.items() if module not in free}
+    assert not left
