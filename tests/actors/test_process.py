@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from congrasp.actors.env import episode_fields
-from congrasp.actors.process.actor import actor as process
+from congrasp.actors.process import actor as process
 from congrasp.actors.rollout import Rollout, Trace
 from congrasp.actors.training_set import TrainingSet
 from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig, to_json

@@ -16,9 +16,10 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.batch import collate
+from congrasp.learner.hub import hub
 from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.deduplication import Sequences
-from congrasp.learner.hub.hub import LearnerHub, hub
+from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.rate_limit import RateLimit
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.write_ahead import PART, WriteAheadLog

@@ -11,25 +11,27 @@ from congrasp.services.evaluate.exam import exam_pool
 from congrasp.services.evaluate.intervals import NORMAL_95
 from congrasp.services.evaluate.results import recorded
 
+_SIGMAS = 3
+"""Standard deviations of each bound: with two, one of the thirty that are checked would break by chance half of the time."""
 EPISODES = 16
 """Of a row, one for each object of the development exam: so many are independent."""
 RESULTS = recorded()
 
 
 def floor(row, episodes):
-    """Success rate less two standard deviations of so many independent episodes and of the figure itself.
+    """Success rate less `_SIGMAS` standard deviations of so many independent episodes and of the figure itself.
 
     Two successes and two failures are added to the figure (Agresti and Coull), so that 100 % has a deviation too.
     """
     rate = (row.success * row.independent + 2) / (row.independent + 4)
-    return rate - 2 * math.sqrt(rate * (1 - rate) * (1 / episodes + 1 / row.independent))
+    return rate - _SIGMAS * math.sqrt(rate * (1 - rate) * (1 / episodes + 1 / row.independent))
 
 
 def ceiling(row, name, episodes):
-    """Mean error and two standard deviations of the mean of so many episodes and of the figure itself."""
+    """Mean error and `_SIGMAS` standard deviations of the mean of so many episodes and of the figure itself."""
     successes = row.success * row.episodes
     deviation = row.margins[name] / NORMAL_95 * math.sqrt(successes)
-    return row.errors[name] + 2 * deviation * math.sqrt(1 / episodes + 1 / successes)
+    return row.errors[name] + _SIGMAS * deviation * math.sqrt(1 / episodes + 1 / successes)
 
 
 @pytest.mark.timeout(600)

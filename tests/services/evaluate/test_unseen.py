@@ -141,7 +141,7 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(simulate
             raise CongraspError(f"The object '{lost}' cannot be approached.")
         return names
 
-    def headings_of(task, obj, seed, given, scale):
+    def headings_of(task, obj, seed, given, scale, own):
         if obj.name == lost:
             raise CongraspError("no heading")
 

@@ -324,7 +324,7 @@ def test_a_hull_that_stands_in_is_no_reliable_shape(tmp_path, options, monkeypat
 
 def test_a_busy_machine_changes_no_shape(monkeypatch):
     """A child that gets no processor time is no reason for another shape."""
-    monkeypatch.setattr(decompose, "STARVED", 0.02)
+    monkeypatch.setattr(decompose, "STARVED", 0.001)
     mesh = ell()
     with pytest.raises(CongraspError, match=r"The machine is too busy: coacd .* Stop other programs and try again"):
         decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
