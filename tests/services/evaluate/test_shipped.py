@@ -12,7 +12,7 @@ from congrasp.services.evaluate.intervals import NORMAL_95
 from congrasp.services.evaluate.results import recorded
 
 _SIGMAS = 3
-"""Standard deviations of each bound: with two, one of the thirty that are checked would break by chance half of the time."""
+"""Standard deviations of each bound: with two, one of the thirty that are checked would break half of the time."""
 EPISODES = 16
 """Of a row, one for each object of the development exam: so many are independent."""
 RESULTS = recorded()
