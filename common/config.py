@@ -65,6 +65,8 @@ class ControlConfig:
     """alpha_w of the three hinges, rad per unit of action."""
     guidance_position_limit: float = 0.04
     """The wrist's target is at most this far ahead of it, m: at kp/kv = 20/s a speed of 0.8 m/s."""
+    approach_position_limit: float = 0.02
+    """The same as long as the table is there: 0.4 m/s, no faster than a reach hands over."""
     closing_position_limit: float = 0.015
     """The same within `closing_distance` of the object, as long as the table is there: 0.3 m/s."""
     closing_distance: float = 0.04
@@ -459,12 +461,14 @@ def with_older_physics(task: Any) -> Any:
     control = task.get("control", {}) if isinstance(task, dict) else None
     if not isinstance(control, dict):
         return task
+    fastest = control.get("guidance_position_limit", 0.04)
     then = {
         "wrist_acceleration": 0.0,
         "wrist_angular_acceleration": 0.0,
         "hold_acceleration": 1.0,
         "load_rate": 0.0,
-        "closing_position_limit": control.get("guidance_position_limit", 0.04),
+        "approach_position_limit": fastest,
+        "closing_position_limit": fastest,
     }
     back_off = task.get("back_off", 0.15)
     begun = {

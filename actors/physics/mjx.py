@@ -15,7 +15,7 @@ from mujoco import mjx
 
 from congrasp.actors.physics.engine import PhysicsState, ResetState, where_environments
 from congrasp.actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
-from congrasp.actors.physics.scene import GAINS, SENSOR_WIDTH, TABLE_AWAY, addresses
+from congrasp.actors.physics.scene import GAINS, MASS_POWERS, SENSOR_WIDTH, TABLE_AWAY, addresses
 from congrasp.actors.physics.slots import Pool
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
@@ -152,11 +152,12 @@ class MjxPhysics:
     def _place(self, data: Any, pool: dict[str, Array], reset_state: ResetState) -> MjxState:
         """Environments at their start, with the fields of their objects from the rows `pool` (N, ...)."""
         where, batch = self._where, reset_state.object_index.shape[0]
-        body = self._object_body
         leaves = {name: value[reset_state.object_index] for name, value in pool.items()}
-        for name in ("body_mass", "body_inertia"):
-            scale = reset_state.mass_scale.reshape(-1, *([1] * (leaves[name].ndim - 2)))
-            leaves[name] = leaves[name].at[:, body].multiply(scale)
+        for name, power in MASS_POWERS.items():
+            leaf = leaves[name]
+            rows = where.object_qvel if name.startswith("dof") else np.array([self._object_body])
+            factor = reset_state.mass_scale.reshape(-1, *[1] * (leaf.ndim - 1)) ** power
+            leaves[name] = leaf.at[:, rows].multiply(factor)
         tiled = {name: jnp.tile(value, (batch, *([1] * value.ndim))) for name, value in self._shared.items()}
         leaves["body_pos"] = tiled["body_pos"].at[:, where.base_body].set(reset_state.base_position)
         leaves["body_quat"] = tiled["body_quat"].at[:, where.base_body].set(reset_state.base_quaternion)

@@ -14,7 +14,7 @@ import psutil
 
 from congrasp.actors.physics.engine import PhysicsState, ResetState
 from congrasp.actors.physics.physics_state import has_diverged, physics_state
-from congrasp.actors.physics.scene import GAINS, TABLE_AWAY, addresses, compile_scene
+from congrasp.actors.physics.scene import GAINS, MASS_POWERS, TABLE_AWAY, addresses, compile_scene
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
@@ -161,8 +161,9 @@ class NativePhysics:
         model, data = instance.model, instance.data
         model.body_pos[where.base_body] = reset_state.base_position[i]
         model.body_quat[where.base_body] = reset_state.base_quaternion[i]
-        model.body_mass[where.object_body] = scene.model.body_mass[where.object_body] * reset_state.mass_scale[i]
-        model.body_inertia[where.object_body] = scene.model.body_inertia[where.object_body] * reset_state.mass_scale[i]
+        for name, power in MASS_POWERS.items():
+            rows = where.object_qvel if name.startswith("dof") else where.object_body
+            getattr(model, name)[rows] = getattr(scene.model, name)[rows] * reset_state.mass_scale[i] ** power
         geoms = model.geom_bodyid == where.object_body
         model.geom_friction[geoms, 0] = reset_state.friction[i]
         for name in GAINS:

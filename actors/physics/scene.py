@@ -18,6 +18,8 @@ TABLE_AWAY = (0.0, 0.0, -1000.0)
 """Where the table is when it is removed: a kilometre down, so that nothing reaches it again."""
 GAINS = ("actuator_gainprm", "actuator_biasprm")
 """Fields of a model that hold a position servo's gains, and nothing else but zeros."""
+MASS_POWERS = {"body_mass": 1, "body_inertia": 1, "body_subtreemass": 1, "body_invweight0": -1, "dof_invweight0": -1}
+"""Fields of a model that change with the power of a body's mass, in the rows of the body or of its free joint."""
 SENSOR_WIDTH = 13
 """Numbers of one contact: found, force (3, contact frame), position (3), normal (3), tangent (3)."""
 _CONTACT_FIELDS = (

@@ -101,14 +101,15 @@ def place(
     if slot > 0:
         return
     body = leaves.object_body
-    leaves.body_mass[env, body] = mass_scale[env] * objects.body_mass[r]
-    leaves.body_inertia[env, body] = mass_scale[env] * objects.body_inertia[r]
+    scale = mass_scale[env]
+    leaves.body_mass[env, body] = scale * objects.body_mass[r]
+    leaves.body_inertia[env, body] = scale * objects.body_inertia[r]
     leaves.body_iquat[env, body] = objects.body_iquat[r]
     leaves.body_subtreemass[env, 0] = objects.body_subtreemass[r, 0]
-    leaves.body_subtreemass[env, body] = objects.body_subtreemass[r, 1]
-    leaves.body_invweight0[env, body] = objects.body_invweight0[r]
+    leaves.body_subtreemass[env, body] = scale * objects.body_subtreemass[r, 1]
+    leaves.body_invweight0[env, body] = objects.body_invweight0[r] / scale
     for i in range(6):
-        leaves.dof_invweight0[env, leaves.object_dof + i] = objects.dof_invweight0[r, i]
+        leaves.dof_invweight0[env, leaves.object_dof + i] = objects.dof_invweight0[r, i] / scale
     for i in range(leaves.motors.shape[0]):
         motor = leaves.motors[i]
         gains = gain_scale[env] * leaves.gains[i]

@@ -20,6 +20,7 @@ jax.tree_util.register_dataclass(
         "wrist_position_scale",
         "wrist_rotation_scale",
         "guidance_position_limit",
+        "approach_position_limit",
         "closing_position_limit",
         "closing_distance",
         "guidance_rotation_limit",
@@ -68,13 +69,13 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
 def _position_limit(scene: Scene, control: ControlConfig) -> Array:
     """(B,) m, the farthest that the wrist's target is ahead of it.
 
-    While the table is there it rises from `closing_position_limit` at `closing_distance` from the object to
-    `guidance_position_limit` at twice that: fast transport, slow closing.
+    `guidance_position_limit`; while the table is there it rises from `closing_position_limit` at `closing_distance` from
+    the object to `approach_position_limit` at twice that, so that the hand arrives slowly.
     """
     gap = jnp.min(jnp.linalg.norm(scene.features.nearest, axis=-1), -1)
-    slow, fast = control.closing_position_limit, control.guidance_position_limit
+    slow, fast = control.closing_position_limit, control.approach_position_limit
     share = jnp.clip(gap / control.closing_distance - 1.0, 0.0, 1.0)
-    return jnp.where(scene.state.table, slow + share * (fast - slow), fast)
+    return jnp.where(scene.state.table, slow + share * (fast - slow), control.guidance_position_limit)
 
 
 def wrist_target(

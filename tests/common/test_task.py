@@ -313,6 +313,7 @@ def test_wrist_target_is_guidance_plus_residual_where_no_limit_stands():
     far = dataclasses.replace(
         TASK.control,
         guidance_position_limit=1e3,
+        approach_position_limit=1e3,
         guidance_rotation_limit=1e3,
         wrist_acceleration=0.0,
         wrist_angular_acceleration=0.0,
