@@ -69,8 +69,8 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
 def _position_limit(scene: Scene, control: ControlConfig) -> Array:
     """(B,) m, the farthest that the wrist's target is ahead of it.
 
-    `guidance_position_limit`; while the table is there it rises from `closing_position_limit` at `closing_distance` from
-    the object to `approach_position_limit` at twice that, so that the hand arrives slowly.
+    `guidance_position_limit`; while the table is there it rises from `closing_position_limit` at `closing_distance`
+    from the object to `approach_position_limit` at twice that, so that the hand arrives slowly.
     """
     gap = jnp.min(jnp.linalg.norm(scene.features.nearest, axis=-1), -1)
     slow, fast = control.closing_position_limit, control.approach_position_limit

@@ -1,11 +1,12 @@
 """What an episode's message says about its constraints and its phases."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.constraints.markers import Marker
 
 _LATEST = 1e4  # s
 _OLDER = ("affordance", "pose_finger", "pose_wrist", "trajectory")
@@ -24,6 +25,15 @@ def active_constraints(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
     """Names of the active constraints, weakest first; the heading always is."""
     blocks = active_blocks(arrays)
     return tuple(c.name for c in CONSTRAINTS if not c.optional or any(blocks.get(block) for block in c.blocks))
+
+
+def markers(arrays: Mapping[str, np.ndarray]) -> Iterator[tuple[str, Marker]]:
+    """What is drawn of each active constraint, with its name."""
+    blocks = [name for name, active in active_blocks(arrays).items() if active]
+    for constraint in CONSTRAINTS:
+        if not constraint.optional or set(constraint.blocks) & set(blocks):
+            own = constraint.goal(*(arrays[f"goal/{constraint.name}_{field}"] for field in constraint.arrays))
+            yield from ((constraint.name, marker) for marker in constraint.markers(own, blocks))
 
 
 def grasp_span(meta: Mapping[str, Any], control_dt: float, table: np.ndarray) -> tuple[int, int]:

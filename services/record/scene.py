@@ -25,11 +25,12 @@ from congrasp.common.hands.spec import Hand, Link, capsule_ends
 from congrasp.common.objects.checks import LARGEST
 from congrasp.common.objects.painting import nearest
 from congrasp.common.objects.spec import Colours
+from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import EPISODE, validate
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
-from congrasp.services.record.goals import active_blocks
+from congrasp.services.record.goals import markers
 from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE, HEADING, OBJECT, TABLE, WAYPOINT
 from congrasp.services.record.surface import surface_parts, surface_points
 
@@ -167,31 +168,43 @@ def _label(meta: Mapping[str, Any]) -> str:
 
 
 def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mapping[str, np.ndarray], now: int) -> None:
-    active = active_blocks(arrays)
-    direction = arrays["goal/heading_direction"]
-    heading = _entity(update, "constraint/heading", frame, now)
-    _add_arrow(heading, arrays["goal/heading_position"] - _ARROW * direction, direction, _ARROW, 0.006, _HEADING)
-    if active.get("trajectory"):
-        entity = _entity(update, "constraint/trajectory", frame, now)
-        line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.003)
-        line.pose.orientation.w = 1.0
-        _set_colour(line.color, _WAYPOINT)
-        for point in arrays["goal/trajectory_position"]:
-            _set_vector(line.points.add(), point)
-            _add_sphere(entity, point, 0.004, _WAYPOINT)
-    if active.get("pose_finger") or active.get("pose_wrist"):
-        entity = _entity(update, "constraint/pose", frame, now)
-        wrist = Rotation.from_quat(arrays["goal/pose_quaternion"], scalar_first=True)
-        origin = arrays["goal/pose_position"]
-        for axis, colour in zip(wrist.as_matrix().T, _AXES, strict=True):
-            _add_arrow(entity, origin, axis, 0.05, 0.003, colour)
-        if active.get("pose_finger"):
-            position, quaternion = mujoco_link_poses(hand, arrays["goal/pose_q"])
-            for k, parts in enumerate(surface_parts(hand)):
-                turn = wrist * Rotation.from_quat(quaternion[k], scalar_first=True)
-                for part in parts:
-                    points = turn.apply(part.points) + wrist.apply(position[k]) + origin
-                    _add_triangles(entity, points.astype(np.float32), part.faces, _GHOST)
+    """Markers of the active constraints; the avoid region is in the cloud of surface points."""
+    for name, marker in markers(arrays):
+        if isinstance(marker, Paint):
+            continue
+        entity = _entity(update, f"constraint/{name}", frame, now)
+        if isinstance(marker, Arrow):
+            start = marker.tip - _ARROW * marker.direction
+            _add_arrow(entity, start, marker.direction, _ARROW, 0.006, _HEADING)
+        elif isinstance(marker, Polyline):
+            _add_beads(entity, marker.points)
+        else:
+            _add_ghost(entity, hand, marker)
+
+
+def _add_beads(entity: SceneEntity, points: np.ndarray) -> None:
+    """Adds balls (n, 3) on a string."""
+    line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.003)
+    line.pose.orientation.w = 1.0
+    _set_colour(line.color, _WAYPOINT)
+    for point in points:
+        _set_vector(line.points.add(), point)
+        _add_sphere(entity, point, 0.004, _WAYPOINT)
+
+
+def _add_ghost(entity: SceneEntity, hand: Hand, ghost: Ghost) -> None:
+    """Adds the axes of a wrist, and the surface of its hand where the finger angles are given."""
+    wrist = Rotation.from_quat(ghost.quaternion, scalar_first=True)
+    for axis, colour in zip(wrist.as_matrix().T, _AXES, strict=True):
+        _add_arrow(entity, ghost.position, axis, 0.05, 0.003, colour)
+    if ghost.q is None:
+        return
+    position, quaternion = mujoco_link_poses(hand, ghost.q)
+    for k, parts in enumerate(surface_parts(hand)):
+        turn = wrist * Rotation.from_quat(quaternion[k], scalar_first=True)
+        for part in parts:
+            points = turn.apply(part.points) + wrist.apply(position[k]) + ghost.position
+            _add_triangles(entity, points.astype(np.float32), part.faces, _GHOST)
 
 
 def _surface(actor: str, arrays: Mapping[str, np.ndarray], now: int) -> PointCloud:

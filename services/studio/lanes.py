@@ -11,10 +11,11 @@ from congrasp.common.objects.painting import painted
 from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.base import ErrorSpec
+from congrasp.common.task.constraints.markers import Ghost, Paint
 from congrasp.common.task.reward import GRASP
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
-from congrasp.services.record.goals import active_blocks, active_constraints
+from congrasp.services.record.goals import active_blocks, active_constraints, markers
 
 TOUCH = 0.05
 """Newtons from which a link counts as touching."""
@@ -70,7 +71,7 @@ def _turn(quaternion: Any) -> Rotation:
 
 
 def for_page(episode: Message) -> Message:
-    """The episode as the player needs it: poses, forces, rewards, object, goal, reference pose and lanes."""
+    """The episode as the player needs it: poses, forces, rewards, object, markers and lanes."""
     found = lanes(episode)
     keep: tuple[str, ...] = (
         "link_position",
@@ -86,18 +87,34 @@ def for_page(episode: Message) -> Message:
         own = Colours(episode.arrays["colour_points"], episode.arrays["colour_values"])
         mesh = painted(arrays["visual_vertices"], arrays["visual_faces"], own)
         arrays |= dict(zip(("visual_vertices", "visual_faces", "visual_colours"), mesh, strict=True))
-    arrays |= {name: value for name, value in episode.arrays.items() if name.startswith(("reward/", "goal/"))}
-    arrays |= {f"active/{block}": np.array(on) for block, on in active_blocks(episode.arrays).items()}
+    arrays |= {name: value for name, value in episode.arrays.items() if name.startswith("reward/")}
     for name, lane in found.items():
         arrays |= {f"lane/{name}/met": lane.met, f"lane/{name}/counts": lane.counts}
         arrays |= {f"lane/{name}/{unit}": np.asarray(value, np.float32) for unit, value in lane.errors.items()}
-    if "pose" in active_constraints(episode.arrays):
-        hand, turn = known_hand(episode.meta["hand"]), _turn(episode.arrays["goal/pose_quaternion"])
-        position, quaternion = mujoco_link_poses(hand, np.asarray(episode.arrays["goal/pose_q"], float))
-        arrays["ghost_position"] = (turn.apply(position) + episode.arrays["goal/pose_position"]).astype(np.float32)
-        arrays["ghost_quaternion"] = (turn * _turn(quaternion)).as_quat(scalar_first=True).astype(np.float32)
+    arrays |= _drawn(episode)
     terms = {name.removeprefix("reward/") for name in arrays if name.startswith("reward/")}
     legends = {name: lane.legend for name, lane in found.items()}
     return Message(
         arrays, {**episode.meta, "lanes": legends, "terms": {name: MEANINGS.get(name, "") for name in terms}}
     )
+
+
+def _drawn(episode: Message) -> dict[str, np.ndarray]:
+    """Markers, object frame, as arrays `KIND/CONSTRAINT/FIELD`; a ghost as link frames (L, 3), (L, 4)."""
+    found: dict[str, Any] = {}
+    for name, marker in markers(episode.arrays):
+        kind = type(marker).__name__.lower()
+        if isinstance(marker, Ghost):
+            if marker.q is None:
+                continue
+            wrist = _turn(marker.quaternion)
+            position, quaternion = mujoco_link_poses(known_hand(episode.meta["hand"]), np.asarray(marker.q, float))
+            position = wrist.apply(position) + marker.position
+            quaternion = (wrist * _turn(quaternion)).as_quat(scalar_first=True)
+            fields = {"position": position, "quaternion": quaternion}
+        elif isinstance(marker, Paint):
+            fields = {"avoid": np.asarray(episode.arrays["surface_minus"])}
+        else:
+            fields = marker._asdict()
+        found |= {f"{kind}/{name}/{field}": np.asarray(value, np.float32) for field, value in fields.items()}
+    return found

@@ -12,8 +12,9 @@ from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
 from congrasp.common.runtime.parallel import cores
+from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.goals import active_blocks, grasp_span, phases_of
+from congrasp.services.record.goals import active_blocks, grasp_span, markers, phases_of
 from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
 from congrasp.services.viz.raster import render_scene, visible
 from congrasp.services.viz.scene import Camera, Shape
@@ -62,7 +63,7 @@ def _object(episode: Message, step: int) -> Shape:
     """The object at a step in its own colours, painted where its avoid region is a constraint."""
     arrays = episode.arrays
     avoid = np.asarray(arrays["surface_minus"], bool)
-    marked = active_blocks(arrays).get("affordance", False) and bool(avoid.any())
+    marked = bool(avoid.any()) and any(isinstance(marker, Paint) for _, marker in markers(arrays))
     paint = None
     if "colour_values" in arrays:
         points, colours = arrays["colour_points"], arrays["colour_values"] / 255
@@ -77,28 +78,32 @@ def _object(episode: Message, step: int) -> Shape:
 
 
 def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
-    """Markers of the active constraints, which are given in the object's frame."""
+    """Markers of the active constraints, which are given in the object's frame; the object is painted already."""
     arrays = episode.arrays
     origin = np.asarray(arrays["object_position"][step], float)
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
-    active = active_blocks(arrays)
-    direction = turn.apply(arrays["goal/heading_direction"])
-    # The target lies inside the object: the arrow ends where its line enters.
-    off = arrays["surface_points"] - arrays["goal/heading_position"]
-    along = off @ arrays["goal/heading_direction"]
-    across = np.linalg.norm(off - along[:, None] * arrays["goal/heading_direction"], axis=-1)
-    depth = max(0.0, -float(along[across < _ARROW_SEARCH].min(initial=0.0))) + _ARROW_GAP
-    tip = turn.apply(arrays["goal/heading_position"]) + origin - depth * direction
-    shapes = arrow(tip - 0.08 * direction, tip, 0.0028, HEADING)
-    if active.get("trajectory"):
-        points = turn.apply(arrays["goal/trajectory_position"]) + origin
-        shapes.append(beads(points, 0.0035, WAYPOINT))
-    if active.get("pose_finger"):
-        wrist = turn * Rotation.from_quat(arrays["goal/pose_quaternion"], scalar_first=True)
-        position = turn.apply(arrays["goal/pose_position"]) + origin
-        ghost = posed_hand(hand, arrays["goal/pose_q"], position, wrist, HEADING, np.ones(len(hand.links)), alpha=0.25)
-        shapes.append(ghost)
+    shapes: list[Shape] = []
+    for _, marker in markers(arrays):
+        if isinstance(marker, Arrow):
+            direction = turn.apply(marker.direction)
+            tip = turn.apply(_outside(marker, arrays["surface_points"])) + origin
+            shapes += arrow(tip - 0.08 * direction, tip, 0.0028, HEADING)
+        elif isinstance(marker, Polyline):
+            shapes.append(beads(turn.apply(marker.points) + origin, 0.0035, WAYPOINT))
+        elif isinstance(marker, Ghost) and marker.q is not None:
+            wrist = turn * Rotation.from_quat(marker.quaternion, scalar_first=True)
+            position = turn.apply(marker.position) + origin
+            shapes.append(posed_hand(hand, marker.q, position, wrist, HEADING, np.ones(len(hand.links)), alpha=0.25))
     return shapes
+
+
+def _outside(marker: Arrow, surface: np.ndarray) -> np.ndarray:
+    """(3,) where an arrow to a point inside the object ends: before its line enters the surface (P, 3)."""
+    off = surface - marker.tip
+    along = off @ marker.direction
+    across = np.linalg.norm(off - along[:, None] * marker.direction, axis=-1)
+    depth = max(0.0, -float(along[across < _ARROW_SEARCH].min(initial=0.0))) + _ARROW_GAP
+    return np.asarray(marker.tip - depth * marker.direction)
 
 
 def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -> Camera:
@@ -145,8 +150,7 @@ def _extent(episode: Message, step: int) -> np.ndarray:
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
     low, high = arrays["visual_vertices"].min(0), arrays["visual_vertices"].max(0)
     points = [np.where(np.indices((2, 2, 2)).reshape(3, -1).T, high, low)]
-    if active_blocks(arrays).get("trajectory"):
-        points.append(arrays["goal/trajectory_position"])
+    points += [marker.points for _, marker in markers(arrays) if isinstance(marker, Polyline)]
     return np.concatenate([around, turn.apply(np.concatenate(points)) + arrays["object_position"][step]])
 
 

@@ -1,6 +1,6 @@
 """Affordance: which region of the object may be grasped (O+ in the paper), and which must be avoided (O-)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -18,6 +18,7 @@ from congrasp.common.task.constraints.base import (
     Weight,
 )
 from congrasp.common.task.constraints.heading import HeadingGoal
+from congrasp.common.task.constraints.markers import Marker, Paint
 from congrasp.common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, square, squash
 from congrasp.common.task.sampling.headings import INWARD, MAX_WIDTH
 from congrasp.common.task.types import Array, Goal, Surface
@@ -164,6 +165,10 @@ class Affordance(Constraint):
     def valid(self, surface: Surface, own: AffordanceGoal) -> Array:
         """Both regions have points."""
         return jnp.any(surface.avoid, -1) & ~jnp.all(surface.avoid, -1)
+
+    def markers(self, own: AffordanceGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
+        """The avoid region."""
+        return (Paint(),)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
         """It keeps the fingers off its region unless a reference pose names its own contacts."""

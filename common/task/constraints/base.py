@@ -7,7 +7,7 @@ All methods are pure functions of batched arrays (leading axis B) that may be tr
 import dataclasses
 import functools
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_type_hints
 
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints.markers import Marker
 from congrasp.common.task.types import Array, Goal, SceneState, Surface
 
 if TYPE_CHECKING:
@@ -258,6 +259,15 @@ class Constraint:
         return {}
 
     # What people see.
+
+    def markers(self, own: Any, blocks: Collection[str]) -> tuple[Marker, ...]:
+        """How pictures, recordings and the studio show it where it is active.
+
+        Args:
+          own: its goal arrays of one episode, as NumPy.
+          blocks: active blocks of the observation.
+        """
+        return ()
 
     def valid(self, surface: Surface, own: Any) -> Array:
         """(B,) bool: whether goal arrays of the right shapes, finite and unit, make sense together."""

@@ -1,6 +1,6 @@
 """Heading: from where the hand comes, and where its centre should be. The default that is always active."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import jax
@@ -21,6 +21,7 @@ from congrasp.common.task.constraints.base import (
     Weight,
 )
 from congrasp.common.task.constraints.fingers import chosen_fingers
+from congrasp.common.task.constraints.markers import Arrow, Marker
 from congrasp.common.task.geometry import flat, hand_center, in_world
 from congrasp.common.task.types import Array, Goal
 
@@ -155,6 +156,10 @@ class Heading(Constraint):
         off = scene.features.center - own.position
         lateral = off - jnp.sum(off * target, -1, keepdims=True) * target
         return {"heading_rad": jnp.arctan2(sine, cosine), "heading_m": jnp.linalg.norm(lateral, axis=-1)}
+
+    def markers(self, own: HeadingGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
+        """An arrow to the hand centre's target."""
+        return (Arrow(own.position, own.direction),)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
         """It guides the wrist where nothing stronger does."""

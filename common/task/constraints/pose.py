@@ -1,6 +1,6 @@
 """Reference pose: where wrist and fingers should be in the grasp."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import jax
@@ -21,6 +21,7 @@ from congrasp.common.task.constraints.base import (
     Weight,
 )
 from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
+from congrasp.common.task.constraints.markers import Ghost, Marker
 from congrasp.common.task.geometry import flat, in_world, square, squared_distances, wrist_to_joints
 from congrasp.common.task.sampling.disturbances import disturbed_fingers, disturbed_wrist
 from congrasp.common.task.types import Array, Goal, Surface
@@ -161,6 +162,10 @@ class Pose(Constraint):
             "pose_rad": jnp.mean(jnp.abs(angles), -1),
             "pose_m": jnp.linalg.norm(scene.features.wrist_position - position, axis=-1),
         }
+
+    def markers(self, own: PoseGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
+        """The reference's hand, or its wrist alone."""
+        return (Ghost(own.position, own.quaternion, own.q if "pose_finger" in blocks else None),)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
         """It guides wrist and fingers, or the fingers alone."""

@@ -1,6 +1,6 @@
 """Wrist trajectory: the path along which the wrist comes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import jax
@@ -21,6 +21,7 @@ from congrasp.common.task.constraints.base import (
 )
 from congrasp.common.task.constraints.fingers import chosen_fingers
 from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
+from congrasp.common.task.constraints.markers import Marker, Polyline
 from congrasp.common.task.constraints.pose import heading_message
 from congrasp.common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
 from congrasp.common.task.sampling.disturbances import disturbed_wrist
@@ -145,6 +146,10 @@ class Trajectory(Constraint):
             "trajectory_rad": rotations.angle(scene.features.wrist_quaternion, quaternion),
             "trajectory_m": jnp.linalg.norm(scene.features.wrist_position - position, axis=-1),
         }
+
+    def markers(self, own: TrajectoryGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
+        """The wrist's path."""
+        return (Polyline(own.position),)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
         """It guides the wrist."""

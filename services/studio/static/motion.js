@@ -10,6 +10,16 @@ function rows({ shape, data }) {
   return Array.from({ length: shape[0] }, (_, t) => Array.from({ length: shape[1] }, (_, k) => pick(t * shape[1] + k)));
 }
 
+// Markers of one kind: their arrays are named KIND/CONSTRAINT/FIELD.
+function markers(arrays, kind, make) {
+  const found = {};
+  for (const [name, array] of Object.entries(arrays)) {
+    const [which, constraint, field] = name.split("/");
+    if (which === kind) (found[constraint] ??= {})[field] = array;
+  }
+  return Object.values(found).map(make);
+}
+
 export class Motion {
   constructor(id, { arrays, meta }) {
     this.id = id;
@@ -27,15 +37,10 @@ export class Motion {
     this.table = arrays.table.data;
     this.steps = this.objects.length;
     this.center = this.objects[0];
-    const bits = Object.keys(arrays).filter((name) => name.startsWith("active/"));
-    this.active = bits.filter((name) => arrays[name].data[0] > 0).map((name) => name.slice("active/".length));
-    this.goal = {
-      position: Array.from(arrays["goal/heading_position"].data),
-      direction: Array.from(arrays["goal/heading_direction"].data),
-      path: this.active.includes("trajectory") ? rows(arrays["goal/trajectory_position"]) : null,
-    };
-    this.ghost = arrays.ghost_position ? { position: rows(arrays.ghost_position), quaternion: rows(arrays.ghost_quaternion) } : null;
-    this.avoid = this.active.includes("affordance") ? this.#labels(arrays) : null;
+    this.arrows = markers(arrays, "arrow", ({ tip, direction }) => ({ tip: Array.from(tip.data), direction: Array.from(direction.data) }));
+    this.paths = markers(arrays, "polyline", ({ points }) => rows(points));
+    this.ghosts = markers(arrays, "ghost", ({ position, quaternion }) => ({ position: rows(position), quaternion: rows(quaternion) }));
+    this.avoid = markers(arrays, "paint", () => this.#labels(arrays))[0] ?? null;
     this.rewards = {};
     for (const [name, { data }] of Object.entries(arrays)) if (name.startsWith("reward/")) this.rewards[name.slice(7)] = data;
     this.lanes = Object.entries(meta.lanes).map(([name, legend]) => {

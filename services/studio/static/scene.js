@@ -209,12 +209,10 @@ export class Scene {
       const strength = norm(force);
       if (strength > LEAST) things.push({ mesh: this.force, model: along(frame.links.position[i], scale(force, 1 / strength), Math.min(FORCE_LENGTH * strength, LONGEST)).map((x, k) => (k < 8 ? 0.09 * x : x)), tint: FORCE, alpha: faint(1) });
     });
-    const { goal } = motion;
-    const direction = rotate(place.quaternion, goal.direction);
-    const target = toWorld(place, goal.position);
-    things.push(this.#arrow(target, direction, HEADING, faint(0.6)));
-    if (goal.path) things.push(this.#path(`path ${slot}`, goal.path, place, faint(0.7)));
-    if (motion.ghost) things.push(...this.#ghost(`ghost ${slot}`, motion.hand, motion.ghost, place));
+    for (const { tip, direction } of motion.arrows)
+      things.push(this.#arrow(toWorld(place, tip), rotate(place.quaternion, direction), HEADING, faint(0.6)));
+    motion.paths.forEach((points, i) => things.push(this.#path(`path ${slot} ${i}`, points, place, faint(0.7))));
+    motion.ghosts.forEach((links, i) => things.push(...this.#ghost(`ghost ${slot} ${i}`, motion.hand, links, place)));
     return things;
   }
 }

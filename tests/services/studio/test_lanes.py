@@ -84,10 +84,10 @@ def test_the_page_gets_one_message_with_everything_it_plays() -> None:
     message = decode(encode(for_page(episode(STEPS, removal=REMOVAL))))
     assert message.arrays["lane/heading/met"].shape == (STEPS,)
     assert "at most" in message.meta["lanes"]["heading"]
-    assert {"link_position", "object_quaternion", "reward/contact", "active/pose_wrist"} <= message.arrays.keys()
+    assert {"link_position", "object_quaternion", "reward/contact", "arrow/heading/tip"} <= message.arrays.keys()
     # The made-up grasp ends in its reference pose: the ghost is where the hand is, in the object's frame.
     last = message.arrays["link_position"][-1] - message.arrays["object_position"][-1]
-    np.testing.assert_allclose(message.arrays["ghost_position"], last, atol=1e-5)
+    np.testing.assert_allclose(message.arrays["ghost/pose/position"], last, atol=1e-5)
 
 
 def test_an_older_recording_shows_contact_alone_beside_its_constraints() -> None:
@@ -96,6 +96,8 @@ def test_an_older_recording_shows_contact_alone_beside_its_constraints() -> None
     assert set(found) == {"contact"}
     np.testing.assert_array_equal(found["contact"].met, lanes(made)["contact"].met)
     page, now = for_page(older(made)), for_page(made)
-    active = {name: bool(x) for name, x in page.arrays.items() if name.startswith("active/")}
-    assert active == {name: bool(x) for name, x in now.arrays.items() if name.startswith("active/")}
-    np.testing.assert_array_equal(page.arrays["ghost_position"], now.arrays["ghost_position"])
+    kinds = ("arrow/", "polyline/", "ghost/", "paint/")
+    drawn = {name: array for name, array in now.arrays.items() if name.startswith(kinds)}
+    assert drawn.keys() == {name for name in page.arrays if name.startswith(kinds)}
+    for name, array in drawn.items():
+        np.testing.assert_array_equal(page.arrays[name], array)
