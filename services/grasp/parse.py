@@ -6,7 +6,7 @@ sets, which know the object's frame, are taken as they are.
 
 import os
 import pathlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,9 +21,9 @@ from congrasp.common.io.inputs import read_json
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.rotations import continuous
-from congrasp.common.task.constraints import CONSTRAINTS, get_constraint
-from congrasp.common.task.constraints.base import Option
-from congrasp.common.task.constraints.force import least_force
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.constraints.base import Option, Part
+from congrasp.common.task.constraints.heading import ABOVE
 from congrasp.common.task.sampling import sets as constraint_sets
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.headers import check_header
@@ -32,18 +32,13 @@ from congrasp.services.export.motion_file import GraspMotion, load_motion
 from congrasp.services.grasp.wrist_paths import HUGE, read_csv
 from congrasp.services.record.goals import grasp_span
 
-ABOVE = "above"
-"""The heading straight down, whatever the object's pose."""
 _LARGEST = 4 << 20  # bytes of a JSON or CSV file
 _FAR = 1.0  # m from an object beyond which nobody grasps it
-_NEAR = 0.004  # m from a part within which a point of the surface belongs to it
 
 
-class Written(NamedTuple):
-    """What a person wrote, and for what."""
+class Target(NamedTuple):
+    """What constraints are written for."""
 
-    texts: Mapping[str, Any]
-    """By the names of the constraints' options; empty is none."""
     obj: GraspObject
     hand: Hand
     waypoints: int
@@ -71,16 +66,22 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
     options = {option.name: option for constraint in CONSTRAINTS for option in constraint.options}
     if unknown := sorted(set(texts) - set(options)):
         raise CongraspError(f"There is no constraint option '{unknown[0]}'.", f"Known: {', '.join(options)}.")
-    plain = {name: _plain(option, texts.get(name, "")) for name, option in options.items()}
-    written = Written(plain, obj, hand, waypoints)
-    found: dict[str, dict[str, np.ndarray]] = {}
-    for constraint in CONSTRAINTS:
-        reader = READERS.get(constraint.name)
-        given = reader(written) if reader else constraint.parse(written.texts, hand)
-        if given is not None:
-            found[constraint.name] = given
-    avoid = _avoid(written) if "affordance" in found else None
-    return GraspRequest({"heading": {}, **found}, avoid, above=written.texts["heading"] == ABOVE)
+    target = Target(obj, hand, waypoints)
+    given = {name: _read(option, _plain(option, texts.get(name, "")), target) for name, option in options.items()}
+    parsed = {constraint: constraint.parse(given, hand, obj) for constraint in CONSTRAINTS}
+    found = {constraint.name: arrays for constraint, arrays in parsed.items() if arrays is not None}
+    regions = [constraint.avoid_region(given, obj) for constraint in CONSTRAINTS if constraint.name in found]
+    avoid = next((region for region in regions if region is not None), None)
+    return GraspRequest({"heading": {}, **found}, avoid, above=texts.get("heading") == ABOVE)
+
+
+def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
+    """What an option says, by its kind; None if it is not given."""
+    if not text:
+        return None
+    if isinstance(text, tuple) or option.kind == "text" or text in option.words:
+        return text
+    return _READERS[option.kind](text, f"--{option.name}", target)
 
 
 def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]) -> str | tuple[str, ...]:
@@ -96,30 +97,16 @@ def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]
     return tuple(text.replace(",", " ").split()) if option.many else text
 
 
-def _heading(written: Written) -> dict[str, np.ndarray] | None:
-    """Direction and position, as far as they are given."""
-    heading, at = written.texts["heading"], written.texts["at"]
-    found = {}
-    if at:
-        found["position"] = _numbers(at, 3, "--at") - written.origin
-        _check_near(written.obj, found["position"], "--at")
-    if heading not in ("", ABOVE):
-        found["direction"] = _unit(_numbers(heading, 3, "--heading"), "--heading")
-    return found or None
+def _place(text: str, name: str, target: Target) -> np.ndarray:
+    """(3,) m, object frame, of a place in the coordinates of the object's file."""
+    position = _numbers(text, 3, name) - target.origin
+    _check_near(target.obj, position, name)
+    return position
 
 
-def _affordance(written: Written) -> dict[str, np.ndarray] | None:
-    """It has no arrays of its own: what it asks for is in the avoid region."""
-    return {} if written.texts["affordance"] or written.texts["avoid"] else None
-
-
-def _force(written: Written) -> dict[str, np.ndarray] | None:
-    """The limit that is given, or the least one for the object's weight."""
-    if not written.texts["gentle"]:
-        return get_constraint("force").parse(written.texts, written.hand)
-    if written.texts["force"]:
-        raise CongraspError("--force and --gentle both set the force limit.", "Leave one out.")
-    return {"limit": np.asarray(least_force(written.obj.mass, 1.0), np.float32)}
+def _direction(text: str, name: str, target: Target) -> np.ndarray:
+    """(3,) unit vector."""
+    return _unit(_numbers(text, 3, name), name)
 
 
 def _numbers(text: str, count: int, name: str) -> np.ndarray:
@@ -142,30 +129,6 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
     return vector / largest / np.linalg.norm(vector / largest)
 
 
-def _avoid(written: Written) -> np.ndarray:
-    """(512,) bool, the avoid region; what is named on both sides belongs to the nearer one."""
-    obj, affordance, avoid = written.obj, written.texts["affordance"], written.texts["avoid"]
-    graspable_distance = _distance(obj, affordance, "--affordance") if affordance else None
-    avoid_distance = _distance(obj, avoid, "--avoid") if avoid else None
-    if graspable_distance is None:
-        assert avoid_distance is not None
-        region = avoid_distance < _NEAR
-    elif avoid_distance is None:
-        region = graspable_distance >= _NEAR
-    else:
-        region = avoid_distance < graspable_distance
-    if region.all() and not affordance:
-        raise CongraspError(f"'{avoid}' is all of '{obj.name}', so that nothing may be touched.", "Avoid a part of it.")
-    if region.all():
-        raise CongraspError(
-            f"Nothing of '{affordance or avoid}' lies on the surface of '{obj.name}'.",
-            "The part must be in the coordinates of the object's file; name it with --affordance.",
-        )
-    if not region.any():
-        raise CongraspError(f"'{affordance or avoid}' leaves no difference: all of '{obj.name}' may be touched.")
-    return region
-
-
 def _check_near(obj: GraspObject, position: np.ndarray, what: str) -> None:
     """Raises a CongraspError if a place (3,), object frame, is so far off that its unit must be another."""
     with np.errstate(over="ignore"):
@@ -176,9 +139,9 @@ def _check_near(obj: GraspObject, position: np.ndarray, what: str) -> None:
         )
 
 
-def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
-    """(512,) m from the surface's points to a part."""
-    path = pathlib.Path(text)
+def _part(text: str, name: str, target: Target) -> Part:
+    """A part of the object: a mesh file in the coordinates of its file, or names of its parts."""
+    path, obj = pathlib.Path(text), target.obj
     if not path.suffix and not path.exists():
         names = [word.strip() for word in text.split(",")]
         for part in names:
@@ -188,7 +151,7 @@ def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
                     f"Its parts are: {', '.join(obj.part_names)}; or name a mesh file of the part.",
                 )
         inside = np.isin(obj.labels, [obj.part_names.index(part) for part in names])
-        return np.where(inside, 0.0, 1.0)
+        return Part(text, np.where(inside, 0.0, 1.0))
     if not path.is_file():
         raise CongraspError(f"{name}: there is no file {path}.", "Check the path.")
     check_header(path, path.suffix.lower(), "Export it as PLY.")
@@ -204,14 +167,12 @@ def _distance(obj: GraspObject, text: str, name: str) -> np.ndarray:
     points = points[np.isfinite(points).all(-1)]
     if not len(points):
         raise CongraspError(f"{name}: {path} holds no points.", "Export the part as PLY.")
-    return cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0]
+    return Part(text, cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0])
 
 
-def _pose(written: Written) -> dict[str, np.ndarray] | None:
+def _pose(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
     """A reference pose from a motion, a constraint set, or JSON."""
-    text, hand, obj, origin = written.texts["pose"], written.hand, written.obj, written.origin
-    if not text:
-        return None
+    hand, obj, origin = target.hand, target.obj, target.origin
     path, index = numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand, index)
@@ -221,18 +182,18 @@ def _pose(written: Written) -> dict[str, np.ndarray] | None:
     if path.name.endswith(constraint_sets.SUFFIX):
         arrays = _set_of(path, hand, obj, index).arrays
         return {name: arrays[f"pose/{name}"][0, index] for name in ("q", "position", "quaternion")}
-    given = _json(path, "--pose", ("joints", "position", "quaternion"))
+    given = _json(path, name, ("joints", "position", "quaternion"))
     joints, names = given["joints"], [joint.name for joint in hand.joints]
     if isinstance(joints, dict):
         if unknown := sorted(set(joints) - set(names)):
-            raise CongraspError(f"--pose: the hand '{hand.name}' has no joint '{unknown[0]}'.", f"Known: {names}.")
+            raise CongraspError(f"{name}: the hand '{hand.name}' has no joint '{unknown[0]}'.", f"Known: {names}.")
         joints = [joints.get(name, 0.0) for name in names]
-    q = _floats(joints, (len(names),), f"--pose: 'joints' of {path}")
-    position = _floats(given["position"], (3,), f"--pose: 'position' of {path}") - origin
-    _check_near(obj, position, f"--pose: the wrist of {path}")
+    q = _floats(joints, (len(names),), f"{name}: 'joints' of {path}")
+    position = _floats(given["position"], (3,), f"{name}: 'position' of {path}") - origin
+    _check_near(obj, position, f"{name}: the wrist of {path}")
     if np.abs(q).max() > 2 * np.pi:
-        raise CongraspError(f"--pose: a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians.")
-    turn = _unit(_floats(given["quaternion"], (4,), f"--pose: 'quaternion' of {path}"), "--pose: the quaternion")
+        raise CongraspError(f"{name}: a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians.")
+    turn = _unit(_floats(given["quaternion"], (4,), f"{name}: 'quaternion' of {path}"), f"{name}: the quaternion")
     return _reference(coupled(hand, np.clip(q, hand.lower, hand.upper)), position, turn)
 
 
@@ -241,34 +202,32 @@ def _reference(q: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> d
     return {"q": q, "position": position, "quaternion": quaternion}
 
 
-def _trajectory(written: Written) -> dict[str, np.ndarray] | None:
+def _path(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
     """A wrist trajectory from a motion, a constraint set, CSV, or JSON."""
-    text, hand, obj, origin = written.texts["trajectory"], written.hand, written.obj, written.origin
-    waypoints = written.waypoints
-    if not text:
-        return None
+    obj, hand, waypoints = target
+    origin = target.origin
     path, index = numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand, index)
         first, last = grasp_part(motion)
         position, quaternion = _wrist_on_object(motion, first)
-        return _resampled(position[first : last + 1], quaternion[first : last + 1], waypoints, str(path))
+        return _resampled(position[first : last + 1], quaternion[first : last + 1], waypoints, name, path)
     if path.name.endswith(constraint_sets.SUFFIX):
         arrays = _set_of(path, hand, obj, index).arrays
         position, quaternion = (arrays[f"trajectory/{name}"][0, index] for name in ("position", "quaternion"))
-        return _resampled(position, quaternion, waypoints, str(path))
+        return _resampled(position, quaternion, waypoints, name, path)
     if path.suffix.lower() == ".csv":
         try:
             position, quaternion = read_csv(path, _LARGEST)
         except CongraspError as error:
-            raise CongraspError(f"--trajectory: {error}") from None
+            raise CongraspError(f"{name}: {error}") from None
     else:
-        given = _json(path, "--trajectory", ("position", "quaternion"))
+        given = _json(path, name, ("position", "quaternion"))
         count = len(given["position"]) if isinstance(given["position"], list) else 0
-        position = _floats(given["position"], (count, 3), f"--trajectory: 'position' of {path}")
-        quaternion = _floats(given["quaternion"], (count, 4), f"--trajectory: 'quaternion' of {path}")
-    _check_near(obj, position[-1] - origin, f"--trajectory: the end of {path}")
-    return _resampled(position - origin, quaternion, waypoints, str(path))
+        position = _floats(given["position"], (count, 3), f"{name}: 'position' of {path}")
+        quaternion = _floats(given["quaternion"], (count, 4), f"{name}: 'quaternion' of {path}")
+    _check_near(obj, position[-1] - origin, f"{name}: the end of {path}")
+    return _resampled(position - origin, quaternion, waypoints, name, path)
 
 
 def numbered(text: str) -> tuple[pathlib.Path, int]:
@@ -350,16 +309,16 @@ def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     return array
 
 
-def _resampled(position: np.ndarray, quaternion: np.ndarray, waypoints: int, what: str) -> dict[str, np.ndarray]:
+def _resampled(
+    position: np.ndarray, quaternion: np.ndarray, waypoints: int, name: str, path: pathlib.Path
+) -> dict[str, np.ndarray]:
     """`waypoints` poses evenly spread along a path (n, 3), (n, 4)."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=-1))])
     kept = np.concatenate([[True], np.diff(along) > 1e-6])
     if kept.sum() < 2:
-        raise CongraspError(
-            f"--trajectory: the wrist does not move in {what}.", "Give two different waypoints or more."
-        )
+        raise CongraspError(f"{name}: the wrist does not move in {path}.", "Give two different waypoints or more.")
     if (np.linalg.norm(quaternion, axis=-1) < 1e-6).any():
-        raise CongraspError(f"--trajectory: {what} has a quaternion of length zero.")
+        raise CongraspError(f"{name}: {path} has a quaternion of length zero.")
     position, quaternion, along = position[kept], quaternion[kept], along[kept]
     wanted = np.linspace(0.0, along[-1], waypoints)
     places = np.stack([np.interp(wanted, along, column) for column in position.T], -1)
@@ -367,11 +326,11 @@ def _resampled(position: np.ndarray, quaternion: np.ndarray, waypoints: int, wha
     return {"position": places, "quaternion": continuous(turns.as_quat(scalar_first=True))}
 
 
-READERS: dict[str, Callable[[Written], dict[str, np.ndarray] | None]] = {
-    "heading": _heading,
-    "affordance": _affordance,
+_READERS: dict[str, Callable[[str, str, Target], Any]] = {
+    "direction": _direction,
+    "place": _place,
+    "part": _part,
     "pose": _pose,
-    "trajectory": _trajectory,
-    "force": _force,
+    "path": _path,
 }
-"""Readers of constraints that take files or the object's own coordinates; the others parse by themselves."""
+"""Readers of an option's text by its kind (`Option.kind`), from the text, the option's name and what it is for."""

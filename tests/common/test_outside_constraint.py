@@ -53,7 +53,7 @@ class Level(Constraint):
     def measure(self, scene):
         return {"level_m": jnp.abs(self._height(scene))}
 
-    def parse(self, given, hand):
+    def parse(self, given, hand, obj):
         return {"wrist": np.array([given["level"] == "wrist"])} if given["level"] else None
 
     def _height(self, scene):

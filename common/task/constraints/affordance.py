@@ -5,9 +5,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from congrasp.common import rotations
+from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
@@ -34,6 +37,8 @@ MARGIN = 0.01
 """m, metres the fingers should keep from the avoid region."""
 SHARPNESS = 0.002
 """tau, metres."""
+_NEAR = 0.004
+"""Metres from a part within which a surface point belongs to it."""
 _CANDIDATES = 24
 """Graspable surface points to which a heading may be redirected."""
 _AS_A_RADIAN = 0.1
@@ -84,8 +89,9 @@ class Affordance(Constraint):
         Option(
             "affordance",
             "What to grasp: a mesh of that part in the coordinates of the object's file, or names of its parts.",
+            "part",
         ),
-        Option("avoid", "What not to touch, likewise."),
+        Option("avoid", "What not to touch, likewise.", "part"),
     )
 
     needs = ("surface_minus",)
@@ -165,6 +171,33 @@ class Affordance(Constraint):
     def valid(self, surface: Surface, own: AffordanceGoal) -> Array:
         """Both regions have points."""
         return jnp.any(surface.avoid, -1) & ~jnp.all(surface.avoid, -1)
+
+    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
+        """No arrays: what it asks for is the avoid region."""
+        return {} if given["affordance"] or given["avoid"] else None
+
+    def avoid_region(self, given: Mapping[str, Any], obj: GraspObject) -> np.ndarray | None:
+        """What is avoided, or is not to be grasped; what is named on both sides belongs to the nearer one."""
+        grasped, avoided = given["affordance"], given["avoid"]
+        if grasped and avoided:
+            region = avoided.distance < grasped.distance
+        elif avoided:
+            region = avoided.distance < _NEAR
+        else:
+            region = grasped.distance >= _NEAR
+        if region.all() and not grasped:
+            raise CongraspError(
+                f"'{avoided.text}' is all of '{obj.name}', so that nothing may be touched.", "Avoid a part of it."
+            )
+        if region.all():
+            raise CongraspError(
+                f"Nothing of '{grasped.text}' lies on the surface of '{obj.name}'.",
+                "The part must be in the coordinates of the object's file; name it with --affordance.",
+            )
+        if not region.any():
+            named = (grasped or avoided).text
+            raise CongraspError(f"'{named}' leaves no difference: all of '{obj.name}' may be touched.")
+        return np.asarray(region)
 
     def markers(self, own: AffordanceGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
         """The avoid region."""

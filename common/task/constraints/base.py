@@ -15,6 +15,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.markers import Marker
 from congrasp.common.task.types import Array, Goal, SceneState, Surface
 
@@ -121,10 +122,25 @@ class Option(NamedTuple):
 
     name: str
     help: str
+    kind: Literal["text", "direction", "place", "part", "pose", "path"] = "text"
+    """What it is read as: a text; three numbers in the axes of the object's file, made a unit vector; three numbers in
+    the coordinates of the file, made a position (3,) in the object frame; a `Part`; a wrist pose with finger angles,
+    or a wrist path of K waypoints, from a file: dicts of `q`, `position` and `quaternion`, object frame."""
+    words: tuple[str, ...] = ()
+    """Texts that stand for themselves, whatever the kind."""
     many: bool = False
-    """Takes several words."""
+    """Takes several words, which are a tuple."""
     switch: bool = False
     """Takes nothing: it is given or not."""
+
+
+class Part(NamedTuple):
+    """A part of an object's surface, as an option names it."""
+
+    text: str
+    """What was written."""
+    distance: np.ndarray
+    """(N,) m from the object's surface points to the part."""
 
 
 class Constraint:
@@ -282,11 +298,24 @@ class Constraint:
         """
         return []
 
-    def parse(self, given: Mapping[str, Any], hand: Hand) -> dict[str, np.ndarray] | None:
+    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
         """Goal arrays by field (without batch axis) from what a person wrote for `options`; None if nothing.
 
+        Args:
+          given: by the names of options, read by their `kind`; None where nothing was written.
+          hand: the hand.
+          obj: the object.
+
         Raises:
-          CongraspError: an option cannot be read.
+          CongraspError: an option says nothing that can be done.
+        """
+        return None
+
+    def avoid_region(self, given: Mapping[str, Any], obj: GraspObject) -> np.ndarray | None:
+        """(N,) bool, the avoid region that `parse`d options ask for; None if they say nothing of it.
+
+        Raises:
+          CongraspError: all or nothing would have to be avoided.
         """
         return None
 

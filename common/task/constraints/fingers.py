@@ -10,6 +10,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
@@ -115,7 +116,7 @@ class Fingers(Constraint):
             return ["The choice of fingers is overridden by the reference pose, which names its own contacts."]
         return ["Only the named fingers may touch the object."]
 
-    def parse(self, given: Mapping[str, Any], hand: Hand) -> dict[str, np.ndarray] | None:
+    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
         """Names of fingers."""
         if not given["fingers"]:
             return None

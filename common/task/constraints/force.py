@@ -9,6 +9,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
@@ -98,9 +99,13 @@ class Force(Constraint):
         """It holds with every other constraint."""
         return ["No link may press harder than the force limit."]
 
-    def parse(self, given: Mapping[str, Any], hand: Hand) -> dict[str, np.ndarray] | None:
-        """A number; the gentle limit depends on the object (`services.grasp.parse`)."""
+    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
+        """A number, or the least limit for the object's weight."""
         text = given["force"]
+        if text and given["gentle"]:
+            raise CongraspError("--force and --gentle both set the force limit.", "Leave one out.")
+        if given["gentle"]:
+            return {"limit": np.asarray(least_force(obj.mass, 1.0), np.float32)}
         if not text:
             return None
         try:

@@ -1,7 +1,7 @@
 """Heading: from where the hand comes, and where its centre should be. The default that is always active."""
 
-from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from congrasp.common.task.features import Contacts, Features
     from congrasp.common.task.sampling.bank import Draw
 
+ABOVE = "above"
+"""What is written for the heading straight down, whatever the object's pose."""
 _FAR = 0.15
 """Metres beyond which the distance costs no more: what a fallen object carries away must not drown all else."""
 
@@ -79,10 +82,13 @@ class Heading(Constraint):
             "heading",
             "The way the hand comes, three numbers in the axes of the object's file (\"0 0 -1\"), or 'above'. Free by "
             "default.",
+            "direction",
+            words=(ABOVE,),
         ),
         Option(
             "at",
             "Where the middle of the grasping hand should be, three numbers in metres, in the coordinates of the file.",
+            "place",
         ),
     )
 
@@ -156,6 +162,12 @@ class Heading(Constraint):
         off = scene.features.center - own.position
         lateral = off - jnp.sum(off * target, -1, keepdims=True) * target
         return {"heading_rad": jnp.arctan2(sine, cosine), "heading_m": jnp.linalg.norm(lateral, axis=-1)}
+
+    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
+        """Direction and position, as far as they are given."""
+        direction = None if isinstance(given["heading"], str) else given["heading"]
+        found = {"direction": direction, "position": given["at"]}
+        return {name: value for name, value in found.items() if value is not None} or None
 
     def markers(self, own: HeadingGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
         """An arrow to the hand centre's target."""

@@ -10,6 +10,7 @@ import numpy as np
 from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
@@ -81,6 +82,7 @@ class Pose(Constraint):
         Option(
             "pose",
             "Reference pose: a grasp.npz, a constraint set (FILE:NUMBER), or JSON with joints, position, quaternion.",
+            "pose",
         ),
     )
 
@@ -162,6 +164,10 @@ class Pose(Constraint):
             "pose_rad": jnp.mean(jnp.abs(angles), -1),
             "pose_m": jnp.linalg.norm(scene.features.wrist_position - position, axis=-1),
         }
+
+    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
+        """What the file holds."""
+        return given["pose"]
 
     def markers(self, own: PoseGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
         """The reference's hand, or its wrist alone."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
@@ -74,6 +75,7 @@ class Trajectory(Constraint):
         Option(
             "trajectory",
             "Wrist path: a grasp.npz, a constraint set, JSON with position and quaternion, or CSV (x y z w x y z).",
+            "path",
         ),
     )
 
@@ -146,6 +148,10 @@ class Trajectory(Constraint):
             "trajectory_rad": rotations.angle(scene.features.wrist_quaternion, quaternion),
             "trajectory_m": jnp.linalg.norm(scene.features.wrist_position - position, axis=-1),
         }
+
+    def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
+        """What the file holds."""
+        return given["trajectory"]
 
     def markers(self, own: TrajectoryGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
         """The wrist's path."""
