@@ -12,6 +12,7 @@ from congrasp.common import rotations
 from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand, kinematics
+from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import load
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.task import metrics
@@ -28,6 +29,7 @@ from tests.scenes import HAND, L, active, scene
 FINGERS = get_constraint("fingers")
 HEADING = get_constraint("heading")
 TASK = TaskConfig(constraints=("heading", "fingers"))
+BOX = procedural.generate(0, "box")
 PINCH = np.array([[True, True, False, False, False]])
 # Links and tips in the order of the human hand: palm, then three links of thumb, index, middle, ring and little finger.
 PALM, THUMB, INDEX, MIDDLE, RING = 0, 3, 6, 9, 12
@@ -209,19 +211,19 @@ def test_policies_of_before_see_what_they_saw(hand):
 
 
 def test_words():
-    parsed = FINGERS.parse({"fingers": ("index", "thumb")}, HAND)
+    parsed = FINGERS.parse({"fingers": ("index", "thumb")}, HAND, BOX)
     np.testing.assert_array_equal(parsed["allowed"], PINCH[0])
     assert parsed["allowed"].dtype == bool
-    assert FINGERS.parse({"fingers": ()}, HAND) is None and FINGERS.parse({"fingers": ""}, HAND) is None
+    assert FINGERS.parse({"fingers": ()}, HAND, BOX) is None and FINGERS.parse({"fingers": ""}, HAND, BOX) is None
     with pytest.raises(CongraspError, match=r"has no finger 'pinky'.*Known: thumb, index, middle, ring, little"):
-        FINGERS.parse({"fingers": ("thumb", "pinky")}, HAND)
+        FINGERS.parse({"fingers": ("thumb", "pinky")}, HAND, BOX)
     with pytest.raises(CongraspError, match="no finger 'little'"):
-        FINGERS.parse({"fingers": ("thumb", "little")}, get_hand("allegro"))
+        FINGERS.parse({"fingers": ("thumb", "little")}, get_hand("allegro"), BOX)
     with pytest.raises(CongraspError, match=r"^--fingers lacks the thumb, which every grasp needs\. Add thumb\.$"):
-        FINGERS.parse({"fingers": ("index", "middle")}, HAND)
+        FINGERS.parse({"fingers": ("index", "middle")}, HAND, BOX)
     for one in (("thumb",), ("thumb", "thumb")):
         with pytest.raises(CongraspError, match="names one finger"):
-            FINGERS.parse({"fingers": one}, HAND)
+            FINGERS.parse({"fingers": one}, HAND, BOX)
 
 
 def test_features_of_a_whole_step_reach_it():
