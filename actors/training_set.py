@@ -12,7 +12,7 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.pool import load_pool, scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.stages import stage
-from congrasp.common.task.sampling.bank import ConstraintBank, rows_of, stacked
+from congrasp.common.task.sampling.bank import ConstraintBank, rows_of, stacked, with_columns
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.sampling.sets import bank_of, load_for
 from congrasp.common.wire.codec import Message
@@ -56,7 +56,8 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
                 f"Make them for '{hand.name}', or train that hand.",
             )
     pool = scale_objects(hand, task, found)
-    bank = bank_of(sets, objects.split) if sets else build_bank(hand, task, pool, seed)
+    captured = with_columns(hand, task, bank_of(sets, objects.split)) if sets else None
+    bank = captured or build_bank(hand, task, pool, seed)
     if not objects.procedural:
         return TrainingSet(pool, bank)
     more = dataclasses.replace(objects, folder="", constraints="", count=objects.procedural)
@@ -65,4 +66,4 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
     if share := objects.folder_share:
         weights = [share / len(pool)] * len(pool) + [(1 - share) / len(beside)] * len(beside)
         both = both._replace(weight=np.array(weights, np.float32))
-    return TrainingSet(pool + beside, both)
+    return TrainingSet(pool + beside, with_columns(hand, task, both))

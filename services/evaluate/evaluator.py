@@ -19,7 +19,7 @@ from congrasp.common.objects.pool import scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
-from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.bank import ConstraintBank, with_columns
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate import loads, references, sensing
@@ -93,7 +93,9 @@ class Evaluator:
         self.objects = scale_objects(self._hand, self.task, objects)
         self._physics, self._threads, self._seed = physics, threads, seed
         self._batch = batch or ENGINES[physics].batch
-        self._bank = bank or build_bank(self._hand, self.task, self.objects, seed)
+        self._bank = (
+            with_columns(self._hand, self.task, bank) if bank else build_bank(self._hand, self.task, self.objects, seed)
+        )
         self._given = bank is not None
         self._references: References | None = None
         self._field: DistanceField | None = None

@@ -17,6 +17,7 @@ import numpy as np
 
 from congrasp.common import rotations
 from congrasp.common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Weight
+from congrasp.common.task.constraints.markers import Polyline
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -34,15 +35,29 @@ class Level(Constraint):
     blocks = ("level",)
     weights = (Weight("level_height", 0.7, "Per metre of height."),)
     errors = (ErrorSpec("level_m", "m", "hold", 0.05, 0.05, "height beside the object's"),)
-    options = (Option("level", "What must be as high as the object: wrist or centre."),)
+    options = (
+        Option("level", "What must be as high as the object: wrist or centre."),
+        Option("levelled", "A wrist path: the wrist must be as high as the object if it ends level.", "path"),
+    )
 
     def fields(self, hand, task):
         return (
             (ObservationField("level_wrist", 1, "1 for the wrist"), ObservationField("level_height", 1, "m, world")),
         )
 
+    def columns(self, hand, bank):
+        """(N,) share of the object's surface points that are above their mean."""
+        height = jnp.asarray(bank.points)[..., 2]
+        return {"upper": jnp.mean(height > height.mean(-1, keepdims=True), -1)}
+
     def sample(self, hand, draw, key):
-        return LevelGoal(jax.random.bernoulli(key, 0.5, (*draw.objects.shape, 1)))
+        return LevelGoal(jax.random.bernoulli(key, draw.own("level")["upper"])[:, None])
+
+    def labels(self, hand):
+        return {"wrist": ("wrist",)}
+
+    def markers(self, own, blocks):
+        return (Polyline(np.array([[-0.05, 0.0, 0.0], [0.05, 0.0, 0.01 * own.wrist[0]]])),)
 
     def observe(self, scene):
         return ([scene.goal["level"].wrist.astype(jnp.float32), self._height(scene)[:, None]],)
@@ -54,6 +69,8 @@ class Level(Constraint):
         return {"level_m": jnp.abs(self._height(scene))}
 
     def parse(self, given, hand, obj):
+        if given["levelled"]:
+            return {"wrist": np.abs(np.diff(given["levelled"]["position"][-2:, 2])) < 1e-3}
         return {"wrist": np.array([given["level"] == "wrist"])} if given["level"] else None
 
     def _height(self, scene):
@@ -68,7 +85,9 @@ def test_nothing_else_must_be_changed():
     command = [sys.executable, "-m", "tests.common.test_outside_constraint"]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=220)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.splitlines() == ["episodes", "tables", "server", "command line", "ONNX"]
+    assert done.stdout.splitlines() == [
+        *("episodes", "tables", "server", "command line", "file", "marker", "studio", "ONNX")
+    ]
 
 
 def episodes(task):
@@ -171,6 +190,48 @@ def command_line():
     assert RunConfig().task.reward.level_height == 0.7
 
 
+def file():
+    """A file that one of its options names."""
+    import json
+    import tempfile
+
+    from congrasp.common.hands import get_hand
+    from congrasp.common.objects import procedural
+    from congrasp.services.grasp.parse import read_request
+
+    with tempfile.TemporaryDirectory() as folder:
+        for end, level in ((0.0, True), (0.1, False)):
+            path = pathlib.Path(folder, "path.json")
+            written = {"position": [[0.2, 0, 0], [0.1, 0, end]], "quaternion": [[1, 0, 0, 0]] * 2}
+            path.write_text(json.dumps(written))
+            request = read_request(procedural.generate(0, "box"), get_hand("human"), 15, levelled=path)
+            assert request.constraints["level"]["wrist"].tolist() == [level]
+
+
+def marker():
+    """What pictures, recordings and the studio's player draw of it."""
+    from congrasp.services.record.goals import markers
+
+    heading = {"position": np.zeros(3), "direction": np.array([0.0, 0.0, -1.0]), "cross": np.array([1.0, 0.0, 0.0])}
+    arrays = {f"goal/heading_{name}": value for name, value in heading.items()}
+    arrays |= {"goal/level_wrist": np.array([True]), "active/level": np.bool_(True)}
+    drawn = dict(markers(arrays))
+    assert list(drawn) == ["heading", "level"] and drawn["level"].points[1, 2] == 0.01
+
+
+def studio(task):
+    """Its toggle."""
+    from congrasp.common.hands import get_hand
+    from congrasp.common.objects import procedural
+    from congrasp.services.studio.description import describe
+    from congrasp.services.studio.state import Studio
+
+    made = Studio(get_hand("human"), task, procedural.generate(0, "box"))
+    made.choose("level", "wrist", [True])
+    assert {"name": "level", "title": "level hand", "flags": {"wrist": {"wrist": True}}} in describe(made)["others"]
+    assert made.asked == {"level"} and made.request.constraints["level"]["wrist"].tolist() == [True]
+
+
 def onnx(task):
     """Its block in what is written beside an exported policy."""
     from congrasp.common.config import NetworkConfig, RunConfig
@@ -204,5 +265,11 @@ if __name__ == "__main__":
     print("server")
     command_line()
     print("command line")
+    file()
+    print("file")
+    marker()
+    print("marker")
+    studio(TASK)
+    print("studio")
     onnx(TASK)
     print("ONNX")

@@ -22,7 +22,7 @@ from congrasp.common.task.types import Array, Goal, SceneState, Surface
 if TYPE_CHECKING:
     from congrasp.common.config import TaskConfig
     from congrasp.common.task.features import Contacts, Features
-    from congrasp.common.task.sampling.bank import Draw
+    from congrasp.common.task.sampling.bank import ConstraintBank, Draw
     from congrasp.common.task.sensing import Readings
 
 Window = Literal["approach", "hold"]
@@ -185,6 +185,13 @@ class Constraint:
         }
 
     # Sampling and the start of an episode.
+
+    def columns(self, hand: Hand, bank: "ConstraintBank") -> Any:
+        """A pytree of arrays (N, ...) that `sample` needs of each object (`Draw.own`), made once; None for nothing.
+
+        Headings, reference poses and trajectories, which constraints share, are the bank's own.
+        """
+        return None
 
     def available(self, draw: "Draw") -> Array:
         """(B,) bool: whether the drawn objects, in their resting poses and regions, allow it.

@@ -2,11 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import numpy as np
 
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints import known
 from congrasp.common.task.types import Array
+
+if TYPE_CHECKING:
+    from congrasp.common.config import TaskConfig
 
 
 class ConstraintBank(NamedTuple):
@@ -54,6 +60,8 @@ class ConstraintBank(NamedTuple):
     """(N,) bool: grasps of the policy in training may take the place of the object's references."""
     grasps: Array
     """(N, V) int, how many of these grasps came so far."""
+    own: Any = {}  # noqa: RUF012 - never changed
+    """Columns (N, ...) of single constraints by their names (`Constraint.columns`)."""
 
 
 _AXES = {
@@ -68,9 +76,20 @@ _AXES = {
 """Leading axes of an object's arrays whose sizes may differ between objects, among others."""
 
 
+SHARED = ConstraintBank._fields[:-1]
+"""Fields of the bank that do not belong to a single constraint."""
+
+
+def with_columns(hand: Hand, task: "TaskConfig", bank: ConstraintBank) -> ConstraintBank:
+    """The bank with the columns that the task's constraints make of it."""
+    found = {constraint.name: constraint.columns(hand, bank) for constraint in known(task)}
+    return bank._replace(own={name: columns for name, columns in found.items() if columns is not None})
+
+
 def rows_of(bank: ConstraintBank) -> list[ConstraintBank]:
-    """Each object's arrays, without the leading axis N."""
-    return [ConstraintBank(*(np.asarray(field)[n] for field in bank)) for n in range(len(bank.points))]
+    """Each object's arrays, without the leading axis N and columns of single constraints."""
+    shared = bank[: len(SHARED)]
+    return [ConstraintBank(*(np.asarray(field)[n] for field in shared)) for n in range(len(bank.points))]
 
 
 def stacked(rows: Sequence[ConstraintBank]) -> ConstraintBank:
@@ -87,9 +106,7 @@ def stacked(rows: Sequence[ConstraintBank]) -> ConstraintBank:
                 value = np.take(value, np.resize(np.arange(value.shape[place]), most[axis]), place)
         return value
 
-    return ConstraintBank(
-        **{name: np.stack([repeated(name, getattr(row, name)) for row in rows]) for name in ConstraintBank._fields}
-    )
+    return ConstraintBank(**{name: np.stack([repeated(name, getattr(row, name)) for row in rows]) for name in SHARED})
 
 
 class Draw(NamedTuple):
@@ -108,6 +125,10 @@ class Draw(NamedTuple):
     """(B,) N, the least limit on a link's force under which the episode's object can be held."""
     disturbance: Array | None = None
     """(B,) between 0 and 1, how far references are off (`common.task.sampling.disturbances`); None for not at all."""
+
+    def own(self, constraint: str) -> Any:
+        """Columns (B, ...) of a constraint for the drawn objects (`Constraint.columns`)."""
+        return jax.tree.map(lambda column: column[self.objects], self.bank.own[constraint])
 
     @property
     def allowed(self) -> Array:

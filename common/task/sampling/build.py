@@ -19,7 +19,7 @@ from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.task.sampling.approach_paths import make_trajectories
-from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.bank import ConstraintBank, with_columns
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
 from congrasp.common.task.sampling.headings import (
     INWARD,
@@ -58,7 +58,8 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
     """
-    return kept_bank(hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed))
+    bank = kept_bank(hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed))
+    return with_columns(hand, task, bank)
 
 
 def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:

@@ -15,7 +15,7 @@ from congrasp.common.io.caches import keep, read_kept, source_digest
 from congrasp.common.io.files import cache_folder
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.wire.codec import Message
 
 LEAST_OBJECTS = 64
@@ -36,10 +36,10 @@ def kept_bank(
     if len(objects) < LEAST_OBJECTS:
         return build()
     path = cache_folder("banks") / f"{_key(hand, task, objects, seed)}.safetensors"
-    if (message := read_kept(path)) and message.arrays.keys() == set(ConstraintBank._fields):
+    if (message := read_kept(path)) and message.arrays.keys() == set(SHARED):
         return jax.device_put(ConstraintBank(**message.arrays))
     bank = build()
-    keep(path, Message({name: np.asarray(field) for name, field in bank._asdict().items()}), MOST_FILES)
+    keep(path, Message({name: np.asarray(getattr(bank, name)) for name in SHARED}), MOST_FILES)
     return bank
 
 
