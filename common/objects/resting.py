@@ -19,6 +19,7 @@ _SPEED_SECONDS = 0.025
 _FREE_SECONDS = 0.5  # after which an object that is not stable betrays itself by its speed
 _DROPS = ((0.03, 1.5e-6), (0.06, 5e-6))  # rad, m; a pose whose centre of mass a tilt lowers by more is not stable
 _ROUNDS = 4
+_UPRIGHT = np.radians(30)
 
 
 class Settled(NamedTuple):
@@ -118,6 +119,13 @@ def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
     poses = np.array(found)
     poses[:, :2] = 0.0
     return poses
+
+
+def upright_rest(obj: GraspObject) -> int | None:
+    """The resting pose in which the object's z axis is nearest to upright; None if it is 30 degrees off in all."""
+    tilts = rest_tilts(obj)
+    best = int(np.argmin(tilts))
+    return best if tilts[best] < _UPRIGHT else None
 
 
 def rest_tilts(obj: GraspObject) -> np.ndarray:

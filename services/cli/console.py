@@ -14,11 +14,11 @@ Track = Callable[[str, int | None], Callable[[int], None]]
 """(what is done, its total if known) -> what to call with the amount done."""
 
 
-def at_least(least: int, **counts: int) -> None:
+def at_least(least: float, **counts: float) -> None:
     """Raises a CongraspError for the first option, by its name, that is less."""
     for name, value in counts.items():
         if value < least:
-            raise CongraspError(f"--{name} is {value}.", f"It must be at least {least}.")
+            raise CongraspError(f"--{name} is {value}.", f"It must be at least {least:g}.")
 
 
 def at_most(most: float, unit: str, **amounts: float) -> None:

@@ -47,12 +47,13 @@ def evaluate(
 ) -> int:
     """Evaluate policies by the paper's protocol, beside the paper's figures.
 
-    An episode has 50 control steps with the table and 2 s without it. Success is counted after the paper's 25 steps
-    without the table, and again after the 2 s (held). Rates come with 95 % intervals whose clusters are objects
-    (captured sequences); 'of all objects' counts uncovered objects as failures. Errors and forces are those of
-    successful episodes in the paper's window of 25 steps. The policy acts by its mean. Every object has the same number
-    of episodes in a row, which is the same whatever other rows are requested. Reference poses and trajectories are
-    grasps of a reference policy, which never had any; the last fifth of each object's 20 is evaluated.
+    An episode has as many control steps with the table as the policy was trained with, and 2 s without it. Success is
+    counted after the paper's 25 steps without the table, and again after the 2 s (held). Rates come with 95 %
+    intervals whose clusters are objects (captured sequences); 'of all objects' counts uncovered objects as failures.
+    Errors and forces are those of successful episodes in the paper's window of 25 steps. The policy acts by its mean.
+    Every object has the same number of episodes in a row, which is the same whatever other rows are requested.
+    Reference poses and trajectories are grasps of a reference policy, which never had any; the last fifth of each
+    object's 20 is evaluated.
 
     Args:
       policy: Policy files (policy.safetensors of a run), as FILE or METHOD=FILE, or folders of runs; by default a

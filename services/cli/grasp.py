@@ -41,6 +41,9 @@ def grasp(
     out: pathlib.Path = pathlib.Path("grasps"),
     constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = Constraints(),  # noqa: B008
     video: bool = False,
+    size: str = "1280x720",
+    fps: float = 25.0,
+    overlays: bool = False,
     pictures: bool = True,
     policy: pathlib.Path | None = None,
     hand: str = "human",
@@ -66,7 +69,10 @@ def grasp(
         names in --folder.
       out: Folder for the results.
       constraint: What the grasp must keep to.
-      video: Also write grasp.mp4, at half speed, with the constraints drawn.
+      video: Also write grasp.mp4, in real time.
+      size: Width and height of the video, pixels.
+      fps: Frames a second of the video.
+      overlays: Draw constraints and contacts into the video; grasp.png shows them in any case.
       pictures: Write pictures.
       policy: A policy file, or 'allegro-student'; by default the hand's that comes with the package.
       hand: Hand whose pretrained policy is taken.
@@ -88,6 +94,7 @@ def grasp(
     from congrasp.services.cli.console import at_least, at_most, bars
     from congrasp.services.grasp.grasper import Grasper
     from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
+    from congrasp.services.viz.render import Film
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
@@ -95,13 +102,16 @@ def grasp(
     at_most(_MOST_ATTEMPTS, "side by side", attempts=attempts)
     at_most(10.0, "seconds", approach=approach)
     at_most(0.5, "metres", lift=lift)
+    at_least(1.0, fps=fps)
+    at_most(120.0, "frames a second", fps=fps)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
     file = policy_file(policy, hand)
     bundle = bundles.load(file)
     found, results = find_objects(objects, folder)
+    film = Film(_pixels(size), fps, overlays) if video else None
     identity = (bundles.content_hash(file.read_bytes()), attempts, seed, approach, lift)
-    settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, video, pictures, again, rest)
+    settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, film, pictures, again, rest)
     grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed)
 
     for result in results:
@@ -149,3 +159,13 @@ def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
 
 
 COMMAND = grasp
+
+
+def _pixels(text: str) -> tuple[int, int]:
+    """Width and height of WIDTHxHEIGHT, even and from 64 to 4096 pixels."""
+    numbers = text.lower().split("x")
+    if len(numbers) == 2 and all(word.isdecimal() and len(word) < 5 for word in numbers):
+        width, height = map(int, numbers)
+        if all(64 <= side <= 4096 and side % 2 == 0 for side in (width, height)):
+            return width, height
+    raise CongraspError(f"--size is '{text}'.", "Write two even numbers from 64 to 4096: --size 1920x1080")

@@ -42,21 +42,21 @@ def episode(
       index: Which of the recorded episodes, from 0; -1 is the last.
       success: Count only episodes that succeeded.
       frames: Pictures on the sheet.
-      video: Also write the whole episode as an MP4, the grasp itself at half its speed.
+      video: Also write the whole episode as an MP4.
 
     Examples:
       congrasp render episode runs/mine --success
       congrasp render episode runs/mine --index 0 --video grasp.mp4
     """
     from congrasp.services.record.reader import pick_episode
-    from congrasp.services.viz.render import episode_sheet, save_episode_video
+    from congrasp.services.viz.render import Film, episode_sheet, save_episode_video
     from congrasp.services.viz.sheets import save_png
 
     chosen = pick_episode(path, index, success=success)
     save_png(out, episode_sheet(chosen, frames=frames))
     print(out)
     if video is not None:
-        save_episode_video(video, chosen)
+        save_episode_video(video, chosen, Film(overlays=True))
         print(video)
     return 0
 

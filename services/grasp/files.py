@@ -17,6 +17,7 @@ from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.scene import episode_entries
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.viz.render import (
+    Film,
     best_camera,
     episode_sheet,
     grasp_picture,
@@ -36,16 +37,17 @@ OBJECT = "object.png"
 """Pictures of the object before and after its import."""
 
 
-_SMALL, _VIDEO = (320, 240), (854, 480)  # pixels
+_SMALL = (320, 240)  # pixels
+_HELD = 0.5  # of the hold, in videos, s
 
 
-def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: bool, about: dict[str, Any]) -> None:
+def save_grasp(folder: pathlib.Path, found: Grasp, *, film: Film | None, pictures: bool, about: dict[str, Any]) -> None:
     """Writes a grasp; the result comes last, so that where there is one everything is there.
 
     Args:
       folder: the object's folder.
       found: the grasp.
-      video: also writes the MP4.
+      film: how the MP4 is drawn; None writes none.
       pictures: also writes the contact sheet.
       about: further entries of the result.
 
@@ -58,13 +60,15 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, video: bool, pictures: boo
     episode = found.episode
     steps = _steps_to_draw(*grasp_steps(episode), len(episode.arrays["table"]) - 1)
     last = steps[-1]
-    camera = best_camera(episode, steps) if pictures or video else None
     if pictures:
+        camera = best_camera(episode, steps)
         save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera))
         save_png(folder / PORTRAIT, grasp_picture(episode, last))
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
-    if video:
-        save_episode_video(folder / VIDEO, episode, _VIDEO, camera)
+    if film:
+        until = found.first("hold") + round(_HELD / float(episode.meta["control_dt"]))
+        seen_from = best_camera(episode, [*steps[:-1], min(until, last)], film.size[0] / film.size[1])
+        save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 
 

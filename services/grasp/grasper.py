@@ -18,6 +18,7 @@ from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
@@ -42,13 +43,13 @@ ROUNDS = 4
 HOLD_SECONDS = 2.0
 """How long the object should be held without the table."""
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
-_SCALES |= {"moved_at_removal": 0.03, "force_link_max": 10.0, "slip": 0.02}
+_SCALES |= {"moved_at_removal": 0.01, "force_link_max": 10.0, "slip": 0.02}
 """What weighs as much as one another, among grasps that hold: errors, the object's way before table removal (m), the
 strongest link's force (N), and the object's way after it went (m)."""
 _FIRM = ("clean", *SURVIVAL)
 """What counts one against a grasp that lacks it, likewise."""
 _UNLIKELY = 0.5
-"""What each likelier resting pose weighs against a grasp, likewise."""
+"""What each resting pose that comes before its own weighs against a grasp, likewise."""
 _TOUCHED = 0.2
 """Share of touches on what must not be touched from which others are attempted."""
 
@@ -82,17 +83,17 @@ class Grasp:
     @property
     def sink(self) -> float:
         """Metres by which the wrist sinks in the hold at most."""
-        height = self.motion.wrist_position[self._from("hold") :, 2]
+        height = self.motion.wrist_position[self.first("hold") :, 2]
         return float(max(height[0] - height.min(), 0.0))
 
     @property
     def shove(self) -> float:
         """Metres by which the object moves at most before it is lifted, or the table removed."""
         phase = "lift" if "lift" in self.motion.about["phases"] else "hold"
-        moved = self.motion.object_position[: self._from(phase)] - self.motion.object_position[0]
+        moved = self.motion.object_position[: self.first(phase)] - self.motion.object_position[0]
         return float(np.linalg.norm(moved, axis=-1).max())
 
-    def _from(self, phase: str) -> int:
+    def first(self, phase: str) -> int:
         """The first step of a phase."""
         begin = self.motion.about["phases"][phase]
         return min(int(np.searchsorted(self.motion.time, begin - 1e-6)), len(self.motion.time) - 1)
@@ -190,7 +191,7 @@ class Grasper:
             _check_aligned(outcome)
             removal = self.task.approach_steps - 1
             cost = costs(outcome, tuple(request.constraints), removal, self._lift)
-            cost = (cost + _UNLIKELY * _places(rests, request))[:different]
+            cost = (cost + _UNLIKELY * _places(obj, rests, request))[:different]
             attempted += different
             holds = outcome.metrics["held"][:different] > 0
             held += int(holds.sum())
@@ -364,9 +365,12 @@ def costs(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: fl
     return np.asarray(cost) + 1e3 * (values["success"] == 0) + 1e4 * (values["held"] == 0)
 
 
-def _places(rests: np.ndarray, request: GraspRequest) -> np.ndarray:
-    """(B,) places down the list of likely resting poses; none where one was asked for."""
-    return rests if request.rest is None else np.zeros_like(rests)
+def _places(obj: GraspObject, rests: np.ndarray, request: GraspRequest) -> np.ndarray:
+    """(B,) places of resting poses: upright first, then by likelihood; zeros where one was asked for."""
+    if request.rest is not None:
+        return np.zeros_like(rests)
+    upright = upright_rest(obj)
+    return rests if upright is None else np.where(rests == upright, 0, rests + (rests < upright))
 
 
 def _check_aligned(outcome: Outcome) -> None:

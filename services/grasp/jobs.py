@@ -13,7 +13,7 @@ from PIL import Image
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import file_name
-from congrasp.common.objects.resting import rest_tilts
+from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.store import Catalogue
 from congrasp.services.assets.objects.materials import with_mass
@@ -24,11 +24,11 @@ from congrasp.services.grasp.files import OBJECT, THUMBNAIL, VIDEO, finished, ke
 from congrasp.services.grasp.grasper import Grasper, Progress
 from congrasp.services.grasp.parse import numbered, read_request
 from congrasp.services.viz.import_sheet import import_sheet, mesh_of_file
+from congrasp.services.viz.render import Film
 from congrasp.services.viz.sheets import contact_sheet, save_png
 
 SHEET, SUMMARY = "summary.png", "summary.json"
 _COLUMNS = 6
-_UPRIGHT = 0.87  # cosine of the angle between the file's z axis and the vertical, at least
 
 
 class Settings(NamedTuple):
@@ -40,7 +40,8 @@ class Settings(NamedTuple):
     """See `services.grasp.parse.read_request`."""
     identity: tuple[Any, ...]
     """What else makes a grasp: policy, seed, attempts."""
-    video: bool
+    film: Film | None
+    """How a video is drawn; None for no video."""
     pictures: bool
     again: bool
     """Whether to redo finished objects."""
@@ -130,7 +131,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
         key = key_of(_content(at), options, given, settings.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
-        if before is not None and ((folder / VIDEO).exists() or not settings.video):
+        if before is not None and ((folder / VIDEO).exists() or settings.film is None):
             return Result(at.name, before, skipped=True)
         progress("Importing", 0, 1)
         obj = _load(at, settings.options)
@@ -150,7 +151,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "notes": [*obj.notes, *_notes(at, obj, settings.options)],
             "rules": list(found.active),
         }
-        save_grasp(folder, found, video=settings.video, pictures=settings.pictures, about=about)
+        save_grasp(folder, found, film=settings.film, pictures=settings.pictures, about=about)
         return Result(at.name, {**found.facts(), **about})
     except CongraspError as error:
         return Result(at.name, {}, str(error))
@@ -164,14 +165,12 @@ def rest_pose(obj: GraspObject, text: str) -> int:
     """
     count = len(obj.rest_poses)
     if text == "upright":
-        tilts = rest_tilts(obj)
-        best = int(np.argmin(tilts))
-        if np.cos(tilts[best]) < _UPRIGHT:
+        if (upright := upright_rest(obj)) is None:
             raise CongraspError(
                 f"'{obj.name}' does not rest with its z axis up in any of its {count} resting poses.",
                 f"Set --rest to a number from 1 to {count}: congrasp objects rests {obj.name} --png rests.png",
             )
-        return best
+        return upright
     if not text.isdecimal() or len(text) > 4 or not 1 <= int(text) <= count:
         raise CongraspError(f"--rest is '{text}'.", f"'{obj.name}' has resting poses 1 to {count}; or set upright.")
     return int(text) - 1

@@ -17,7 +17,7 @@ from congrasp.services.record.scene import episode_entries
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.studio.arrow import vector
 from congrasp.services.studio.server import Download
-from congrasp.services.viz.render import render_episode_frames, save_episode_video
+from congrasp.services.viz.render import Film, render_episode_frames, save_episode_video
 from congrasp.services.viz.scene import Camera
 from congrasp.services.viz.sheets import png_of
 
@@ -84,7 +84,7 @@ def drawing(
         return Download(_name(episode, key, f"-{frame}.png"), png_of(image))
     with tempfile.TemporaryDirectory(prefix="congrasp-video-") as folder:
         path = pathlib.Path(folder) / "motion.mp4"
-        save_episode_video(path, episode, _VIDEO, camera, progress)
+        save_episode_video(path, episode, Film(_VIDEO, overlays=True), camera, progress)
         return Download(_name(episode, key, ".mp4"), path.read_bytes())
 
 

@@ -3,6 +3,7 @@
 import pathlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
@@ -37,33 +38,44 @@ _FULL_CONTACT = 2.0  # force at which a link takes most of the contact colour, N
 _ELEVATION = 24.0  # degrees
 _ARROW_SEARCH, _ARROW_GAP = 0.012, 0.004  # radius in which the approach looks for the object, space before it, m
 _GAP = 3  # between two views of a picture, pixels
-_FRAME_SECONDS = 0.04  # between two frames of a video
 _FALL = 0.1  # how far the camera follows a falling object, m
 
 
-def episode_shapes(episode: Message, step: int) -> list[Shape]:
-    """Hand, object, table and active constraints of one control step of an episode."""
-    return _bodies(episode, step) + _constraints(known_hand(episode.meta["hand"]), episode, step)
+class Film(NamedTuple):
+    """How a video is drawn."""
+
+    size: tuple[int, int] = (1280, 720)
+    """Width and height in pixels, both even."""
+    fps: float = 25.0
+    """Frames a second."""
+    overlays: bool = False
+    """Draws the active constraints, and in green where the hand touches."""
 
 
-def _bodies(episode: Message, step: int) -> list[Shape]:
+def episode_shapes(episode: Message, step: int, *, overlays: bool = True) -> list[Shape]:
+    """Hand, object and table of one control step of an episode; as overlays its active constraints and contacts."""
+    bodies = _bodies(episode, step, overlays=overlays)
+    return bodies + (_constraints(known_hand(episode.meta["hand"]), episode, step) if overlays else [])
+
+
+def _bodies(episode: Message, step: int, *, overlays: bool) -> list[Shape]:
     """Hand, object and table of one control step of an episode."""
     arrays = episode.arrays
     hand = known_hand(episode.meta["hand"])
     force = np.linalg.norm(arrays["contact_force"][step], axis=-1)
-    share = np.where(force > _TOUCH, 0.3 + 0.3 * np.minimum(force / _FULL_CONTACT, 1.0), 0.0)
+    share = np.where(force > _TOUCH, 0.3 + 0.3 * np.minimum(force / _FULL_CONTACT, 1.0), 0.0) * overlays
     links = arrays["link_position"][step], arrays["link_quaternion"][step]
-    shapes = [skin_shape(skin_of(hand), *links, TOUCHING, share), _object(episode, step)]
+    shapes = [skin_shape(skin_of(hand), *links, TOUCHING, share), _object(episode, step, painted=overlays)]
     if arrays["table"][step]:
         shapes.append(table_shape(arrays["object_position"][0]))
     return shapes
 
 
-def _object(episode: Message, step: int) -> Shape:
+def _object(episode: Message, step: int, *, painted: bool = True) -> Shape:
     """The object at a step in its own colours, painted where its avoid region is a constraint."""
     arrays = episode.arrays
     avoid = np.asarray(arrays["surface_minus"], bool)
-    marked = bool(avoid.any()) and any(isinstance(marker, Paint) for _, marker in markers(arrays))
+    marked = painted and bool(avoid.any()) and any(isinstance(marker, Paint) for _, marker in markers(arrays))
     paint = None
     if "colour_values" in arrays:
         points, colours = arrays["colour_points"], arrays["colour_values"] / 255
@@ -167,10 +179,10 @@ def thumb_camera(episode: Message, step: int, aspect: float) -> Camera:
 
 
 def grasp_picture(episode: Message, step: int, size: tuple[int, int] = (1280, 720)) -> np.ndarray:
-    """A step as (height, width, 3) uint8, without constraints: framed on the grasp, and from the thumb's side."""
+    """A step as (height, width, 3) uint8, without overlays: framed on the grasp, and from the thumb's side."""
     width, height = size
     left = 2 * width // 3
-    shapes = _bodies(episode, step)
+    shapes = episode_shapes(episode, step, overlays=False)
     cameras = best_camera(episode, [step], left / height), thumb_camera(episode, step, (width - left) / height)
     widths = left, width - left
     views = [render_scene(shapes, camera, (w, height)) for camera, w in zip(cameras, widths, strict=True)]
@@ -183,6 +195,8 @@ def render_episode_frames(
     steps: Iterable[int],
     size: tuple[int, int] = (640, 480),
     camera: Camera | None = None,
+    *,
+    overlays: bool = True,
 ) -> Iterator[np.ndarray]:
     """Pictures (height, width, 3) uint8 of control steps of an episode, all from one camera.
 
@@ -191,11 +205,16 @@ def render_episode_frames(
       steps: control steps, from 0.
       size: width and height in pixels.
       camera: from where; the best of a circle around the scene otherwise.
+      overlays: see `Film`.
     """
     steps = list(steps)
     seen_from = camera or best_camera(episode, steps, size[0] / size[1])
+
+    def drawn(step: int) -> np.ndarray:
+        return render_scene(episode_shapes(episode, step, overlays=overlays), seen_from, size)
+
     with ThreadPoolExecutor(cores()) as pool:
-        yield from pool.map(lambda step: render_scene(episode_shapes(episode, step), seen_from, size), steps)
+        yield from pool.map(drawn, steps)
 
 
 def episode_sheet(
@@ -294,28 +313,36 @@ def episode_title(episode: Message) -> str:
 def save_episode_video(
     path: pathlib.Path,
     episode: Message,
-    size: tuple[int, int] = (640, 480),
+    film: Film = Film(),  # noqa: B008 - frozen
     camera: Camera | None = None,
     progress: Callable[[float], None] = lambda share: None,
+    *,
+    until: int | None = None,
 ) -> None:
-    """An episode as MP4: in real time, the grasp itself (before the lift or the table's removal) at half its speed.
+    """An episode as MP4, in real time.
 
     Args:
-      path: the file.
+      path: the file; it is written under another name and renamed when it is whole.
       episode: the episode.
-      size: width and height in pixels.
+      film: size, frame rate and overlays.
       camera: see `render_episode_frames`.
       progress: told which share of the frames is drawn.
+      until: its first control step that is not drawn; all are by default.
+
+    Raises:
+      CongraspError: the package for videos is absent, or the file cannot be written.
     """
-    step = max(1, round(_FRAME_SECONDS / 2 / float(episode.meta["control_dt"])))
-    first, end = grasp_steps(episode)
-    last = len(episode.arrays["table"])
-    steps = [*range(0, first, 2 * step), *range(first, end, step), *range(end, last, 2 * step)]
+    step = 1 / (film.fps * float(episode.meta["control_dt"]))
+    last = len(episode.arrays["table"]) if until is None else min(until, len(episode.arrays["table"]))
+    steps = [int(i * step) for i in range(int(np.ceil(last / step)))]
 
     def frames() -> Iterator[np.ndarray]:
         """The frames, one after another."""
-        for done, frame in enumerate(render_episode_frames(episode, steps, size, camera), 1):
+        drawn = render_episode_frames(episode, steps, film.size, camera, overlays=film.overlays)
+        for done, frame in enumerate(drawn, 1):
             yield frame
             progress(done / len(steps))
 
-    save_video(path, frames(), size, 1 / _FRAME_SECONDS)
+    unfinished = path.with_name(f".{path.name}")
+    save_video(unfinished, frames(), film.size, film.fps)
+    unfinished.replace(path)

@@ -13,6 +13,8 @@ from congrasp.actors.attempts import Outcome
 from congrasp.actors.rollout import Trace
 from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common.errors import CongraspError
+from congrasp.common.objects import procedural
+from congrasp.common.objects.resting import upright_rest
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
@@ -22,7 +24,7 @@ from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
 from congrasp.services.export.motion_file import load_motion, motion_of_episode
 from congrasp.services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
-from congrasp.services.grasp.grasper import Grasp, Grasper, costs
+from congrasp.services.grasp.grasper import Grasp, Grasper, _places, costs
 from congrasp.services.grasp.jobs import Result
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.record.reader import read_episodes
@@ -58,11 +60,13 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     heading = {"direction": np.array([0.0, 0.0, -1.0])}
     request = GraspRequest({"heading": heading, "affordance": {}}, avoid=minus)
     found = grasper.grasp(block, request, lambda what, done, total: reports.append((what, done, total)))
-    assert reports[0][0].startswith("Compiling") and reports[1] == ("Attempting", 1, 75) and reports[-1][1:] == (75, 75)
+    steps = grasper.task.approach_steps + 25
+    assert reports[0][0].startswith("Compiling") and reports[1] == ("Attempting", 1, steps)
+    assert reports[-1][1:] == (steps, steps)
     assert 1 <= found.held <= found.attempts <= 12 and found.success
     motion = found.motion
     assert motion.constraints == ("heading", "affordance") and motion.about["attempts"] == found.attempts
-    assert len(motion.time) == 75 and motion.table.sum() == 49  # the table goes with the fiftieth step
+    assert len(motion.time) == steps and motion.table.sum() == 49  # the table goes with the fiftieth step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     np.testing.assert_array_equal(motion.surface_minus, minus[:256])
     # The hand came along the block's own z axis: from its start to its end the wrist moved mostly that way.
@@ -105,7 +109,8 @@ def test_a_grasp_lifts_the_block_off_a_table_that_stays(block):
     lifting.close()
     motion, phases = found.motion, found.facts()["phases"]
     assert list(phases) == ["approach", "grasp", "lift", "hold"] and found.rest == upright
-    assert phases["grasp"] >= 0.3 and phases["lift"] == pytest.approx(phases["grasp"] + 0.5)
+    seconds = lifting.task.approach_steps * lifting.task.control_dt
+    assert phases["grasp"] >= 0.3 and phases["lift"] == pytest.approx(phases["grasp"] + seconds)
     assert motion.table.all() and found.success
     grasped, lifted, held = (round(phases[name] / motion.control_dt) for name in ("grasp", "lift", "hold"))
     assert len(motion.time) == held + 25
@@ -230,8 +235,20 @@ def test_nothing_to_grasp(tmp_path):
 
 def test_files_of_a_grasp_are_constraints_of_the_next(tmp_path, block, grasper, monkeypatch, made_up):
     found = Grasper.grasp(grasper, block)
-    save_grasp(tmp_path, found, video=False, pictures=False, about={"key": "k"})
+    save_grasp(tmp_path, found, film=None, pictures=False, about={"key": "k"})
     text = str(tmp_path / MOTION)
     request = read_request(block, grasper.hand, 15, pose=text, trajectory=text)
     assert set(request.constraints) == {"heading", "pose", "trajectory"}
     np.testing.assert_array_equal(request.given("pose", "q"), found.motion.joint_position[7])
+
+
+def test_an_object_that_can_stand_is_grasped_as_it_stands():
+    """The mug rests likeliest on its side; upright comes before that, and nothing where a pose was asked for."""
+    mug = procedural.generate(0, "mug")
+    upright = upright_rest(mug)
+    assert upright is not None and upright > 0
+    rests = np.arange(len(mug.rest_poses))
+    places = _places(mug, rests, GraspRequest())
+    assert places[upright] == 0 and sorted(places) == list(rests)
+    np.testing.assert_array_equal(places[upright + 1 :], rests[upright + 1 :])
+    assert not _places(mug, rests, GraspRequest(rest=0)).any()

@@ -36,13 +36,13 @@ def test_a_picture_is_seen_from_where_the_page_looks() -> None:
     assert len(orange(image({**VIEW, "position": [1.0, -1.2, 0.74]}))[0]) == pytest.approx(len(rows) / 4, rel=0.25)
 
 
-def test_a_video_has_a_frame_for_every_40_ms_at_half_speed_before_the_table_is_removed() -> None:
+def test_a_video_has_a_frame_for_every_40_ms() -> None:
     shares: list[float] = []
     made = drawing(episode(6, removal=4), "3", "mp4", VIEW, 0, shares.append)
     assert made.name == "cylinder-0-3.mp4" and shares[-1] == 1.0 and shares == sorted(shares)
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", "-", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     frames = subprocess.run(command, input=made.data, capture_output=True, check=True).stdout
-    assert len(frames) == len(shares) * 854 * 480 * 3 and len(shares) == 3  # steps 0 and 2, and 4 without the table
+    assert len(frames) == len(shares) * 854 * 480 * 3 and len(shares) == 2  # steps 0 and 4
 
 
 @pytest.mark.parametrize(

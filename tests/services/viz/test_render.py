@@ -27,6 +27,7 @@ from congrasp.services.viz.raster import render_scene, visible
 from congrasp.services.viz.render import (
     OBJECT_AVOID,
     TOUCHING,
+    Film,
     best_camera,
     episode_shapes,
     episode_sheet,
@@ -34,6 +35,7 @@ from congrasp.services.viz.render import (
     grasp_picture,
     key_steps,
     render_episode_frames,
+    save_episode_video,
     thumb_camera,
 )
 from congrasp.services.viz.scene import Camera, Shape, between
@@ -300,6 +302,17 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
     frames = render_episode_frames(pick_episode(tmp_path / "run", 0), range(4), (64, 48))
     save_video(tmp_path / "film.mp4", frames, (64, 48), 0.5 / CONTROL_DT)
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 4
+
+
+def test_a_video_runs_in_real_time_to_its_last_step_and_shows_no_overlays(tmp_path) -> None:
+    """Ten of twelve steps of 10 ms at 50 frames a second are five frames; a constraint's arrow is an overlay."""
+    path = tmp_path / "film.mp4"
+    save_episode_video(path, episode(), Film((64, 48), 0.5 / CONTROL_DT), until=10)
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (5, 5 * 2 * CONTROL_DT)
+    assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
+    bare, marked = episode_shapes(episode(), 11, overlays=False), episode_shapes(episode(), 11)
+    assert len(bare) == 2 and len(marked) > 2
 
 
 def test_pictures_need_no_folder_that_can_be_written() -> None:
