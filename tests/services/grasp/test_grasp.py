@@ -66,7 +66,7 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     assert 1 <= found.held <= found.attempts <= 12 and found.success
     motion = found.motion
     assert motion.constraints == ("heading", "affordance") and motion.about["attempts"] == found.attempts
-    assert len(motion.time) == steps and motion.table.sum() == steps - 26  # the table goes with the approach's last step
+    assert len(motion.time) == steps and motion.table.sum() == steps - 26  # gone with its last step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     np.testing.assert_array_equal(motion.surface_minus, minus[:256])
     # The hand came along the block's own z axis: from its start to its end the wrist moved mostly that way.
