@@ -5,7 +5,6 @@ compiled halves (`actors.rollout`); `step` puts them together for those that it 
 """
 
 import dataclasses
-import itertools
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ from congrasp.common.task import metrics, privileged, sensing
 from congrasp.common.task.constraints import blocks
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.control import decode, track_load, wrist_load
-from congrasp.common.task.features import features
+from congrasp.common.task.features import Features, features
 from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
 from congrasp.common.task.reward import reward_terms, terms
 from congrasp.common.task.sensing import Readings, Tracker
@@ -44,14 +43,28 @@ class Settings(NamedTuple):
     """(N,) kg, of the engine's objects, where the critic's privileged inputs are recorded."""
 
 
+class View(NamedTuple):
+    """One control step and the geometry that the task's terms share."""
+
+    state: SceneState
+    features: Features
+
+
+class Views(NamedTuple):
+    """A control step as it is, and as the policy sees it."""
+
+    true: View
+    sensed: View | None
+    """What the sensors show; None where the policy sees the truth."""
+
+
 class EnvState(NamedTuple):
     """A batch of B environments between two control steps."""
 
     physics: Any
     """The engine's state; None where the engine keeps it in place."""
-    scene: tuple[Any, ...]
-    """`SceneState` and `Features` after the step, and as the policy sees them where that differs; empty inside of a
-    loop around an engine that is not compiled."""
+    views: Views | None
+    """The scene after the step; None inside of a loop around an engine that is not compiled."""
     reset_state: ResetState
     """What the present episodes started from."""
     goal: Goal
@@ -135,7 +148,7 @@ class GraspEnv:
         sums = {**metrics.empty_sums(self.task, batch), **dict.fromkeys(("return", *FORCES), zero)}
         state = EnvState(
             physics=physics if self.physics.compiled else None,
-            scene=(),
+            views=None,
             reset_state=reset_state,
             goal=initial.goal,
             surface=initial.surface,
@@ -165,10 +178,10 @@ class GraspEnv:
     def merge(self, state: EnvState, mask: Array, fresh: EnvState) -> EnvState:
         """`fresh` in the masked environments (B,), but for what is not of the episode; its engine is merged already."""
         kept: dict[str, Any] = {name: getattr(state, name) for name in ("grasps", "finished", "has_finished")}
-        scene = where_environments(mask, fresh.scene, state.scene) if self.physics.compiled else ()
-        apart: dict[str, Any] = {"physics": None, "scene": ()}
+        views = where_environments(mask, fresh.views, state.views) if self.physics.compiled else None
+        apart: dict[str, Any] = {"physics": None, "views": None}
         merged = where_environments(mask, fresh._replace(**kept, **apart), state._replace(**apart))
-        return merged._replace(physics=fresh.physics, scene=scene)
+        return merged._replace(physics=fresh.physics, views=views)
 
     def step(self, state: EnvState, action: Array, settings: Settings | None = None) -> tuple[EnvState, Transition]:
         """One control step of an engine that can be traced; episodes that ended stay in place.
@@ -285,23 +298,27 @@ class GraspEnv:
             time=state.time.astype(jnp.float32),
             table=self.table_present(state),
         )
-        scenes = [scene]
+        sensed = None
         if state.tracker is not None and state.readings is not None:
             first = state.tracker.first
             begun = scene._replace(object_position_initial=first[:, :3], object_quaternion_initial=first[:, 3:])
-            scenes.append(sensing.seen_by(self.task, begun, state.readings))
-        found = [(each, features(self.hand, self.task, each, state.surface, state.goal)) for each in scenes]
-        return state._replace(scene=tuple(itertools.chain(*found)))
+            sensed = self._view(state, sensing.seen_by(self.task, begun, state.readings))
+        return state._replace(views=Views(self._view(state, scene), sensed))
+
+    def _view(self, state: EnvState, scene: SceneState) -> View:
+        """A control step with its features."""
+        return View(scene, features(self.hand, self.task, scene, state.surface, state.goal))
 
     def scene_of(self, state: EnvState) -> Scene:
         """The present control step as the task's terms see it."""
-        scene, features, *_ = state.scene
-        return Scene(self.hand, self.task, scene, features, state.goal)
+        assert state.views is not None, "`with_scene` comes first"
+        return Scene(self.hand, self.task, *state.views.true, state.goal)
 
     def seen(self, state: EnvState) -> Scene:
         """The present control step as the policy sees it."""
-        *_, scene, features = state.scene
-        return Scene(self.hand, self.task, scene, features, state.goal, state.readings)
+        assert state.views is not None, "`with_scene` comes first"
+        view = state.views.sensed or state.views.true
+        return Scene(self.hand, self.task, *view, state.goal, state.readings)
 
     def privileged(self, state: EnvState) -> Scene:
         """The present control step as a policy sees it that sees all."""

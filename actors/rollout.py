@@ -18,6 +18,7 @@ from congrasp.actors.env import EnvState, GraspEnv, Settings, Transition, episod
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics.engine import Physics, PhysicsState
+from congrasp.actors.stress import Frame
 from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
@@ -212,7 +213,7 @@ class RolloutWorker:
         else:
             self.physics.reset(None, np.ones(self.batch, bool), conditions.reset_state)
         state = self._begin_jit(conditions, None)
-        self.state = self._with_scene_jit(state._replace(scene=()), self.physics.read(None))
+        self.state = self._with_scene_jit(state._replace(views=None), self.physics.read(None))
         if kept is not None:
             self.state = self.state._replace(grasps=kept.grasps)
 
@@ -300,8 +301,9 @@ class RolloutWorker:
 
     def _kept(self, state: EnvState, action: Array, transition: Transition, settings: Settings) -> tuple[Trace, Any]:
         """What trace and probe keep of a step."""
-        probed = self._probe(self.env.scene_of(state), state.reset_state.object_index, settings.probe_data)
-        return _traced(state, action, transition, self._task, self._traced), probed
+        scene = self.env.scene_of(state)
+        probed = self._probe(scene, state.reset_state.object_index, settings.probe_data)
+        return _traced(scene, state.frame, action, transition, self._traced), probed
 
     def _advance(
         self,
@@ -321,7 +323,7 @@ class RolloutWorker:
         kept = self._kept(after, decision.action, transition, settings)
         following = self._decide(parameters, settings, after, jax.random.wrap_key_data(keys[step]))
         changed = {name: new for name, new in after._asdict().items() if new is not getattr(state, name)}
-        changed.pop("scene")
+        changed.pop("views")
         return changed, transition, kept, following
 
     def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
@@ -332,7 +334,7 @@ class RolloutWorker:
         parameters, settings = _on_device((parameters, self._settings))
         assert self.state is not None
         decision = self._decide_jit(parameters, settings, self.state, keys[0])
-        state = self.state._replace(scene=())
+        state = self.state._replace(views=None)
         rows: list[dict[str, Any]] = []
         extras = []
         for step in range(1, steps + 1):
@@ -443,28 +445,28 @@ _split = jax.jit(lambda key: tuple(jax.random.split(key)))
 """Two random keys, in one call."""
 
 
-def _traced(state: EnvState, action: Array, transition: Transition, task: TaskConfig, where: int | slice) -> Trace:
+def _traced(scene: Scene, frame: Frame, action: Array, transition: Transition, where: int | slice) -> Trace:
     """What is kept of a step of one environment, or of several."""
-    scene, features, *_ = state.scene
-    force = jnp.sum(jnp.where(scene.contact_found[where][..., None], scene.contact_force[where], 0.0), -2)
+    state, features = scene.state, scene.features
+    force = jnp.sum(jnp.where(state.contact_found[where][..., None], state.contact_force[where], 0.0), -2)
     errors = [
-        a[where] / jnp.maximum(b[where], 1.0) for a, b in (transition.errors[s.name] for s in metrics.specs(task))
+        a[where] / jnp.maximum(b[where], 1.0) for a, b in (transition.errors[s.name] for s in metrics.specs(scene.task))
     ]
-    way, slid = protocols.up(state.frame.height), protocols.slides(scene.base_quaternion, state.frame.height)
+    way, slid = protocols.up(frame.height), protocols.slides(state.base_quaternion, frame.height)
     return Trace(
-        q=scene.q[where],
-        u=(scene.u + slid)[where],
-        q_target=scene.q_target[where],
-        u_target=(scene.u_target + slid)[where],
+        q=state.q[where],
+        u=(state.u + slid)[where],
+        q_target=state.q_target[where],
+        u_target=(state.u_target + slid)[where],
         wrist_position=(features.wrist_position + way)[where],
         wrist_quaternion=features.wrist_quaternion[where],
-        object_position=(scene.object_position + way)[where],
-        object_quaternion=scene.object_quaternion[where],
+        object_position=(state.object_position + way)[where],
+        object_quaternion=state.object_quaternion[where],
         contact_force=force,
         action=action[where],
         terms=transition.terms[where],
         errors=jnp.stack(errors, -1),
-        table=scene.table[where],
+        table=state.table[where],
         terminal=transition.terminal[where],
     )
 

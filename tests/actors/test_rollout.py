@@ -131,7 +131,7 @@ def _other_objects_take_the_place_of_the_first_ones(worker):
         assert np.abs(others[i].rest_poses[:, 2] - height).min() < 1e-5
     worker.collect(None, 3)
     # Each lies where it was put: a wrong shape would fall, or be thrown up by the table.
-    np.testing.assert_allclose(np.asarray(worker.state.scene[0].object_position)[:, 2], heights, atol=2e-3)
+    np.testing.assert_allclose(np.asarray(worker.state.views.true.state.object_position)[:, 2], heights, atol=2e-3)
 
 
 def test_success_needs_the_object_to_stay_up(bank):
@@ -160,7 +160,7 @@ def _begun(physics, task, conditions):
 def _advance(env, targets):
     """A control step of which the engine's part is given."""
     step = jax.jit(lambda state, after: env.advance(state, targets, after, env.settings))
-    return lambda state, after: step(state._replace(scene=()), after)
+    return lambda state, after: step(state._replace(views=None), after)
 
 
 def test_a_lifted_object_that_stays_is_a_success(bank):

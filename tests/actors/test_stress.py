@@ -185,7 +185,7 @@ def lifted(action: np.ndarray, protocol: Protocol | None, steps: int):
         target, command = decide(state)
         _, after = physics.step(None, *command)
         state, _ = advance(state, target, after)
-        seen.append((state.scene[0], state.scene[1], state.frame, after))
+        seen.append((*state.views.true, state.frame, after))
     physics.close()
     return seen
 
