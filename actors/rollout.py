@@ -168,6 +168,8 @@ class RolloutWorker:
         self._decide_jit = jax.jit(self._decide)
         self._advance_jit = jax.jit(self._advance)
         self._merge_jit = jax.jit(self._merge)
+        self._restart_jit = jax.jit(self.env.restart)
+        self._look_jit = jax.jit(self._look)
         self._with_scene_jit = jax.jit(self.env.with_scene)
         self._scan_jit = jax.jit(self._scan, static_argnames="steps")
         self.state: EnvState | None = None
@@ -216,6 +218,21 @@ class RolloutWorker:
         self.state = self._with_scene_jit(state._replace(views=None), self.physics.read(None))
         if kept is not None:
             self.state = self.state._replace(grasps=kept.grasps)
+
+    def renew(self, mask: np.ndarray, conditions: InitialConditions) -> None:
+        """Goes on with these episodes, which are about to begin, in the masked environments (B,)."""
+        assert self.state is not None, "no episode was begun"
+        conditions = _on_device(conditions)
+        if self.physics.compiled:
+            self.state = self._restart_jit(self.state, mask, conditions)
+            return
+        self.physics.reset(None, mask, conditions.reset_state)
+        state = self._merge_jit(self.state._replace(views=None), mask, conditions)
+        self.state = self._with_scene_jit(state, self.physics.read(None))
+
+    def observe(self) -> Array:
+        """(B, D) what a policy sees of the present control step."""
+        return self._look_jit(self.state, self._settings).observation
 
     def compile(self, parameters: Any, steps: int) -> None:
         """Compiles what `collect` and `renew_references` run, all at once, and runs nothing; for compiled engines.

@@ -22,6 +22,24 @@ class CongraspError(Exception):
         super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}")
 
 
+_EXTRAS = {
+    **dict.fromkeys(("foxglove", "imageio_ffmpeg", "jinja2", "matplotlib"), "viz"),
+    **dict.fromkeys(("bvhio", "mcap_ros2", "onnx", "onnxruntime", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
+    "gymnasium": "gym",
+    "wandb": "wandb",
+    "warp": "cuda",
+}
+
+
+class MissingPackageError(CongraspError):
+    """A package is absent that comes with one of the extras."""
+
+    def __init__(self, what: str, package: str):
+        """Args: what needs it, and its import name."""
+        extra = _EXTRAS.get(package, "train")
+        super().__init__(f"{what} needs the package '{package}'.", f"Run: pip install 'congrasp[{extra}]'")
+
+
 class TooWideError(CongraspError):
     """The object is wider, wherever it can be approached, than the hand opens."""
 

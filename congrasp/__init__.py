@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from congrasp.services.client.ticker import Ticker
     from congrasp.services.export.motion_file import GraspMotion, load_motion, save_motion
     from congrasp.services.grasp.grasper import Grasp, Grasper, grasp
+    from congrasp.services.gym.vector_env import make_vec
     from congrasp.services.serve.local import load_policy
 
 __all__ = [
@@ -61,6 +62,7 @@ __all__ = [
     "grasp",
     "load_motion",
     "load_policy",
+    "make_vec",
     "save_motion",
 ]
 
@@ -80,6 +82,7 @@ _MODULES = {
     "grasp": "congrasp.services.grasp.grasper",
     "load_motion": "congrasp.services.export.motion_file",
     "load_policy": "congrasp.services.serve.local",
+    "make_vec": "congrasp.services.gym.vector_env",
     "save_motion": "congrasp.services.export.motion_file",
 }
 """Where each name is defined; the others are errors."""
@@ -89,7 +92,15 @@ def __getattr__(name: str) -> Any:
     """A public name, imported (PEP 562)."""
     if name not in __all__:
         raise AttributeError(f"module 'congrasp' has no attribute '{name}'")
-    globals()[name] = found = getattr(importlib.import_module(_MODULES.get(name, "congrasp.common.errors")), name)
+    errors = importlib.import_module("congrasp.common.errors")
+    try:
+        module = importlib.import_module(_MODULES.get(name, errors.__name__))
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package == "congrasp":
+            raise
+        raise errors.MissingPackageError(f"congrasp.{name}", package) from None
+    globals()[name] = found = getattr(module, name)
     return found
 
 

@@ -44,6 +44,20 @@ def _quickly_compiled_kernels():
 
 
 @pytest.fixture(scope="session")
+def paper_policy(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """File of a human policy that knows the paper's four constraints and has learnt nothing."""
+    from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+    from congrasp.common.policy import bundle
+    from congrasp.common.task.constraints import PAPER
+    from congrasp.services.train.command import untrained
+
+    file = tmp_path_factory.mktemp("policies") / "paper.safetensors"
+    network = NetworkConfig(hidden=(16,), encoder=4)
+    bundle.save(untrained(RunConfig(task=TaskConfig(constraints=PAPER), network=network)), file)
+    return file
+
+
+@pytest.fixture(scope="session")
 def shared_objects() -> pathlib.Path:
     """Folder of the 24 scanned objects, which lies beside the repository where it is present."""
     folder = ROOT.parent / "shared" / "objects"

@@ -54,7 +54,7 @@ def test_the_client_and_its_errors_need_numpy_and_zenoh_alone():
     assert done.stdout.startswith("The request lacks 'surface' and 'q' and 'wrist' and 'object_pose'.")
 
 
-def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch):
+def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_policy):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     mesh = tmp_path / "block.stl"
     trimesh.creation.box((0.05, 0.06, 0.14)).export(mesh)
@@ -64,4 +64,4 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch):
     congrasp.save_motion(str(tmp_path / "block.npz"), found.motion)
     assert congrasp.load_motion(str(tmp_path / "block.npz")).object == "block"
     with pytest.raises(congrasp.UnknownConstraintError, match="does not know the constraint 'fingers'"):
-        congrasp.grasp(mesh, fingers="thumb index", attempts=4)
+        congrasp.grasp(mesh, fingers="thumb index", attempts=4, policy=paper_policy)

@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.files import cache_folder
 from congrasp.services.ops.logs import log_error
 from congrasp.services.ops.shutdown import follow_parent, on_signal
@@ -61,12 +61,6 @@ _PATH = (
     errno.ELOOP,
     errno.EEXIST,
 )
-EXTRAS = {
-    **dict.fromkeys(("foxglove", "imageio_ffmpeg", "jinja2", "matplotlib"), "viz"),
-    **dict.fromkeys(("bvhio", "mcap_ros2", "onnx", "onnxruntime", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
-    "wandb": "wandb",
-    "warp": "cuda",
-}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -87,11 +81,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         code = _fail(_said_of(error), USAGE_ERROR, debug)
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] == "congrasp":
-            raise
         package = (error.name or "").partition(".")[0]
-        extra = EXTRAS.get(package, "train")
-        code = _fail(f"This needs the package '{package}'. Run: pip install 'congrasp[{extra}]'", USAGE_ERROR, debug)
+        if package == "congrasp":
+            raise
+        code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
     if code in SIGNALLED:  # no time for what an interpreter does at its end
         os._exit(code)

@@ -10,7 +10,7 @@ from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.task.sampling import kept as kept_banks
-from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.task.sampling.kept import kept_bank
 
 HAND = get_hand("human")
@@ -33,7 +33,7 @@ class Builder:
     def __call__(self) -> ConstraintBank:
         self.built += 1
         rng = np.random.default_rng(self.built)
-        fields = {name: rng.normal(size=(2, 3)).astype(np.float32) for name in ConstraintBank._fields}
+        fields = {name: rng.normal(size=(2, 3)).astype(np.float32) for name in SHARED}
         fields["avoid"] = rng.random((2, 3)) > 0.5
         return ConstraintBank(**fields)
 
@@ -43,7 +43,7 @@ def test_a_bank_is_built_once_and_found_again_as_it_was():
     first = kept_bank(HAND, TASK, OBJECTS, 0, build)
     again = kept_bank(HAND, TASK, OBJECTS, 0, build)
     assert build.built == 1
-    for a, b in zip(first, again, strict=True):
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         assert isinstance(b, jax.Array) and a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
 

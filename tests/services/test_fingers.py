@@ -65,12 +65,15 @@ def query() -> dict[str, np.ndarray]:
 
 
 def test_the_command_refuses_it_in_one_line(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    paper_policy: pathlib.Path,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
-    options = ["--out", str(tmp_path / "out"), "--no-pictures", "--fingers", "thumb", "index"]
-    assert load("grasp")([str(tmp_path / "block.stl"), *options])() == 2
+    options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures"]
+    assert load("grasp")([str(tmp_path / "block.stl"), *options, "--fingers", "thumb", "index"])() == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
     assert line.startswith("congrasp: error: The policy does not know the constraint 'fingers'. It knows heading, ")
     assert not (tmp_path / "out" / "block" / RESULT).exists()

@@ -39,10 +39,11 @@ def policy() -> PolicyBundle:
 
 
 @pytest.mark.parametrize("option", [["--force", "3"], ["--gentle"]])
-def test_a_policy_that_does_not_know_it_says_so(tmp_path: pathlib.Path, monkeypatch, capsys, option) -> None:
+def test_a_policy_that_does_not_know_it_says_so(paper_policy, tmp_path: pathlib.Path, monkeypatch, capsys, option):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
-    assert load("grasp")([str(tmp_path / "block.stl"), "--out", str(tmp_path / "out"), "--no-pictures", *option])() == 2
+    options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures", *option]
+    assert load("grasp")([str(tmp_path / "block.stl"), *options])() == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
     assert line.startswith("congrasp: error: The policy does not know the constraint 'force'. It knows heading, ")
 
