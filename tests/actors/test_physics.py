@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import psutil
 import pytest
@@ -121,6 +122,22 @@ def test_a_stationary_object_stays_when_pushed(env):
     assert touched.any()
     np.testing.assert_allclose(after.object_position, env.reset_state.object_position, atol=4e-3)
     physics.close()
+
+
+def test_a_scaled_mass_is_the_mass_of_a_heavier_object(env):
+    """Its inertia and the weights of its constraints change with it."""
+    heavy = [dataclasses.replace(obj, mass=3 * obj.mass, inertia=3 * obj.inertia) for obj in OBJECTS]
+    scaled, compiled = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, heavy, 1)
+    scaled.start(env.reset_state._replace(mass_scale=np.full(ENVIRONMENTS, 3.0)))
+    compiled.start(env.reset_state._replace(mass_scale=np.ones(ENVIRONMENTS)))
+    names = {name for name in dir(mujoco.MjModel) if name.startswith(("body_", "dof_"))} - {"dof_M0"}  # the compiler's
+    for ours, theirs in zip(scaled.instances, compiled.instances, strict=True):
+        for name in names:
+            if isinstance(value := getattr(ours.model, name), np.ndarray):
+                world = name.startswith("body_")  # nothing depends on the mass of everything together
+                np.testing.assert_allclose(value[world:], getattr(theirs.model, name)[world:], 1e-5, 1e-9, err_msg=name)
+    scaled.close()
+    compiled.close()
 
 
 def test_contact_force_is_that_of_the_object_on_the_link(env):
