@@ -13,9 +13,9 @@ import psutil
 import pytest
 
 from congrasp.common.policy import bundle as bundles
-from congrasp.services.bench.second_reading import read_again
 from congrasp.services.ops.audit import audit
 from congrasp.services.record.reader import read_episodes, read_metrics, read_rollouts
+from tests.benchmarks.second_reading import read_again
 
 pytestmark = pytest.mark.timeout(600)
 UPDATES = 40
