@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.mano import ManoModel
 from congrasp.common.io.inputs import file_name, read_file
-from congrasp.common.io.pickles import read_pickle
+from congrasp.common.io.pickles import MAX_BYTES, read_pickles
 from congrasp.services.assets.captures import mano
 from congrasp.services.assets.captures.objects import Meshes
 from congrasp.services.assets.captures.sequence import Dropped, Part, Sequence, read_or_drop
@@ -86,7 +86,10 @@ def _sequence(
     object_id = name.split("_")[0]
     object_name = names.get(object_id, object_id)
     mesh = meshes.find(name, object_id if meshes.has(object_id) else object_name)
-    rows = [_frame(name, folder / f"{file_name(stem, 'a frame')}.pkl") for _, stem in frames]
+    files = [folder / f"{file_name(stem, 'a frame')}.pkl" for _, stem in frames]
+    there = [file for file in files if file.is_file()]
+    contents = dict(zip(there, read_pickles((str(file), read_file(file, MAX_BYTES)) for file in there), strict=True))
+    rows = [_frame(name, file, contents[file]) if file in contents else None for file in files]
     known = next((row for row in rows if row is not None), None)
     if known is None:
         raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
@@ -113,28 +116,25 @@ def _sequence(
     )
 
 
-def _frame(name: str, file: pathlib.Path) -> tuple[np.ndarray, ...] | None:
-    """Hand pose (16, 4), shape (10,), wrist (3,) and object pose (4, 4); nothing where the frame is missing."""
-    if not file.is_file():
-        return None
-    content = read_pickle(file, mixed=True)
+def _frame(name: str, file: pathlib.Path, content: dict[str, np.ndarray]) -> tuple[np.ndarray, ...] | None:
+    """Hand pose (16, 4), shape (10,), wrist (3,) and object pose (4, 4); None if there is no hand or object."""
+    known = {key.partition("/")[0] for key in content}
     for key in ("hand_anno", "obj_anno"):
-        if not isinstance(content, dict) or key not in content:
+        if key not in known:
             raise Dropped(name, "wrong layout", f"{file.name} has no '{key}'")
-    hand = content["hand_anno"]
-    if hand is None or content["obj_anno"] is None:
-        return None
-    values = []
-    for key, shape in (("hand_pose", (16, 4)), ("hand_shape", (10,)), ("hand_tsl", (3,))):
-        if key not in hand:
-            raise Dropped(name, "wrong layout", f"{file.name} has no 'hand_anno/{key}'")
-        values.append(_shaped(name, file, key, hand[key], shape))
-    return (*values, _shaped(name, file, "obj_anno", content["obj_anno"], (4, 4)))
+        if key in content and not content[key].size:
+            return None
+    shapes = {"hand_anno/hand_pose": (16, 4), "hand_anno/hand_shape": (10,), "hand_anno/hand_tsl": (3,)}
+    return tuple(_shaped(name, file, key, content, shape) for key, shape in (shapes | {"obj_anno": (4, 4)}).items())
 
 
-def _shaped(name: str, file: pathlib.Path, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _shaped(
+    name: str, file: pathlib.Path, key: str, content: dict[str, np.ndarray], shape: tuple[int, ...]
+) -> np.ndarray:
     """An array of this shape."""
-    array = np.asarray(value, float)
+    if key not in content:
+        raise Dropped(name, "wrong layout", f"{file.name} has no '{key}'")
+    array = content[key].astype(float)
     if array.size != np.prod(shape):
         raise Dropped(name, "wrong layout", f"'{key}' of {file.name} has the shape {array.shape}, not {shape}")
     return array.reshape(shape)
