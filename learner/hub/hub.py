@@ -100,8 +100,7 @@ class LearnerHub:
         self._last_event: dict[str, float] = {}
         self._finished = self._closed = False
         self._audit, self._log = audit, log
-        self._rate_limit = RateLimit()
-        self._pull_limit = RateLimit(per_second=_PIECES, most=4 * _PIECES)
+        self._rate_limit, self._pull_limit = RateLimit(), RateLimit(per_second=_PIECES, most=4 * _PIECES)
         if durable is not None:
             self._restore(durable)
         self._recovered: Recovered | None = self._begin()
