@@ -9,7 +9,6 @@ sorted. An object's mesh is centred on its bounding box before the annotated pos
 
 import collections
 import functools
-import json
 import pathlib
 from collections.abc import Iterator
 from typing import Any
@@ -19,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.mano import ManoModel
-from congrasp.common.io.inputs import file_name, read_file
+from congrasp.common.io.inputs import file_name, read_file, read_json
 from congrasp.common.io.pickles import MAX_BYTES, read_pickles
 from congrasp.services.assets.captures import mano
 from congrasp.services.assets.captures.objects import Meshes
@@ -28,6 +27,7 @@ from congrasp.services.assets.objects.sources import read_mesh
 
 HOLDS = "anno/seq_all.json"
 _LARGEST_JSON = 256 << 20
+_REMEDY = "Get the file again."
 _Frames = list[tuple[int, str]]
 
 
@@ -43,7 +43,7 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
         raise CongraspError(f"There is no {index}.", "Name the folder that holds OakInk-Image's 'anno'.")
     found = meshes.beside(root / "obj", path / "obj")
     names = _names(path)
-    for (name, _), frames in sorted(_sequences(_json(index)).items()):
+    for (name, _), frames in sorted(_sequences(read_json(index, _LARGEST_JSON, _REMEDY)).items()):
         folder = root / "anno" / "general_info"
         yield read_or_drop(name, _sequence, name, frames, folder, found, model, names, path)
 
@@ -57,19 +57,11 @@ def _sequences(rows: list[list[Any]]) -> dict[tuple[str, int], _Frames]:
     return {key: sorted(of_camera[min(of_camera)]) for key, of_camera in cameras.items()}
 
 
-def _json(path: pathlib.Path) -> Any:
-    """What a JSON file says."""
-    try:
-        return json.loads(read_file(path, _LARGEST_JSON))
-    except (ValueError, RecursionError):
-        raise CongraspError(f"{path} is not JSON.", "Get the file again.") from None
-
-
 def _names(path: pathlib.Path) -> dict[str, str]:
     """Objects' names by their ids."""
     names: dict[str, str] = {}
     for file in sorted(path.glob("**/metaV2/*object_id.json")):
-        names |= {key: str(value.get("name", key)) for key, value in _json(file).items()}
+        names |= {key: str(value.get("name", key)) for key, value in read_json(file, _LARGEST_JSON, _REMEDY).items()}
     return names
 
 
@@ -155,6 +147,6 @@ def _parts(root: pathlib.Path, *names: str) -> tuple[Part, ...]:
     parts = []
     for file in sorted(folder.glob("part_*.ply")):
         labels = file.with_suffix(".json")
-        label = _json(labels).get("name", file.stem) if labels.is_file() else file.stem
+        label = read_json(labels, _LARGEST_JSON, _REMEDY).get("name", file.stem) if labels.is_file() else file.stem
         parts.append(Part(str(label), mano.read_vertices(file)))
     return tuple(parts) if len(parts) > 1 else ()
