@@ -174,9 +174,7 @@ def _marker(make: _Messages, motion: GraspMotion) -> Any:
         id=0,
         type=11,  # a list of triangles
         action=0,
-        pose=make(
-            "geometry_msgs/Pose", position=make.vector(np.zeros(3), "Point"), orientation=make.quaternion((0, 0, 0, 1))
-        ),
+        pose=make("geometry_msgs/Pose", position=make.vector(np.zeros(3), "Point"), orientation=upright),
         scale=make.vector(np.ones(3)),
         color=make("std_msgs/ColorRGBA", **dict(zip("rgba", (*COLOURS[OBJECT], 1.0), strict=True))),
         lifetime=make.duration(0),
