@@ -44,6 +44,7 @@ from congrasp.learner.run_directory import (
     CONFIG_FILE,
     INITIAL_FILE,
     POLICY_FILE,
+    exclusive,
     keep_policy,
     note_version,
     open_run,
@@ -97,15 +98,18 @@ def run_learner(
       on_event: given what is worth a line.
 
     Raises:
-      CongraspError: the directory is not a run's; the checkpoint does not fit; the disk is full; a thread of this
-        process died; training collapsed; another rank ended the run.
+      CongraspError: the directory is not a run's, or in use; the checkpoint does not fit; the disk is full; a thread
+        of this process died; training collapsed; another rank ended the run.
       PhysicsError: batch after batch, a value was not finite; state and last batch are in `failure/`.
     """
     ranks = ranks or Ranks()
     try:
-        if ranks.rank == 0:
-            open_run(run_dir)
-        with _watch_threads() as deaths, recorder or contextlib.nullcontext():
+        with contextlib.ExitStack() as stack:
+            if ranks.rank == 0:
+                open_run(run_dir)
+                stack.enter_context(exclusive(run_dir, functools.partial(on_event, "warning")))
+            deaths = stack.enter_context(_watch_threads())
+            stack.enter_context(recorder or contextlib.nullcontext())
             learner = _Learner(run_dir, config, transport, ranks, resume, audit, on_event)
             try:
                 learner.train(stop_event, deaths, on_update)

@@ -3,13 +3,16 @@
 It holds `config.json`, `initial.safetensors` where training does not begin with random weights, `checkpoints/`,
 `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `accepted/`
 (rollouts that no checkpoint holds yet), `version` (the newest version that was ever published, so that versions rise
-over a crash, too), `endpoint` (where its learner listens, while it runs) and, after an update that was not finite,
+over a crash, too), `endpoint` (where its learner listens, while it runs), `lock`
+(held by the process of its learner) and, after an update that was not finite,
 `failure/`.
 What a resume could not read, or does not go on from, is kept beside it as `*.aside`.
 """
 
 import contextlib
 import dataclasses
+import errno
+import fcntl
 import os
 import pathlib
 from collections.abc import Callable, Iterator
@@ -30,6 +33,7 @@ LOGS = "logs"
 CHECKPOINTS = "checkpoints"
 _VERSION_FILE = "version"
 _ENDPOINT_FILE = "endpoint"
+_LOCK_FILE = "lock"
 _MAX_VERSION = 1 << 53
 _MAX_CONFIG = 1 << 20
 _MAX_ENDPOINT = 1 << 10
@@ -83,6 +87,38 @@ def open_run(run_dir: pathlib.Path) -> RunConfig:
 
 
 @contextlib.contextmanager
+def exclusive(run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text: None) -> Iterator[None]:
+    """Keeps other processes out of a run directory while the block runs; a process that dies gives it up.
+
+    Args:
+      run_dir: the run's directory.
+      notify: told where the file system has no locks.
+
+    Raises:
+      CongraspError: another process has it.
+    """
+    # A lock by `lockf` is the process's own: forked children do not inherit it.
+    with open(run_dir / _LOCK_FILE, "a+b", 0) as file:
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):
+                file.seek(0)
+                holder = f"process {file.read(32).decode(errors='replace')}"
+                url = learner_url(run_dir)
+                raise CongraspError(
+                    f"{run_dir} is in use by {holder}{f', which listens at {url}' if url else ''}.",
+                    "Stop it first, or choose another --run-dir.",
+                ) from None
+            notify(f"{run_dir} is on a file system without locks: a second learner would go unnoticed.")
+        else:
+            with contextlib.suppress(OSError):  # a disk that is full costs the number in another's error and no more
+                file.truncate(0)
+                file.write(f"{os.getpid()}".encode())
+        yield
+
+
+@contextlib.contextmanager
 def listening(run_dir: pathlib.Path, url: str) -> Iterator[None]:
     """Keeps in a run directory where its learner listens, while the block runs; a killed learner's stays."""
     path = run_dir / _ENDPOINT_FILE
@@ -133,7 +169,7 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
       config: that of `open_run`, with what is to be different from now on.
 
     Raises:
-      CongraspError: something differs that must not, or this is no run directory.
+      CongraspError: something differs that must not, this is no run directory, or a learner works in it.
     """
     before = open_run(run_dir)
     for field in dataclasses.fields(config):
@@ -142,8 +178,9 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
                 f"A run goes on with the '{field.name}' that it began with.",
                 f"Begin another run with --initial {run_dir / POLICY_FILE}.",
             )
-    if config != before:
-        write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
+    with exclusive(run_dir):
+        if config != before:
+            write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
 
 
 def note_version(run_dir: pathlib.Path, version: int) -> None:

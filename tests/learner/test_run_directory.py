@@ -1,6 +1,10 @@
 """A run goes on with the configuration that it began with, but for what the learner alone uses."""
 
 import dataclasses
+import os
+import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -9,7 +13,9 @@ from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.run_directory import (
     continue_run,
     create_run,
+    exclusive,
     has_checkpoints,
+    listening,
     note_version,
     open_run,
     published_version,
@@ -109,3 +115,22 @@ def test_versions_go_on_from_the_journals_where_the_version_file_is_damaged(run,
     assert published_version(folder) == 3
     log.used(21, [], [])
     assert published_version(folder) == 22
+
+
+def test_one_learner_at_a_time_until_it_dies(run):
+    folder, config = run
+    script = (
+        "import pathlib, sys, time; from congrasp.learner.run_directory import exclusive\n"
+        "with exclusive(pathlib.Path(sys.argv[1])): print('mine', flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script, str(folder)], stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"mine\n"
+        with listening(folder, "tcp/127.0.0.1:7"), pytest.raises(CongraspError) as refused:
+            continue_run(folder, dataclasses.replace(config, updates=9))
+        said = f"in use by process {other.pid}, which listens at tcp/127.0.0.1:7. Stop it first"
+        assert said in str(refused.value) and open_run(folder) == config
+        other.kill()
+        assert other.wait() == -signal.SIGKILL
+    continue_run(folder, dataclasses.replace(config, updates=9))
+    with exclusive(folder):
+        assert (folder / "lock").read_text() == str(os.getpid())
