@@ -40,6 +40,10 @@ _UP = (0.0, 0.10, 0.20, 0.32)  # and upwards, m
 _TOLERANCE = 1e-3  # m
 
 
+class NoReachError(CongraspError):
+    """Every way to the grasp touches the object or the table."""
+
+
 class Reach(NamedTuple):
     """N poses of a hand, a control step apart; the next one is where the grasp begins."""
 
@@ -108,7 +112,7 @@ def plan_reach(
       speed: of the wrist at the end, along the heading, m/s.
 
     Raises:
-      CongraspError: every way that was tried touches the object or the table.
+      NoReachError: every way that was tried touches the object or the table.
     """
     x = np.linspace(0, 1, _CHECKED)
     checked = _minimum_jerk(x, 0.0)
@@ -125,7 +129,7 @@ def plan_reach(
         needed = np.where(far, CLEARANCE, np.minimum(CLEARANCE, end[:, None])) - _TOLERANCE
         if (found >= needed).all():
             return curve.at(np.arange(steps) / steps, steps * dt, speed)
-    raise CongraspError(
+    raise NoReachError(
         f"From beside the table no way leads to a grasp of '{obj.name}' without touching it or the table.",
         "Leave out --approach, or set another --heading.",
     )
