@@ -86,6 +86,11 @@ class ArmPlanner:
         """The arm's name."""
         return self._arm.name
 
+    @property
+    def side(self) -> float:
+        """The side of the object on which the base stands, rad from the world's x axis."""
+        return float(np.arctan2(self._base.position[1], self._base.position[0]))
+
     def plan(self, obj: GraspObject, motion: GraspMotion) -> ArmMotion:
         """The joints along a motion.
 

@@ -5,6 +5,7 @@ import dataclasses
 import mink
 import mujoco
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from congrasp.services.arm.robot import Infeasible, Robot
@@ -13,8 +14,9 @@ ACCELERATION = 60.0
 """rad/s^2 (m/s^2 of slides), the limit of every joint's acceleration."""
 POSITION, ANGLE = 0.005, float(np.radians(2.0))
 """m and rad by which the wrist may be off its path."""
-_STARTS, _TRACKED = 24, 8  # random postures to start from, distinct solutions that are followed
-_ITERATIONS = 100  # from each
+_STARTS, _TRACKED = 24, 5  # random postures to start from, distinct solutions that are followed
+_SMOOTHING = 0.02  # s, standard deviation of the filter that takes the tremor of contacts from the path
+_ITERATIONS = 80  # from each
 _POSTURE, _PULL = 2e-3, 0.02  # weight of the middle of the ranges against 1 m, share of the way to it in a step
 _SAME = 0.05  # rad between two postures, below which they count as one
 _AT_END = 2e-3  # rad from the end of a range
@@ -71,12 +73,24 @@ def follow(robot: Robot, path: Path, rng: np.random.Generator) -> Track:
     solver = _Solver(robot, path)
     starts = solver.starts(rng)
     furthest: tuple[int, str] = (-1, "")
-    for start in starts[:_TRACKED]:
+    for start in starts:
         steps, reason, track = solver.track(start)
         if track is not None:
             return track
         furthest = max(furthest, (steps, reason))
     raise Infeasible(furthest[1])
+
+
+def _smooth(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(T, 3) and (T, 4) the wrist's path without the tremor of contacts."""
+    quaternion = path.rotation.as_quat(scalar_first=True)
+    same = np.sum(quaternion[1:] * quaternion[:-1], -1) >= 0
+    quaternion[1:] *= np.cumprod(np.where(same, 1.0, -1.0))[:, None]
+    steps = _SMOOTHING / path.dt
+    position, turns = (
+        gaussian_filter1d(values, steps, axis=0, mode="nearest") for values in (path.position, quaternion)
+    )
+    return position, turns / np.linalg.norm(turns, axis=-1, keepdims=True)
 
 
 class _Solver:
@@ -85,6 +99,7 @@ class _Solver:
     def __init__(self, robot: Robot, path: Path):
         arm, model = robot.arm, robot.model
         self.robot, self.path = robot, path
+        self.target = _smooth(path)
         self.lower, self.upper = np.maximum(arm.lower, -_TURN), np.minimum(arm.upper, _TURN)
         self.wrist = mink.FrameTask(robot.palm, "body", position_cost=1.0, orientation_cost=0.3, lm_damping=1e-6)
         cost = np.zeros(model.nv)
@@ -111,9 +126,8 @@ class _Solver:
 
     def aim(self, t: int) -> None:
         """Makes the pose of step t the wrist's target."""
-        quaternion = self.path.rotation[t].as_quat(scalar_first=True)
-        turn = mink.SO3(quaternion)
-        self.wrist.set_target(mink.SE3.from_rotation_and_translation(turn, self.path.position[t]))
+        position, quaternion = self.target
+        self.wrist.set_target(mink.SE3.from_rotation_and_translation(mink.SO3(quaternion[t]), position[t]))
 
     def errors(self, t: int) -> tuple[float, float]:
         """m and rad of the wrist from step t of the path."""
@@ -142,6 +156,8 @@ class _Solver:
             elif all(np.abs(q - other).max() > _SAME for _, other in found):
                 room = np.minimum(q - arm.lower, arm.upper - q) / np.maximum(self.upper - self.lower, 1e-9)
                 found.append((float(room.min()), q))
+                if len(found) == _TRACKED:
+                    break
         if not found:
             raise Infeasible(nearest[1])
         return [q for _, q in sorted(found, key=lambda pair: -pair[0])]

@@ -314,9 +314,8 @@ class Grasper:
         turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
         first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
         heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(arrays["goal/heading_direction"])
-        return plan_reach(
-            self.hand, obj, rest, heading, first, self._approach, self.task.control_dt, self._attempts.speed
-        )
+        dt, speed, side = self.task.control_dt, self._attempts.speed, self._arm.side if self._arm else None
+        return plan_reach(self.hand, obj, rest, heading, first, self._approach, dt, speed, side)
 
 
 def grasp(

@@ -37,6 +37,7 @@ class AllArms:
 
     def __init__(self, planners):
         self._planners = planners
+        self.side = next(iter(planners.values())).side
         self.begin()
 
     def begin(self):
@@ -66,6 +67,7 @@ def main():
     parser.add_argument("--base", default=ArmOptions.base)
     parser.add_argument("--mount", default="")
     parser.add_argument("--attempts", type=int, default=16)
+    parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--approach", type=float, default=1.0)
     parser.add_argument("--lift", type=float, default=0.15)
     parser.add_argument("--out", type=pathlib.Path)
@@ -86,7 +88,9 @@ def main():
             for name in given.arms
         }
     )
-    grasper = Grasper(bundle, attempts=given.attempts, approach=given.approach, lift=given.lift, arm=arms)
+    grasper = Grasper(
+        bundle, attempts=given.attempts, rounds=given.rounds, approach=given.approach, lift=given.lift, arm=arms
+    )
     rows = {}
     for folder in sorted(path for path in given.objects.iterdir() if path.is_dir()):
         if given.names and folder.name not in given.names:
