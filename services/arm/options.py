@@ -10,7 +10,7 @@ class ArmOptions:
     arm: str = ""
     """Arm that carries the hand: an MJCF or URDF file, or a robot of MuJoCo Menagerie (panda, ur5e). Attempts that it
     cannot do are rejected."""
-    base: str = "-0.6 0 0 0"
+    base: str = "-0.7 0 0 0"
     """X Y Z YAW of the arm's base: metres from the object on the table, degrees."""
     flange: str = ""
     """Site or body of the arm that carries the hand; by default attachment_site, or the last body."""

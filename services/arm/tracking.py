@@ -129,12 +129,11 @@ class _Solver:
         position, quaternion = self.target
         self.wrist.set_target(mink.SE3.from_rotation_and_translation(mink.SO3(quaternion[t]), position[t]))
 
-    def errors(self, t: int) -> tuple[float, float]:
-        """m and rad of the wrist from step t of the path."""
+    def errors(self, position: np.ndarray, turn: Rotation) -> tuple[float, float]:
+        """m and rad of the wrist from a pose."""
         data = self.configuration.data
-        turn = Rotation.from_matrix(data.xmat[self.body].reshape(3, 3))
-        off = float(np.linalg.norm(data.xpos[self.body] - self.path.position[t]))
-        return off, float((turn.inv() * self.path.rotation[t]).magnitude())
+        now = Rotation.from_matrix(data.xmat[self.body].reshape(3, 3))
+        return float(np.linalg.norm(data.xpos[self.body] - position)), float((now.inv() * turn).magnitude())
 
     def starts(self, rng: np.random.Generator) -> list[np.ndarray]:
         """Distinct postures (N,) at the path's first pose that touch nothing, most room to the ends first.
@@ -175,7 +174,8 @@ class _Solver:
             settled = settled + 1 if np.abs(velocity).max() < 1e-2 else 0
             if settled > 3:
                 break
-        return self.configuration.q[self.robot.joints].copy(), self.errors(0)
+        position, turn = self.target[0][0], Rotation.from_quat(self.target[1][0], scalar_first=True)
+        return self.configuration.q[self.robot.joints].copy(), self.errors(position, turn)
 
     def track(self, start: np.ndarray) -> tuple[int, str, Track | None]:
         """Follows the path from a posture: steps that it could, the limit that ended them, the track if none did."""
@@ -196,9 +196,9 @@ class _Solver:
             )
             q[t] = q[t - 1] + path.dt * velocity[robot.joints]
             self.configuration.update(self.whole(q[t], t))
-            errors = self.errors(t)
+            errors = self.errors(path.position[t], path.rotation[t])
             if errors[0] > POSITION or errors[1] > ANGLE:
-                return t, self._ends(q[t]) or self._fast(velocity) or "the reach", None
+                return t, self._ends(q[t]) or self._fast(velocity) or self._slack(t), None
             if touching := self._collision(q[t], t):
                 return t, touching, None
             worst = np.maximum(worst, errors)
@@ -220,6 +220,11 @@ class _Solver:
         shares = np.abs(velocity[self.robot.joints]) / self.robot.arm.speed
         joint = int(shares.argmax())
         return f"the speed of {self.robot.arm.joints[joint]}" if shares[joint] > 0.99 else ""
+
+    def _slack(self, t: int) -> str:
+        """The path's acceleration where the arm is where it should be on the smooth path, else the reach."""
+        off = np.linalg.norm(self.configuration.data.xpos[self.body] - self.target[0][t])
+        return "the acceleration of the wrist" if off < POSITION / 2 else "the reach"
 
     def _collision(self, q: np.ndarray, t: int) -> str:
         """What touches what at step t, in words; empty where nothing does."""

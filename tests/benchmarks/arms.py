@@ -68,7 +68,7 @@ def main():
     parser.add_argument("--mount", default="")
     parser.add_argument("--attempts", type=int, default=16)
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--approach", type=float, default=1.0)
+    parser.add_argument("--approach", type=float, default=3.0)
     parser.add_argument("--lift", type=float, default=0.15)
     parser.add_argument("--out", type=pathlib.Path)
     given = parser.parse_args()
