@@ -121,7 +121,7 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
 
 def _above(model: mujoco.MjModel, body: int) -> list[int]:
     """Bodies from the base to this one."""
-    chain = []
+    chain: list[int] = []
     while body:
         chain.insert(0, body)
         body = int(model.body_parentid[body])

@@ -17,7 +17,6 @@ _HAND = "hand/"
 _TABLE, _OBJECT = "grasp_table", "grasp_object"
 _ARM_BIT, _SCENE_BIT, _HAND_BIT = 1, 2, 4
 _NEIGHBOURS = 3  # joints between two bodies, below which their housings may overlap
-_TILT = 0.0  # degrees
 
 
 class Infeasible(Exception):
@@ -83,8 +82,8 @@ def _scene_last(name: str) -> bool:
 
 
 def default_mount(hand: Hand) -> Pose:
-    """The fingers along the flange's z axis, tilted to the palm's side, and the palm's back end at the flange."""
-    turn = Rotation.from_euler("y", _TILT, degrees=True) * upright(hand)
+    """The fingers along the flange's z axis, the palm towards its x axis, and the palm's near end at the flange."""
+    turn = upright(hand)
     palm = hand.capsule_links == 0
     ends = turn.apply(hand.capsules[palm].reshape(-1, 3))[:, 2] - np.repeat(hand.capsule_radii[palm], 2)
     return Pose(np.array([0.0, 0.0, -float(ends.min())]), turn)
