@@ -45,8 +45,8 @@ bench:
 	$(MAKE) install EXTRA=bench
 	timeout 600 $(VENV)/bin/congrasp bench physics
 	timeout 300 $(VENV)/bin/congrasp bench query
-	timeout 300 $(VENV)/bin/congrasp bench transport --seconds 3 --repeats 2 --versions 20
-	timeout 600 $(VENV)/bin/congrasp bench measures --repeats 3
+	timeout 300 $(VENV)/bin/python -m tests.benchmarks transport --seconds 3 --repeats 2 --versions 20
+	timeout 600 $(VENV)/bin/python -m tests.benchmarks measures --repeats 3
 	timeout 900 $(VENV)/bin/congrasp bench startup --preset quickstart --deadline 400
 
 install: $(VENV)/.$(EXTRA)

@@ -1,6 +1,7 @@
 """The actor process: pulls weights, steps environments, uploads rollouts, until the run ends."""
 
 import functools
+import pathlib
 import threading
 import time
 import zlib
@@ -16,6 +17,7 @@ from congrasp.actors.followed import Followed, Follower
 from congrasp.actors.physics import make_physics
 from congrasp.actors.process.failure_weights import FailureWeights
 from congrasp.actors.process.link import ActorLink, RunFinished, RunRestarted, Ticket
+from congrasp.actors.process.own_references import save_references, with_kept_references
 from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
 from congrasp.actors.training_set import training_set
 from congrasp.common.config import RunConfig, run_config_from_json
@@ -33,6 +35,8 @@ from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, TAUGHT
 
 _TICKET_SECONDS = 1.0
 _FLUSH_SECONDS = 2.0
+_SAVE_SECONDS = 60.0
+"""Between two files of the references that the policy's grasps became."""
 
 
 def run_actor(
@@ -46,6 +50,7 @@ def run_actor(
     patience: float = 60.0,
     on_rollout: Callable[[dict[str, float]], None] = lambda values: None,
     journal: Journal | None = None,
+    references: pathlib.Path | None = None,
 ) -> None:
     """Acts for the learner of `run` until it ends or `stop` is set.
 
@@ -59,6 +64,7 @@ def run_actor(
       patience: seconds without a learner after which the actor gives up.
       on_rollout: given the metrics of every rollout, its version among them.
       journal: see `ActorLink`.
+      references: file by which a later start goes on with the reference poses that were the policy's own grasps.
 
     Raises:
       CongraspError: the learner is gone, or refuses this actor's rollouts.
@@ -68,7 +74,8 @@ def run_actor(
             try:
                 info = link.config(patience)
                 config = run_config_from_json(info.config)
-                _Actor(config, info.arrays, link, transport, physics or config.physics, threads, on_rollout).act(stop)
+                engine = physics or config.physics
+                _Actor(config, info.arrays, link, transport, engine, threads, on_rollout, references).act(stop)
                 link.flush(_FLUSH_SECONDS)
                 return
             except RunFinished:
@@ -98,6 +105,7 @@ class _Actor:
         physics: PhysicsName,
         threads: int,
         on_rollout: Callable[[dict[str, float]], None],
+        references: pathlib.Path | None,
     ):
         if unknown := set(arrays) - RECORDABLE.keys():
             raise CongraspError(
@@ -107,7 +115,11 @@ class _Actor:
         self._config, self._arrays, self._link, self._transport = config, arrays, link, transport
         self._hand = get_hand(config.task.hand)
         self._number = zlib.crc32(link.actor.encode())
+        self._references = references if config.task.own_references else None
+        self._saved = time.monotonic()
         self._objects, bank = training_set(self._hand, config, self._number)
+        if self._references:
+            bank = with_kept_references(self._references, bank)
         with stage("engine"):
             self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
         self._spec = policy_spec(config.task, config.network)
@@ -150,6 +162,8 @@ class _Actor:
                 self._rollout(self._bundle, ticket, _Since(asked, granted))
                 asked = time.monotonic()
         finally:
+            if self._references:
+                save_references(self._references, self._worker.bank)
             self._physics.close()
 
     def _failure_weights(self, bank: ConstraintBank) -> FailureWeights | None:
@@ -215,6 +229,9 @@ class _Actor:
         arrays = taken | episodes
         if config.task.own_references:
             self._worker.renew_references()
+            if self._references and time.monotonic() - self._saved > _SAVE_SECONDS:
+                save_references(self._references, self._worker.bank)
+                self._saved = time.monotonic()
         if self._failures is not None:
             self._failures.add(episodes["episode/object_index"], episodes["episode/held"])
             self._worker.weigh_objects(self._failures.weights)

@@ -77,18 +77,16 @@ class ManoModel:
 
 
 def read_mano(path: pathlib.Path) -> ManoModel:
-    """A MANO file, without unpickling it.
+    """A MANO file.
 
     Raises:
       CongraspError: it is not there, no MANO file, or that of a left hand.
     """
     content = read_pickle(path)
-    if not isinstance(content, dict):
-        raise CongraspError(f"{path} is no MANO file.", _REMEDY)
     arrays = []
     for name, shape in _SHAPES.items():
         array = content.get(name)
-        if not isinstance(array, np.ndarray) or array.shape != shape or not np.isfinite(array).all():
+        if array is None or array.dtype.kind not in "iuf" or array.shape != shape or not np.isfinite(array).all():
             raise CongraspError(f"{path} has no array '{name}' {shape} of finite numbers.", _REMEDY)
         arrays.append(array.astype(float))
     model = ManoModel(*arrays)

@@ -5,7 +5,6 @@ import math
 import pathlib
 import zipfile
 import zlib
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,8 @@ def read_npz(
     *,
     kind: str = "an NPZ file",
     largest: int = MAX_BYTES,
-    objects: Callable[[bytes, str], Any] | None = None,
+    most: int = MAX_ARRAYS,
+    pickled: bool = False,
 ) -> dict[str, Any]:
     """The arrays of a file by name: numbers, booleans and texts.
 
@@ -37,20 +37,18 @@ def read_npz(
       remedy: what to do, for an error's text.
       kind: what the file should be, for the same.
       largest: bytes that all arrays together may have.
-      objects: reads the pickle of an array of objects, (bytes, how errors call it) -> value; refused without.
+      most: arrays of the file.
+      pickled: arrays of objects are the bytes of their pickle; refused without.
 
     Raises:
-      CongraspError: it is no NPZ file, or damaged, or larger than that; nothing of it is unpickled.
+      CongraspError: it is no NPZ file, or damaged, or larger than that; this function unpickles nothing.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(read_file(path, largest, remedy))) as archive:
             members = archive.infolist()
-            _check_members(members, largest)
-            found = {}
-            for member in members:
-                name = member.filename.removesuffix(".npy")
-                found[name] = _array(archive.read(member), name, objects, f"{path}, '{name[:60]}'")
-            return found
+            _check_members(members, largest, most)
+            names = [member.filename.removesuffix(".npy") for member in members]
+            return {name: _array(archive.read(f"{name}.npy"), name, pickled) for name in names}
     except OSError as error:
         raise CongraspError(f"{path} cannot be read: {error.strerror or error}.", remedy) from None
     except _UNREADABLE as error:
@@ -60,10 +58,10 @@ def read_npz(
     raise CongraspError(f"{path} cannot be read: it is not {kind} ({why}).", remedy)
 
 
-def _check_members(members: list[zipfile.ZipInfo], largest: int) -> None:
+def _check_members(members: list[zipfile.ZipInfo], largest: int, most: int) -> None:
     """A ValueError where the members are none of an NPZ file, or too many or too large once they are inflated."""
-    if len(members) > MAX_ARRAYS:
-        raise ValueError(f"it has more than {MAX_ARRAYS} arrays")
+    if len(members) > most:
+        raise ValueError(f"it has more than {most} arrays")
     if sum(member.file_size for member in members) > largest:
         raise ValueError(f"its arrays have more than {largest >> 20} MB")
     for member in members:
@@ -73,15 +71,15 @@ def _check_members(members: list[zipfile.ZipInfo], largest: int) -> None:
         raise ValueError("it holds an array twice")
 
 
-def _array(data: bytes, name: str, objects: Callable[[bytes, str], Any] | None, source: str) -> Any:
+def _array(data: bytes, name: str, pickled: bool) -> Any:
     """One array of its bytes in NumPy's format."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = header(stream)
     rest = memoryview(data)[stream.tell() :]
-    if dtype.hasobject and objects is not None:
-        return objects(bytes(rest), source)
+    if dtype.hasobject and pickled:
+        return bytes(rest)
     if dtype.kind not in _KINDS:
         raise ValueError(f"'{name[:60]}' is of the type {str(dtype)[:40]}")
     if math.prod(shape) * dtype.itemsize != len(rest) or (not dtype.itemsize and math.prod(shape) > 1):

@@ -86,15 +86,12 @@ class ZenohTransport:
             raise CongraspError("A transport needs endpoints either to connect to or to listen on.")
         wanted = [secured(one, credentials) for one in (connect or listen)]
         endpoints = {name: [shifted(one, i) for one in wanted] for i, name in enumerate(flows)}
-        self._max_message = max_message
-        self._sender = secrets.token_bytes(8)
+        self._max_message, self._sender = max_message, secrets.token_bytes(8)
         self._counts: dict[str, int] = {}
         self._counts_lock = threading.Lock()
-        self._outbox, self._pace = Outbox(), Pace()
-        self._sessions = Sessions()
+        self._outbox, self._pace, self._sessions = Outbox(), Pace(), Sessions()
         self._finalizer = weakref.finalize(self, self._sessions.close)
-        deadline = time.monotonic() + wait
-        known = credentials.revoked() if credentials else frozenset()
+        deadline, known = time.monotonic() + wait, credentials.revoked() if credentials else frozenset()
 
         def opened(name: Flow, where: list[str]) -> zenoh.Session:
             longest = longest_rollout if name == "bulk" and longest_rollout else max_message

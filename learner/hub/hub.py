@@ -84,29 +84,23 @@ class LearnerHub:
         Raises:
           CongraspError: the durable state is of another run.
         """
-        self.keys = Keys(run)
-        self.run_id = run_id
+        self.keys, self.run_id = Keys(run), run_id
         self.session_id = secrets.token_hex(4)
         self._transport = transport
-        self._config = config_json
-        self._schema = schema
-        self._form = form
-        self._staleness = staleness
-        self._limit = queue_limit
+        self._config, self._schema, self._form = config_json, schema, form
+        self._staleness, self._limit = staleness, queue_limit
         self._name, self._on_event = check_name("learner", name), on_event
         self._changed = threading.Condition()
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
         self._sequences = SequenceTable()
         self._being_written: set[tuple[Owner, int]] = set()  # accepted, and not acknowledged yet
         self._bundle: SharedMessage | None = None
-        self._members = Members()
-        self._admission = admission or Admission()
+        self._members, self._admission = Members(), admission or Admission()
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
         self._last_event: dict[str, float] = {}
         self._finished = self._closed = False
         self._audit, self._log = audit, log
-        self._rate_limit = RateLimit()
-        self._pull_limit = RateLimit(per_second=_PIECES, most=4 * _PIECES)
+        self._rate_limit, self._pull_limit = RateLimit(), RateLimit(per_second=_PIECES, most=4 * _PIECES)
         if durable is not None:
             self._restore(durable)
         self._recovered: Recovered | None = self._begin()

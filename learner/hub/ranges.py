@@ -94,15 +94,7 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
     rng = np.random.default_rng(0)
     fingers, contacts = len(hand.joints), (_STATES, len(hand.links), CONTACTS_PER_LINK)
 
-    def within(*shape: int, most: Any = 1.0) -> np.ndarray:
-        # Some draws are at the ends and some in the middle: terms reach their bounds near and far.
-        drawn = rng.uniform(-1.0, 1.0, (_STATES, *shape))
-        towards = rng.choice([0.1, 1.0, 8.0], (_STATES, *[1] * len(shape)))
-        return np.asarray(most * np.sign(drawn) * np.abs(drawn) ** towards, np.float32)
-
-    def unit(*shape: int) -> np.ndarray:
-        drawn = rng.normal(size=(_STATES, *shape))
-        return (drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)).astype(np.float32)
+    within, unit = functools.partial(_within, rng), functools.partial(_unit, rng)
 
     def joints() -> np.ndarray:
         return rng.uniform(hand.lower - _BEYOND, hand.upper + _BEYOND, (_STATES, fingers)).astype(np.float32)
@@ -134,17 +126,7 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
         table=rng.random(_STATES) < 0.5,
     )
     surface = Surface(within(task.surface_points, 3, most=0.1), rng.random((_STATES, task.surface_points)) < 0.5)
-    symbols, values = symbol_sizes(hand, task), {}
-    for constraint in known(task):
-        made = {}
-        for name, array in constraint.arrays.items():
-            shape = tuple(symbols[size] if isinstance(size, str) else size for size in array.shape)
-            if array.kind == "flag":
-                made[name] = rng.random((_STATES, *shape)) < 0.5
-            else:
-                made[name] = within(*shape, most=0.3) if array.kind == "real" else unit(*shape)
-        values[constraint.name] = constraint.goal(**made)
-    everything = {block: np.ones(_STATES, bool) for constraint in known(task) for block in constraint.blocks}
+    goal = _goal(hand, task, rng)
     others = rng.integers(0, _STATES, (_STATES, task.history))
     others[:, 0] = np.arange(_STATES)
     readings = Readings(*(getattr(state, name)[others] for name in Readings._fields))
@@ -156,4 +138,32 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
         hold=rng.integers(0, max(task.hold_steps, task.hold_steps_max) + 1, _STATES),
         sensors=draw_sensors(task.sensing, task.control_dt, jax.random.key(0), _STATES) if task.sensed else None,
     )
-    return jax.tree.map(jnp.asarray, (state, surface, Goal(values, everything), readings, parameters))
+    return jax.tree.map(jnp.asarray, (state, surface, goal, readings, parameters))
+
+
+def _goal(hand: Hand, task: TaskConfig, rng: np.random.Generator) -> Goal:
+    """Random goals in which every constraint is active."""
+    symbols, values = symbol_sizes(hand, task), {}
+    for constraint in known(task):
+        made = {}
+        for name, array in constraint.arrays.items():
+            shape = tuple(symbols[size] if isinstance(size, str) else size for size in array.shape)
+            if array.kind == "flag":
+                made[name] = rng.random((_STATES, *shape)) < 0.5
+            else:
+                made[name] = _within(rng, *shape, most=0.3) if array.kind == "real" else _unit(rng, *shape)
+        values[constraint.name] = constraint.goal(**made)
+    return Goal(values, {block: np.ones(_STATES, bool) for constraint in known(task) for block in constraint.blocks})
+
+
+def _within(rng: np.random.Generator, *shape: int, most: Any = 1.0) -> np.ndarray:
+    """(B, *shape) numbers of at most a magnitude; some at the ends and some in the middle, where terms differ."""
+    drawn = rng.uniform(-1.0, 1.0, (_STATES, *shape))
+    towards = rng.choice([0.1, 1.0, 8.0], (_STATES, *[1] * len(shape)))
+    return np.asarray(most * np.sign(drawn) * np.abs(drawn) ** towards, np.float32)
+
+
+def _unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """(B, *shape) unit vectors."""
+    drawn = rng.normal(size=(_STATES, *shape))
+    return (drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)).astype(np.float32)

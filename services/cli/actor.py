@@ -18,6 +18,7 @@ def actor(
     threads: int = 0,
     patience: float = 60.0,
     audit: pathlib.Path | None = None,
+    references: pathlib.Path | None = None,
     watch: Watched = Watch(),  # noqa: B008
     certs: pathlib.Path | None = None,
 ) -> int:
@@ -31,6 +32,7 @@ def actor(
       threads: Threads of the native engine; 0 takes all cores.
       patience: Seconds without a learner after which the actor gives up.
       audit: Journal of every rollout and the learner's answer to it, for 'congrasp audit'; nothing is written without.
+      references: File by which the next start goes on with the policy's own grasps as reference poses.
       watch: How it is watched.
       certs: Folder of an actor's certificate (congrasp certs), whose number its name on the wire begins with.
 
@@ -70,6 +72,7 @@ def actor(
             patience=patience,
             on_rollout=report,
             journal=Journal(audit, lambda text: log("error", text)) if audit else None,
+            references=references,
         )
         return stop.exit_code
 

@@ -165,6 +165,7 @@ def _marker(make: _Messages, motion: GraspMotion) -> Any:
     """The object's mesh as a marker."""
     corners = motion.object_vertices[motion.object_faces.ravel()]
     colours = (nearest(corners, motion.colours) / 255).tolist() if motion.colours else []
+    upright = make.quaternion((0, 0, 0, 1))
     image = make("sensor_msgs/CompressedImage", header=make.header(0, ""), format="", data=np.zeros(0, np.uint8))
     return make(
         "visualization_msgs/Marker",
@@ -173,7 +174,7 @@ def _marker(make: _Messages, motion: GraspMotion) -> Any:
         id=0,
         type=11,  # a list of triangles
         action=0,
-        pose=make("geometry_msgs/Pose", position=make.vector(np.zeros(3), "Point"), orientation=_upright(make)),
+        pose=make("geometry_msgs/Pose", position=make.vector(np.zeros(3), "Point"), orientation=upright),
         scale=make.vector(np.ones(3)),
         color=make("std_msgs/ColorRGBA", **dict(zip("rgba", (*COLOURS[OBJECT], 1.0), strict=True))),
         lifetime=make.duration(0),
@@ -188,11 +189,6 @@ def _marker(make: _Messages, motion: GraspMotion) -> Any:
         mesh_file=make("visualization_msgs/MeshFile", filename="", data=np.zeros(0, np.uint8)),
         mesh_use_embedded_materials=False,
     )
-
-
-def _upright(make: _Messages) -> Any:
-    """The identity."""
-    return make.quaternion([0.0, 0.0, 0.0, 1.0])
 
 
 def read(path: pathlib.Path) -> list[Track]:

@@ -48,15 +48,6 @@ def log_files(path: pathlib.Path) -> list[pathlib.Path]:
     return found
 
 
-def is_complete(path: pathlib.Path) -> bool:
-    """Whether the file was finished; false for one whose writer was killed."""
-    with open_file(path) as file:
-        file.seek(0, 2)
-        size = file.tell()
-        file.seek(max(0, size - len(MCAP0_MAGIC)))
-        return size > 2 * len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC
-
-
 def read_records(
     path: pathlib.Path, wanted: Callable[[str], bool] = lambda topic: True, warn: Callable[[str], None] = _log.warning
 ) -> Iterator[Record]:

@@ -104,7 +104,7 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
     for i in range(len(arrays["object_position"])):
         now = start + i * step
         yield _protobuf(f"{topic}/tf", now, _transforms(hand, actor, arrays, i, slot, now))
-        yield _protobuf(f"{topic}/contacts", now, _contacts(hand, actor, arrays, i, now, step))
+        yield _protobuf(f"{topic}/contacts", now, _contacts(actor, arrays, i, now, step))
         yield channels.entry(f"{topic}/signals", now, _signals(hand, arrays, i, episode.meta["control_dt"]))
 
 
@@ -230,7 +230,7 @@ def _cloud(frame: str, points: np.ndarray, colours: np.ndarray, now: int) -> Poi
     return cloud
 
 
-def _contacts(hand: Hand, actor: str, arrays: Mapping[str, np.ndarray], i: int, now: int, step: int) -> SceneUpdate:
+def _contacts(actor: str, arrays: Mapping[str, np.ndarray], i: int, now: int, step: int) -> SceneUpdate:
     """Table and contact forces of one step; they vanish by themselves shortly after it."""
     update = SceneUpdate()
     if arrays["table"][i]:

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from congrasp.actors.process.actor import run_actor
+from congrasp.actors.process.own_references import references_file
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores, prepare_workers
@@ -74,7 +75,7 @@ def learn(
         if metrics_port:
             stack.enter_context(exposed(metrics_port, metrics_host, metrics))
         if inside is not None:
-            stack.enter_context(_actor_thread(url, config, f"actor-{rank}", inside, stop, grace))
+            stack.enter_context(_actor_thread(url, config, run_dir, f"actor-{rank}", inside, stop, grace))
         run_learner(
             run_dir,
             config,
@@ -91,7 +92,13 @@ def learn(
 
 @contextlib.contextmanager
 def _actor_thread(
-    url: str, config: RunConfig, name: str, physics: PhysicsName, stop: threading.Event, grace: float
+    url: str,
+    config: RunConfig,
+    run_dir: pathlib.Path,
+    name: str,
+    physics: PhysicsName,
+    stop: threading.Event,
+    grace: float,
 ) -> Iterator[None]:
     """An actor in a thread of its own while the block runs; should it fail, it sets `stop`, and its error is raised."""
     failures: list[BaseException] = []
@@ -108,6 +115,7 @@ def _actor_thread(
                     physics=physics,
                     threads=cores(),
                     patience=ROUND_SECONDS,
+                    references=references_file(run_dir, name),
                 )
         except BaseException as error:
             failures.append(error)

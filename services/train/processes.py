@@ -14,6 +14,7 @@ from typing import Any
 import jax
 
 from congrasp.actors.physics import resolve_physics
+from congrasp.actors.process.own_references import references_file
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.io.journal import AUDIT
@@ -157,6 +158,7 @@ def _actors(
         name = f"actor-{number}"
         arguments = ["actor", "--connect", rank_url(connect[0], number // actors), *connect[1:], "--run", run]
         arguments += ["--id", name, "--physics", physics, "--audit", str(run_dir / AUDIT / f"{name}.jsonl")]
+        arguments += ["--references", str(references_file(run_dir, name))]
         arguments += ["--threads", str(threads), "--patience", "60" if ranks == 1 else "300"]
         found.append(Child(name, arguments, run_dir / "logs" / f"{name}.log"))
     return found

@@ -9,6 +9,7 @@ import pytest
 
 from congrasp.actors.harvest import Grasps, renew
 from congrasp.actors.physics.engine import where_environments
+from congrasp.actors.process.own_references import save_references, with_kept_references
 from congrasp.common import rotations
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
@@ -157,3 +158,15 @@ def test_only_masked_environments_are_exchanged():
     merged = where_environments(mask, new, old)
     np.testing.assert_array_equal(merged["a"], [[1, 1, 1], [0, 0, 0]])
     np.testing.assert_array_equal(merged["b"], [True, False])
+
+
+def test_references_of_the_policy_outlive_a_restart(bank, tmp_path):
+    path = tmp_path / "new folder" / "a.safetensors"
+    assert with_kept_references(path, bank) is bank
+    grown = bank._replace(pose_q=bank.pose_q.at[1, 1, 0].set(0.5), grasps=bank.grasps.at[1, 1].add(3))
+    save_references(path, grown)
+    jax.tree.map(np.testing.assert_array_equal, with_kept_references(path, bank), grown)
+    others = bank._replace(points=bank.points.at[0, 0, 0].add(1e-3))
+    assert with_kept_references(path, others) is others
+    path.write_bytes(path.read_bytes()[:-1])
+    assert with_kept_references(path, bank) is bank

@@ -147,7 +147,7 @@ def heard(monkeypatch):
 
 def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
     with pytest.raises(CongraspError, match=r"do not record: torque\. Start the actor with the version"):
-        process._Actor(CONFIG, ("reward", "torque"), None, None, "native", 1, lambda values: None)
+        process._Actor(CONFIG, ("reward", "torque"), None, None, "native", 1, lambda values: None, None)
 
 
 def test_steps_in_which_the_physics_left_contacts_out_are_counted():

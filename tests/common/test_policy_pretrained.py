@@ -84,7 +84,7 @@ def test_a_policy_of_the_package_is_given_by_its_name(tmp_path, monkeypatch):
     file = named_policy(name)
     assert file == policy_file(pathlib.Path(name)) == module._FOLDER / f"{name}.safetensors"
     student, teacher = bundles.load(file).task, bundles.load(policy_file(None, "allegro")).task
-    assert student.observation == "tracked" and student.hand == teacher.hand and student.control == teacher.control
+    assert student.observation == "tracked" and student.hand == teacher.hand
     (entrant,) = read_entrants([name])
     assert (entrant.hand, entrant.method) == ("allegro", "student")
     (tmp_path / name).touch()

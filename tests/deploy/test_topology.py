@@ -14,8 +14,8 @@ import time
 import pytest
 import yaml
 
-from congrasp.services.bench.shutdown import SMALL
 from congrasp.services.record.reader import read_metrics
+from tests.benchmarks.shutdown import SMALL
 from tests.conftest import ROOT
 
 SERVICES = yaml.safe_load((ROOT / "deploy" / "compose.yaml").read_text())["services"]

@@ -12,8 +12,8 @@ import pytest
 from congrasp.common.io.journal import AUDIT, read_journal
 from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.write_ahead import FOLDER
-from congrasp.services.bench.second_reading import read_again
 from congrasp.services.ops.audit import audit
+from tests.benchmarks.second_reading import read_again
 from tests.cluster import KEYS, Proxy, T, rollout
 
 pytestmark = pytest.mark.timeout(300)

@@ -20,7 +20,7 @@ from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
-from congrasp.services.bench.attacks import attacked, throttled
+from tests.benchmarks.attacks import attacked, throttled
 from tests.cluster import A, B, D, T, bundle, rollout
 
 pytestmark = pytest.mark.timeout(120)

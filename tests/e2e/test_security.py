@@ -530,7 +530,7 @@ def test_the_command_line_says_why_in_one_line(run, evil, certs):
 
 
 def test_nothing_unpickles():
-    """No module of the project imports what runs code out of data."""
+    """One module imports what can run code out of data: the child process with an allow-list."""
     forbidden = re.compile(
         r"^\s*(from|import)\s+(pickle|cPickle|dill|cloudpickle|joblib|marshal|shelve|torch)\b|allow_pickle=True|\beval\(",
         re.MULTILINE,
@@ -538,7 +538,8 @@ def test_nothing_unpickles():
     root = pathlib.Path(__file__).resolve().parents[2]
     files = [path for folder in ("common", "actors", "learner", "services") for path in (root / folder).rglob("*.py")]
     assert len(files) > 100
-    assert [str(path) for path in files if forbidden.search(path.read_text())] == []
+    found = [str(path.relative_to(root)) for path in files if forbidden.search(path.read_text())]
+    assert found == ["common/io/unpickle.py"]
 
 
 # --- floods ---

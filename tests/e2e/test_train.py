@@ -13,9 +13,9 @@ import psutil
 import pytest
 
 from congrasp.common.policy import bundle as bundles
-from congrasp.services.bench.second_reading import read_again
 from congrasp.services.ops.audit import audit
 from congrasp.services.record.reader import read_episodes, read_metrics, read_rollouts
+from tests.benchmarks.second_reading import read_again
 
 pytestmark = pytest.mark.timeout(600)
 UPDATES = 40
@@ -82,6 +82,7 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path):
     assert process.returncode == 0, output
     assert "actor-0 died" in output or "actor-1 died" in output
     assert "learner died" in output
+    assert sorted(file.stem for file in (run_dir / "references").iterdir()) == ["actor-0", "actor-1"]
     assert audit(run_dir).exit_code == 0 and read_again(run_dir)[:4] == (0, 0, 0, 0)
     policy = bundles.load(run_dir / "policy.safetensors")
     assert policy.transitions == UPDATES * 2 * 4 * 75

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from congrasp.common.errors import CongraspError
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.checkpoint import Checkpoints
-from congrasp.services.bench import toy
+from tests.benchmarks import toy
 from tests.learner.test_ppo import rollout
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

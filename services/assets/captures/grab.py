@@ -9,7 +9,6 @@ labels of the object's contacts say which fingers touch.
 import functools
 import pathlib
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -58,13 +57,11 @@ def _sequence(
     """The sequence of a file."""
     name = f"{file.parent.name}/{file.stem}"
     data = read_archive(file)
-    if "rhand" not in data and "lhand" in data:
+    parts = {key.partition("/")[0] for key in data}
+    if "rhand" not in parts and "lhand" in parts:
         raise Dropped(name, "left hand", "it has no right hand")
-    hand = _entry(name, data, "rhand", "params")
-    turn, shift, fingers = (array_of(name, "rhand/params", hand, key, "T", width) for key, width in _HAND.items())
-    place = _entry(name, data, "object", "params")
-    object_shift, object_turn = (
-        array_of(name, "object/params", place, key, "T", 3) for key in ("transl", "global_orient")
+    turn, shift, fingers, object_shift, object_turn = (
+        array_of(name, "the file", data, key, "T", width) for key, width in _WIDTHS.items()
     )
     object_name = str(data.get("obj_name", file.stem.split("_")[0]))
     subject = _template(root, data)
@@ -89,21 +86,15 @@ def _sequence(
     )
 
 
-_HAND = {"global_orient": 3, "transl": 3, "fullpose": 45}
+_WIDTHS = {
+    **{"rhand/params/global_orient": 3, "rhand/params/transl": 3, "rhand/params/fullpose": 45},
+    **{"object/params/transl": 3, "object/params/global_orient": 3},
+}
 
 
-def _entry(name: str, data: dict[str, Any], *keys: str) -> dict[str, Any]:
-    """The dictionary under some keys."""
-    for key in keys:
-        if not isinstance(data, dict) or key not in data:
-            raise Dropped(name, "wrong layout", f"the file has no '{'/'.join(keys)}'")
-        data = data[key]
-    return data
-
-
-def _template(root: pathlib.Path, data: dict[str, Any]) -> pathlib.Path | None:
+def _template(root: pathlib.Path, data: dict[str, np.ndarray]) -> pathlib.Path | None:
     """The mesh of the subject's right hand, where it is there."""
-    text = data["rhand"].get("vtemp")
+    text = data.get("rhand/vtemp")
     path = root / str(text) if text is not None else None
     inside = path is not None and path.resolve().is_relative_to(root.resolve())
     return path if path is not None and inside and path.is_file() else None
@@ -115,10 +106,9 @@ def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> mano.Sk
     return mano.skeleton(model, template=template)
 
 
-def _touching(data: dict[str, Any], frames: int) -> np.ndarray | None:
+def _touching(data: dict[str, np.ndarray], frames: int) -> np.ndarray | None:
     """(T, 5) bool, from the labels of the object's contacts."""
-    contact = data.get("contact")
-    labels = np.asarray(contact["object"]) if isinstance(contact, dict) and "object" in contact else None
+    labels = data.get("contact/object")
     if labels is None or labels.ndim != 2 or len(labels) != frames:
         return None
     return np.stack([((labels >= low) & (labels <= high)).any(-1) for low, high in (_LABELS[f] for f in FINGERS)], -1)

@@ -9,7 +9,6 @@ sorted. An object's mesh is centred on its bounding box before the annotated pos
 
 import collections
 import functools
-import json
 import pathlib
 from collections.abc import Iterator
 from typing import Any
@@ -19,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.mano import ManoModel
-from congrasp.common.io.inputs import file_name, read_file
-from congrasp.common.io.pickles import read_pickle
+from congrasp.common.io.inputs import file_name, read_file, read_json
+from congrasp.common.io.pickles import MAX_BYTES, read_pickles
 from congrasp.services.assets.captures import mano
 from congrasp.services.assets.captures.objects import Meshes
 from congrasp.services.assets.captures.sequence import Dropped, Part, Sequence, read_or_drop
@@ -28,6 +27,7 @@ from congrasp.services.assets.objects.sources import read_mesh
 
 HOLDS = "anno/seq_all.json"
 _LARGEST_JSON = 256 << 20
+_REMEDY = "Get the file again."
 _Frames = list[tuple[int, str]]
 
 
@@ -43,7 +43,7 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
         raise CongraspError(f"There is no {index}.", "Name the folder that holds OakInk-Image's 'anno'.")
     found = meshes.beside(root / "obj", path / "obj")
     names = _names(path)
-    for (name, _), frames in sorted(_sequences(_json(index)).items()):
+    for (name, _), frames in sorted(_sequences(read_json(index, _LARGEST_JSON, _REMEDY)).items()):
         folder = root / "anno" / "general_info"
         yield read_or_drop(name, _sequence, name, frames, folder, found, model, names, path)
 
@@ -57,19 +57,11 @@ def _sequences(rows: list[list[Any]]) -> dict[tuple[str, int], _Frames]:
     return {key: sorted(of_camera[min(of_camera)]) for key, of_camera in cameras.items()}
 
 
-def _json(path: pathlib.Path) -> Any:
-    """What a JSON file says."""
-    try:
-        return json.loads(read_file(path, _LARGEST_JSON))
-    except (ValueError, RecursionError):
-        raise CongraspError(f"{path} is not JSON.", "Get the file again.") from None
-
-
 def _names(path: pathlib.Path) -> dict[str, str]:
     """Objects' names by their ids."""
     names: dict[str, str] = {}
     for file in sorted(path.glob("**/metaV2/*object_id.json")):
-        names |= {key: str(value.get("name", key)) for key, value in _json(file).items()}
+        names |= {key: str(value.get("name", key)) for key, value in read_json(file, _LARGEST_JSON, _REMEDY).items()}
     return names
 
 
@@ -86,7 +78,10 @@ def _sequence(
     object_id = name.split("_")[0]
     object_name = names.get(object_id, object_id)
     mesh = meshes.find(name, object_id if meshes.has(object_id) else object_name)
-    rows = [_frame(name, folder / f"{file_name(stem, 'a frame')}.pkl") for _, stem in frames]
+    files = [folder / f"{file_name(stem, 'a frame')}.pkl" for _, stem in frames]
+    there = [file for file in files if file.is_file()]
+    contents = dict(zip(there, read_pickles((str(file), read_file(file, MAX_BYTES)) for file in there), strict=True))
+    rows = [_frame(name, file, contents[file]) if file in contents else None for file in files]
     known = next((row for row in rows if row is not None), None)
     if known is None:
         raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
@@ -113,28 +108,25 @@ def _sequence(
     )
 
 
-def _frame(name: str, file: pathlib.Path) -> tuple[np.ndarray, ...] | None:
-    """Hand pose (16, 4), shape (10,), wrist (3,) and object pose (4, 4); nothing where the frame is missing."""
-    if not file.is_file():
-        return None
-    content = read_pickle(file, mixed=True)
+def _frame(name: str, file: pathlib.Path, content: dict[str, np.ndarray]) -> tuple[np.ndarray, ...] | None:
+    """Hand pose (16, 4), shape (10,), wrist (3,) and object pose (4, 4); None if there is no hand or object."""
+    known = {key.partition("/")[0] for key in content}
     for key in ("hand_anno", "obj_anno"):
-        if not isinstance(content, dict) or key not in content:
+        if key not in known:
             raise Dropped(name, "wrong layout", f"{file.name} has no '{key}'")
-    hand = content["hand_anno"]
-    if hand is None or content["obj_anno"] is None:
-        return None
-    values = []
-    for key, shape in (("hand_pose", (16, 4)), ("hand_shape", (10,)), ("hand_tsl", (3,))):
-        if key not in hand:
-            raise Dropped(name, "wrong layout", f"{file.name} has no 'hand_anno/{key}'")
-        values.append(_shaped(name, file, key, hand[key], shape))
-    return (*values, _shaped(name, file, "obj_anno", content["obj_anno"], (4, 4)))
+        if key in content and not content[key].size:
+            return None
+    shapes = {"hand_anno/hand_pose": (16, 4), "hand_anno/hand_shape": (10,), "hand_anno/hand_tsl": (3,)}
+    return tuple(_shaped(name, file, key, content, shape) for key, shape in (shapes | {"obj_anno": (4, 4)}).items())
 
 
-def _shaped(name: str, file: pathlib.Path, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _shaped(
+    name: str, file: pathlib.Path, key: str, content: dict[str, np.ndarray], shape: tuple[int, ...]
+) -> np.ndarray:
     """An array of this shape."""
-    array = np.asarray(value, float)
+    if key not in content:
+        raise Dropped(name, "wrong layout", f"{file.name} has no '{key}'")
+    array = content[key].astype(float)
     if array.size != np.prod(shape):
         raise Dropped(name, "wrong layout", f"'{key}' of {file.name} has the shape {array.shape}, not {shape}")
     return array.reshape(shape)
@@ -155,6 +147,6 @@ def _parts(root: pathlib.Path, *names: str) -> tuple[Part, ...]:
     parts = []
     for file in sorted(folder.glob("part_*.ply")):
         labels = file.with_suffix(".json")
-        label = _json(labels).get("name", file.stem) if labels.is_file() else file.stem
+        label = read_json(labels, _LARGEST_JSON, _REMEDY).get("name", file.stem) if labels.is_file() else file.stem
         parts.append(Part(str(label), mano.read_vertices(file)))
     return tuple(parts) if len(parts) > 1 else ()

@@ -22,7 +22,7 @@ _BARE = 0.005  # m, radius of a link of which nothing is known
 
 
 def surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """World points on what collides of a body, or on what is drawn of it if nothing collides."""
+    """Points on what collides of a body, or on what is drawn of it if nothing collides."""
     mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
     solid = [g for g in mine if model.geom_contype[g] | model.geom_conaffinity[g]] or mine
     found: list[np.ndarray] = []
@@ -33,13 +33,8 @@ def surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.nd
     return found
 
 
-def solids_of(
-    model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], turn: np.ndarray, origin: np.ndarray
-) -> tuple[Solid, ...]:
-    """What collides of bodies, in the frame that `turn` (3, 3) brings to the world and that lies at `origin` (3,) m.
-
-    None where that is nothing, or has a mesh among it.
-    """
+def solids_of(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> tuple[Solid, ...]:
+    """What collides of bodies; none where that is nothing, or has a mesh among it."""
     found = []
     for g in np.flatnonzero(np.isin(model.geom_bodyid, bodies)):
         if not model.geom_contype[g] | model.geom_conaffinity[g]:
@@ -50,9 +45,9 @@ def solids_of(
         if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_SPHERE:
             size = np.repeat(size[0], 3)
         quaternion = np.zeros(4)
-        mujoco.mju_mat2Quat(quaternion, np.ravel(turn.T @ data.geom_xmat[g].reshape(3, 3)))
+        mujoco.mju_mat2Quat(quaternion, data.geom_xmat[g])
         w, x, y, z = quaternion.round(9).tolist()
-        place = vector(((data.geom_xpos[g] - origin) @ turn).round(6))
+        place = vector(data.geom_xpos[g].round(6))
         found.append(Solid(kind, vector(size.round(6)), place, (w, x, y, z)))
     return tuple(found)
 
@@ -81,7 +76,7 @@ def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
 
 
 def inertia_box(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """World corners of the box with a body's mass and inertia, if the file has them and it is as large as a link."""
+    """Corners of the box with a body's mass and inertia, if the file has them and it is as large as a link."""
     mass, (x, y, z) = model.body_mass[body], model.body_inertia[body]
     if mass < 1e-4 or (mass, x, y, z) == (LEAST[0], *3 * (LEAST[1],)):
         return []

@@ -76,6 +76,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
             f"{path} has {len(tree.ends)} finger(s) on its palm '{body_name(model, tree.palm)}'.",
             "Name another --palm.",
         )
+    _to_palm(data, tree.palm)
     links, drive = _links(model, data, tree, notes)
     if choices.own_collision:
         links = _with_solids(model, data, tree, links, notes)
@@ -153,12 +154,21 @@ def _text(vector: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
 
 
+def _to_palm(data: mujoco.MjData, palm: int) -> None:
+    """Moves places and axes of the simulation's world into the palm's frame."""
+    turn, origin = data.xmat[palm].reshape(3, 3).copy(), data.xpos[palm].copy()
+    for places in (data.xpos, data.xipos, data.xanchor, data.geom_xpos):
+        places[:] = (places - origin) @ turn
+    data.xaxis[:] = data.xaxis @ turn
+    for frames in (data.ximat, data.geom_xmat):
+        frames[:] = (turn.T @ frames.reshape(-1, 3, 3)).reshape(-1, 9)
+
+
 def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[str]) -> tuple[list[Link], Drive]:
-    """The links in the palm's frame at zero, and what moves them; `notes` says what is proposed."""
-    turn, origin = data.xmat[tree.palm].reshape(3, 3), data.xpos[tree.palm]
+    """The links, and what moves them; `notes` says what is proposed."""
     names = {link: "palm" if link == tree.palm else body_name(model, link) for link in tree.groups}
     above = {link: tree.owner[int(model.body_parentid[link])] for link in tree.groups if link != tree.palm}
-    at = {link: np.zeros(3) if link == tree.palm else _anchor(model, data, link, turn, origin) for link in tree.groups}
+    at = {link: np.zeros(3) if link == tree.palm else data.xanchor[hinges(model, link)[0]] for link in tree.groups}
     shapes = {}
     boxed: list[str] = []
     empty: list[str] = []
@@ -167,11 +177,10 @@ def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[s
         if not points:
             points = [p for body in bodies for p in inertia_box(model, data, body)]
             (boxed if points else empty).append(names[link])
-        local = [(p - origin) @ turn for p in points]
-        shapes[link] = fit_capsules(np.array(local or bare(at[link], *(at[x] for x in above if above[x] == link))))
+        shapes[link] = fit_capsules(np.array(points or bare(at[link], *(at[x] for x in above if above[x] == link))))
     tips = {link: far_end(shapes[link], at[link]) for link in tree.ends}
     joints = _joint_names(model, tree, {*names.values()})
-    levers = _levers(model, data, tree, above, tips, turn, origin)
+    levers = _levers(model, data, tree, above, tips)
     drive = Drive(model, data, joints, levers)
     links = []
     for link, bodies in tree.groups.items():
@@ -183,7 +192,7 @@ def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[s
             Link(
                 name=names[link],
                 parent="" if link == tree.palm else names[above[link]],
-                joints=tuple(_joint(model, data, j, joints[j], turn, origin, drive) for j in own),
+                joints=tuple(_joint(model, data, j, joints[j], drive) for j in own),
                 capsules=shapes[link],
                 mass=max(mass, 1e-3),
                 contact_weight=3.0 if link in tips else 1.0,
@@ -201,29 +210,22 @@ def _with_solids(
     model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, links: list[Link], notes: list[str]
 ) -> list[Link]:
     """The links with the file's own collision geometry; `notes` says which keep their capsules."""
-    turn, origin = data.xmat[tree.palm].reshape(3, 3), data.xpos[tree.palm]
-    found = [solids_of(model, data, bodies, turn, origin) for bodies in tree.groups.values()]
+    found = [solids_of(model, data, bodies) for bodies in tree.groups.values()]
     if kept := [link.name for link, solids in zip(links, found, strict=True) if not solids]:
         notes.append(f"no collision geometry but meshes, these collide by their capsules: {', '.join(kept)}")
     return [dataclasses.replace(link, solids=solids) for link, solids in zip(links, found, strict=True)]
 
 
 def _meshes(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[str]) -> Meshes:
-    """What the file draws of each link, in the palm's frame at zero, unless it is larger than a hand."""
-    turn, origin = data.xmat[tree.palm].reshape(3, 3), data.xpos[tree.palm]
+    """What the file draws of each link, unless it is larger than a hand."""
     found = {
-        "palm" if link == tree.palm else body_name(model, link): link_mesh(model, data, bodies, turn, origin)
+        "palm" if link == tree.palm else body_name(model, link): link_mesh(model, data, bodies)
         for link, bodies in tree.groups.items()
     }
     drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
     if large := [name for name, (vertices, _) in drawn.items() if np.abs(vertices).max() > MAX_DISTANCE]:
         notes.append(f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and left out: {', '.join(large)}")
     return {name: mesh for name, mesh in drawn.items() if name not in large}
-
-
-def _anchor(model: mujoco.MjModel, data: mujoco.MjData, link: int, turn: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(3,) where a link's first joint is, in the palm's frame."""
-    return np.asarray((data.xanchor[hinges(model, link)[0]] - origin) @ turn)
 
 
 def _joint_names(model: mujoco.MjModel, tree: Tree, taken: set[str]) -> dict[int, str]:
@@ -234,13 +236,7 @@ def _joint_names(model: mujoco.MjModel, tree: Tree, taken: set[str]) -> dict[int
 
 
 def _levers(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    tree: Tree,
-    above: dict[int, int],
-    tips: dict[int, np.ndarray],
-    turn: np.ndarray,
-    origin: np.ndarray,
+    model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, above: dict[int, int], tips: dict[int, np.ndarray]
 ) -> dict[int, float]:
     """m from each joint of the hand to the farthest tip that it moves."""
     levers = {j: _LEVER for link in tree.groups if link != tree.palm for j in hinges(model, link)}
@@ -248,19 +244,17 @@ def _levers(
         link = end
         while link != tree.palm:
             for j in hinges(model, link):
-                levers[j] = max(levers[j], float(np.linalg.norm((data.xanchor[j] - origin) @ turn - tip)))
+                levers[j] = max(levers[j], float(np.linalg.norm(data.xanchor[j] - tip)))
             link = above[link]
     return levers
 
 
-def _joint(
-    model: mujoco.MjModel, data: mujoco.MjData, j: int, name: str, turn: np.ndarray, origin: np.ndarray, drive: Drive
-) -> Joint:
-    """A hinge in the palm's frame, which `turn` (3, 3) brings to the world and whose origin lies at `origin` (3,) m."""
+def _joint(model: mujoco.MjModel, data: mujoco.MjData, j: int, name: str, drive: Drive) -> Joint:
+    """A hinge."""
     if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
         raise CongraspError(f"The joint '{name}' is not a hinge.", "Hands of hinges alone can be imported.")
     if not model.jnt_limited[j]:
         raise CongraspError(f"The joint '{name}' has no limits.", "Give it a range.")
     lower, upper = model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]]
-    axis, anchor = vector(turn.T @ data.xaxis[j]), vector((data.xanchor[j] - origin) @ turn)
+    axis, anchor = vector(data.xaxis[j]), vector(data.xanchor[j])
     return drive.joint(j, lower, upper, Joint(name, axis, anchor, 0.0, 0.0, 0.0, 0.0, 0.0))

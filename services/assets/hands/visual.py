@@ -13,21 +13,16 @@ from congrasp.common.io.files import write_atomically
 from congrasp.services.assets.hands.geometry import geom_mesh
 
 
-def link_mesh(
-    model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int], turn: np.ndarray, origin: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """What is drawn of bodies, in the frame that `turn` (3, 3) brings to the world and that lies at `origin` (3,) m.
-
-    None where that is nothing.
-    """
+def link_mesh(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> tuple[np.ndarray, np.ndarray] | None:
+    """What is drawn of bodies; None where that is nothing."""
     parts = []
     for body in bodies:
         mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
         drawn = [g for g in mine if not model.geom_contype[g] | model.geom_conaffinity[g]] or mine
         for g in drawn:
             if (mesh := geom_mesh(model, g)) is not None:
-                world = np.asarray(mesh.vertices) @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
-                parts.append(trimesh.Trimesh((world - origin) @ turn, mesh.faces, process=False))
+                placed = np.asarray(mesh.vertices) @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+                parts.append(trimesh.Trimesh(placed, mesh.faces, process=False))
     if not parts:
         return None
     starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])

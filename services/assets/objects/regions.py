@@ -17,18 +17,13 @@ _CUTS = (0.5, 0.65, 0.35, 0.8, 0.2)
 UNCOVERED = "none of its halves can be held without the other: it has no affordance"
 
 
-def covered(obj: GraspObject) -> np.ndarray:
-    """(R,) bool, resting poses in which the human hand has a heading that closes on the graspable region."""
-    return _covered(obj, use_affordance=True)
-
-
 def cut_to_hold(obj: GraspObject) -> GraspObject:
     """An object of two halves with the first partition that is covered in all resting poses, or in the most.
 
     Its current halves come first, then their exchange, then cuts across the longest axis that make the graspable half
     larger or smaller. Its notes say where no half can be held in any resting pose.
     """
-    most = int(_covered(obj, use_affordance=False).sum())
+    most = int(covered(obj, use_affordance=False).sum())
     best, score = obj, -1
     for candidate in _candidates(obj):
         found = int(covered(candidate).sum())
@@ -39,8 +34,8 @@ def cut_to_hold(obj: GraspObject) -> GraspObject:
     return best if score > 0 else dataclasses.replace(best, notes=(*best.notes, UNCOVERED))
 
 
-def _covered(obj: GraspObject, *, use_affordance: bool) -> np.ndarray:
-    """(R,) bool, resting poses with an allowed heading, on the graspable region alone or the whole surface."""
+def covered(obj: GraspObject, *, use_affordance: bool = True) -> np.ndarray:
+    """(R,) bool, resting poses in which the human hand has a heading on the graspable region, or the whole surface."""
     hand = outline(HUMAN)
     found = sample_headings(
         obj, np.random.default_rng(0), use_affordance=use_affordance, max_width=max_width(hand, HUMAN.object_scale)

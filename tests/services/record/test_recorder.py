@@ -22,7 +22,6 @@ from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.channels import Entry
 from congrasp.services.record.reader import (
-    is_complete,
     log_files,
     read_episodes,
     read_metrics,
@@ -32,6 +31,7 @@ from congrasp.services.record.reader import (
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
+from tests.recordings import is_complete
 
 KEYS = Keys("r")
 METRICS = KEYS.log("metrics", "learner", "0")

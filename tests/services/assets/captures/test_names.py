@@ -22,7 +22,7 @@ def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folder
             meshes.find("a", name)
     with pytest.raises(CongraspError, match="cannot name a calibration"):
         _betas("a", tmp_path / "in", "/../../x")
-    inside, outside = ({"rhand": {"vtemp": name}} for name in ("y.obj", "../x.obj"))
+    inside, outside = ({"rhand/vtemp": name} for name in ("y.obj", "../x.obj"))
     assert _template(tmp_path / "in", inside) == pathlib.Path(tmp_path / "in" / "y.obj")
     assert _template(tmp_path / "in", outside) is None
 

@@ -38,7 +38,12 @@ def test_a_half_that_cannot_be_held_is_cut_elsewhere(tmp_path):
 
 
 def test_what_cannot_be_held_by_any_half_says_so(monkeypatch):
-    monkeypatch.setattr(regions, "covered", lambda obj: np.zeros(len(obj.rest_poses), bool))
+    free = regions.covered
+
+    def never(obj, *, use_affordance=True):
+        return np.zeros(len(obj.rest_poses), bool) if use_affordance else free(obj, use_affordance=False)
+
+    monkeypatch.setattr(regions, "covered", never)
     obj = generate(3, "cylinder")
     cut = regions.cut_to_hold(obj)
     assert cut.notes == (*obj.notes, regions.UNCOVERED)

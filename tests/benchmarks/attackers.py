@@ -1,4 +1,4 @@
-"""Hostile peers, for benchmarks and tests: `python -m services.bench.attackers KIND ENDPOINT RUN [FILE]`.
+"""Hostile peers, for benchmarks and tests: `python -m tests.benchmarks.attackers KIND ENDPOINT RUN [FILE]`.
 
 Each does one thing without end, as fast as it can, over plain TCP and with Zenoh's own interface: nothing that the
 project's own peers do to be polite holds it back. It prints a line when it has begun.

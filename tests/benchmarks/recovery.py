@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.bench.run_under_test import RunUnderTest, until
 from congrasp.services.ops.audit import audit
+from tests.benchmarks.run_under_test import RunUnderTest, until
 
 _WINDOW = 10.0  # seconds over which throughput is measured
 _AFTER = 5.0  # seconds after a death

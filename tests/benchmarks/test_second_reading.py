@@ -2,8 +2,8 @@
 
 import pytest
 
-from congrasp.services.bench.second_reading import read_again
 from congrasp.services.ops.audit import FAULTS, audit
+from tests.benchmarks.second_reading import read_again
 from tests.services.ops.test_audit import learner, life, run_dir, used, whole_run
 
 __all__ = ["run_dir"]  # the fixture

@@ -114,7 +114,7 @@ def attacked(
     kind: str, endpoint: str, run: str, query: pathlib.Path | None = None, count: int = 1
 ) -> Iterator[Sequence[subprocess.Popen]]:
     """Attackers of a kind, in processes of their own, while the block runs."""
-    command = [sys.executable, "-m", "congrasp.services.bench.attackers", kind, endpoint, run, str(query or "")]
+    command = [sys.executable, "-m", "tests.benchmarks.attackers", kind, endpoint, run, str(query or "")]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) for _ in range(count)]
     try:
         for process in processes:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from congrasp.services.bench.staleness import returns, settings
+from tests.benchmarks.staleness import returns, settings
 
 
 @pytest.mark.timeout(120)

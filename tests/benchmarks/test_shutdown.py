@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from congrasp.services.bench import shutdown
+from tests.benchmarks import shutdown
 
 ORPHANING = """
 import os, signal, subprocess, sys, time

@@ -22,10 +22,10 @@ from rich.console import Console
 from rich.table import Table
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.bench.run_under_test import RunUnderTest, until
-from congrasp.services.bench.second_reading import Verdict, read_again
 from congrasp.services.ops.audit import FAULTS as KINDS
 from congrasp.services.ops.audit import Report, audit
+from tests.benchmarks.run_under_test import RunUnderTest, until
+from tests.benchmarks.second_reading import Verdict, read_again
 
 _DISK = 24 << 20  # bytes of the disk that is filled
 _FROZEN = 4.0  # seconds, longer than a lease

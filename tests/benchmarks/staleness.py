@@ -11,7 +11,7 @@ from rich.table import Table
 
 from congrasp.common.policy import bundle as bundles
 from congrasp.learner.algorithms.ppo import PPO
-from congrasp.services.bench import toy
+from tests.benchmarks import toy
 
 SETTINGS = dataclasses.replace(
     toy.SETTINGS, epochs=16, learning_rate=5e-3, learning_rate_range=(1e-5, 1e-2), kl_target=0.02
