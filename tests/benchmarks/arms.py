@@ -1,17 +1,14 @@
-"""Grasps of scanned objects on several arms: how many get a motion, and what forbids the rest.
+"""Grasps of objects on several arms: how many get a motion, and what forbids the rest."""
 
-Every arm chooses among the same attempts of the policy. Run from the repository's root:
-python -m tests.benchmarks.arms OBJECTS ROBOTS --arms panda ur5e iiwa xarm7
-"""
-
-import argparse
 import collections
 import json
 import pathlib
-import time
+from typing import Any
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.io.files import write_atomically
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.services.arm.options import ArmOptions
@@ -19,6 +16,7 @@ from congrasp.services.arm.planner import ArmPlanner
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.assets.objects.named import objects_at
 from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.grasp.grasper import Grasper
 
 SPEEDS = {
@@ -35,92 +33,69 @@ class AllArms:
 
     name = "arms"
 
-    def __init__(self, planners):
+    def __init__(self, planners: dict[str, ArmPlanner]):
         self._planners = planners
         self.side = next(iter(planners.values())).side
         self.begin()
 
-    def begin(self):
-        self.done, self.refused = {}, {name: collections.Counter() for name in self._planners}
+    def begin(self) -> None:
+        """Forgets what was done with the object of before."""
+        self.done: dict[str, dict[str, Any]] = {}
+        self.refused = {name: collections.Counter[str]() for name in self._planners}
 
-    def plan(self, obj, motion):
+    def plan(self, obj: GraspObject, motion: GraspMotion) -> None:
+        """Tries it with the arms that have done none; raises `Infeasible` while there are any."""
         for name, planner in self._planners.items():
             if name in self.done:
                 continue
-            begun = time.monotonic()
             try:
                 self.done[name] = planner.plan(obj, motion).facts()
             except Infeasible as limit:
                 self.refused[name][str(limit)] += 1
-            self.refused[name]["seconds"] += time.monotonic() - begun
         if len(self.done) < len(self._planners):
             raise Infeasible("an arm")
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("objects", type=pathlib.Path)
-    parser.add_argument("robots", type=pathlib.Path, help="folder with NAME/robot.xml")
-    parser.add_argument("--arms", nargs="+", default=list(SPEEDS))
-    parser.add_argument("--names", nargs="*")
-    parser.add_argument("--hand", default="allegro")
-    parser.add_argument("--base", default=ArmOptions.base)
-    parser.add_argument("--mount", default="")
-    parser.add_argument("--attempts", type=int, default=16)
-    parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--approach", type=float, default=3.0)
-    parser.add_argument("--lift", type=float, default=0.15)
-    parser.add_argument("--out", type=pathlib.Path)
-    given = parser.parse_args()
-    bundle = bundles.load(policy_file(None, given.hand))
-    hand = get_hand(bundle.spec.hand)
-    arms = AllArms(
-        {
-            name: ArmPlanner(
-                ArmOptions(
-                    arm=str(given.robots / name / "robot.xml"),
-                    base=given.base,
-                    mount=given.mount,
-                    arm_speed=SPEEDS.get(name, ""),
-                ),
-                hand,
-            )
-            for name in given.arms
-        }
-    )
-    grasper = Grasper(
-        bundle, attempts=given.attempts, rounds=given.rounds, approach=given.approach, lift=given.lift, arm=arms
-    )
-    rows = {}
-    for folder in sorted(path for path in given.objects.iterdir() if path.is_dir()):
-        if given.names and folder.name not in given.names:
-            continue
-        begun = time.monotonic()
-        arms.begin()
+def bench_arms(
+    objects: pathlib.Path,
+    robots: pathlib.Path,
+    arms: tuple[str, ...],
+    hand: str,
+    attempts: int,
+    out: pathlib.Path | None,
+) -> None:
+    """Prints what each arm can do with each object; see `python -m tests.benchmarks arms --help`."""
+    bundle = bundles.load(policy_file(None, hand))
+    planners = {
+        name: ArmPlanner(
+            ArmOptions(arm=str(robots / name / "robot.xml"), arm_speed=SPEEDS.get(name, "")), get_hand(bundle.spec.hand)
+        )
+        for name in arms
+    }
+    every = AllArms(planners)
+    grasper = Grasper(bundle, attempts=attempts, rounds=1, approach=3.0, lift=0.15, arm=every)
+    rows: dict[str, Any] = {}
+    for folder in sorted(path for path in objects.iterdir() if path.is_dir()):
+        every.begin()
         try:
             grasper.grasp(objects_at(folder)[0].load(ImportOptions(unit="guess")))
-            outcome = ""
         except CongraspError as error:
-            outcome = str(error)
-        seconds = time.monotonic() - begun
+            print(error)
         rows[folder.name] = {
-            name: {"facts": arms.done.get(name), "refused": dict(arms.refused[name])} for name in given.arms
+            name: {"facts": every.done.get(name), "refused": dict(every.refused[name])} for name in arms
         }
-        done = " ".join(f"{name} {'yes' if name in arms.done else 'NO'}" for name in given.arms)
-        print(f"{folder.name:16s} {seconds:5.1f} s  {done}  {outcome[:60]}", flush=True)
-        if given.out:
-            given.out.write_text(json.dumps({"options": vars(given) | {}, "rows": rows}, default=str, indent=1))
-    for name in given.arms:
-        limits = collections.Counter()
-        for row in rows.values():
-            limits.update({k: v for k, v in row[name]["refused"].items() if k != "seconds"})
-        facts = [row[name]["facts"] for row in rows.values() if row[name]["facts"]]
-        worst = {key: max((f[key] for f in facts), default=0.0) for key in ("arm_error_mm", "arm_error_deg")}
-        worst["speed"] = max((f["arm_speed_share"] for f in facts), default=0.0)
-        worst["acceleration"] = max((f["arm_acceleration"] for f in facts), default=0.0)
-        spent = sum(row[name]["refused"].get("seconds", 0.0) for row in rows.values())
-        print(f"{name}: {len(facts)} of {len(rows)}; {worst}; {spent:.0f} s; {limits.most_common(8)}")
+        done = "  ".join(f"{name} {'yes' if name in every.done else 'no'}" for name in arms)
+        print(f"{folder.name:16s} {done}", flush=True)
+        if out:
+            write_atomically(out, json.dumps(rows, indent=1).encode())
+    for name in arms:
+        _summarize(name, [row[name] for row in rows.values()])
 
 
-if __name__ == "__main__":
-    main()
+def _summarize(name: str, rows: list[dict[str, Any]]) -> None:
+    """Prints how many objects an arm can grasp, the worst figures of those, and what forbids how many attempts."""
+    facts = [row["facts"] for row in rows if row["facts"]]
+    figures = ("arm_error_mm", "arm_error_deg", "arm_speed_share", "arm_acceleration")
+    worst = {key: round(max((fact[key] for fact in facts), default=0.0), 2) for key in figures}
+    limits = sum((collections.Counter(row["refused"]) for row in rows), collections.Counter())
+    print(f"{name}: {len(facts)} of {len(rows)}, worst {worst}, forbidden {limits.most_common()}")
