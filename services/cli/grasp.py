@@ -12,6 +12,7 @@ from typing_extensions import Doc
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.services.arm.options import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ def grasp(
     folder: str = "objects",
     again: bool = False,
     mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
+    arm: Annotated[ArmOptions, tyro.conf.OmitArgPrefixes] = ArmOptions(),  # noqa: B008
 ) -> int:
     """Make grasp motions for objects of your own.
 
@@ -84,11 +86,14 @@ def grasp(
       folder: Folder of objects, whose names can stand for files.
       again: Also redo finished objects.
       mesh: How meshes become objects.
+      arm: The arm that carries the hand.
 
     Examples:
       congrasp grasp examples/mug.obj --video
       congrasp grasp mug:7 --rest upright --approach 1 --lift 0.15
+      congrasp grasp mug:7 --hand allegro --arm panda --base "-0.7 0 0 0"
     """
+    from congrasp.common.hands import get_hand
     from congrasp.common.policy import bundle as bundles
     from congrasp.common.policy.pretrained import policy_file
     from congrasp.services.cli.console import at_least, at_most, bars
@@ -110,9 +115,15 @@ def grasp(
     bundle = bundles.load(file)
     found, results = find_objects(objects, folder)
     film = Film(_pixels(size), fps, overlays) if video else None
-    identity = (bundles.content_hash(file.read_bytes()), attempts, seed, approach, lift)
+    identity: tuple[Any, ...] = (bundles.content_hash(file.read_bytes()), attempts, seed, approach, lift)
+    planner = None
+    if arm.arm:
+        from congrasp.services.arm.planner import ArmPlanner
+
+        planner = ArmPlanner(arm, get_hand(bundle.spec.hand), seed)
+        identity = (*identity, planner.identity)
     settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, film, pictures, again, rest)
-    grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed)
+    grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed, arm=planner)
 
     for result in results:
         _show(result)

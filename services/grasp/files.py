@@ -11,6 +11,8 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
+from congrasp.services.arm.files import PICTURE as ARM_PICTURE
+from congrasp.services.arm.files import save_picture, save_trajectories
 from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.grasper import Grasp
 from congrasp.services.record.channels import JsonChannels
@@ -57,6 +59,10 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, film: Film | None, picture
     (folder / RESULT).unlink(missing_ok=True)
     save_motion(folder / MOTION, found.motion)
     save_recording(folder / RECORDING, found.episode)
+    if found.arm:
+        save_trajectories(folder, found.arm)
+        if pictures:
+            save_picture(folder / ARM_PICTURE, found.arm, found.episode, found.first("hold"))
     episode = found.episode
     steps = _steps_to_draw(*grasp_steps(episode), len(episode.arrays["table"]) - 1)
     last = steps[-1]

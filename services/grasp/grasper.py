@@ -1,11 +1,12 @@
 """A grasp motion for one object under constraints: several attempts at once, of which the best is kept."""
 
+import collections
 import dataclasses
 import functools
 import os
 import pathlib
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -29,12 +30,16 @@ from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional, req
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
+from congrasp.services.arm.robot import Infeasible
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.export.motion_file import GraspMotion, motion_of_episode
 from congrasp.services.grasp.approaches import headings, prescribed, valid_rests
 from congrasp.services.grasp.parse import read_request
-from congrasp.services.grasp.reach import Reach, plan_reach, with_reach
+from congrasp.services.grasp.reach import NoReachError, Reach, plan_reach, with_reach
+
+if TYPE_CHECKING:
+    from congrasp.services.arm.planner import ArmMotion, ArmPlanner
 
 ATTEMPTS = 16
 """Grasps that are simulated side by side."""
@@ -74,6 +79,8 @@ class Grasp:
     """Which of the object's resting poses it starts from."""
     active: tuple[str, ...]
     """Which constraints are active and why, in sentences."""
+    arm: "ArmMotion | None" = None
+    """The same on an arm, if there is one."""
 
     @property
     def success(self) -> bool:
@@ -115,6 +122,7 @@ class Grasp:
             "links_at_removal": self.motion.metrics["links_at_removal"],
             **{name: value for name, value in self.motion.metrics.items() if name in ASSESSED},
             **{name: self.motion.metrics[name] for name in _errors_of(self.motion.constraints)},
+            **(self.arm.facts() if self.arm else {}),
         }
 
 
@@ -132,6 +140,7 @@ class Grasper:
         lift: float = 0.0,
         threads: int = 0,
         seed: int = 0,
+        arm: "ArmPlanner | None" = None,
     ):
         """Compiles nothing yet.
 
@@ -144,7 +153,9 @@ class Grasper:
           lift: metres by which the hand lifts the object off the table, which then stands to the end.
           threads: of the physics; 0 takes one a core.
           seed: draws what is attempted.
+          arm: the arm that must be able to do it.
         """
+        self._arm = arm
         self.hand = get_hand(policy.spec.hand)
         self.task = dataclasses.replace(policy.task, end_when_fallen=False)
         self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
@@ -174,11 +185,12 @@ class Grasper:
         Raises:
           UnknownConstraintError: the policy does not know one of the constraints.
           ContradictionError: two of them exclude each other.
-          CongraspError: the table is in the way of all attempts.
+          CongraspError: the table is in the way of all attempts, or the arm can do none that holds the object.
         """
         request = request or GraspRequest()
         require_known(request.constraints, self.task)
-        best: tuple[float, Outcome, Goal, int, int] | None = None
+        best: tuple[float, Outcome, Goal, int, np.ndarray] | None = None
+        refused: collections.Counter[str] = collections.Counter()
         held = attempted = 0
         for round_ in range(self._rounds):
             episodes, rests, different = self._episodes(obj, request, np.random.default_rng((self._seed, round_)))
@@ -197,18 +209,47 @@ class Grasper:
             held += int(holds.sum())
             if request.avoid is not None:  # one that holds it by what must not be touched is not what was asked for
                 holds &= outcome.metrics["affordance_ratio"][:different] < _TOUCHED
+            if self._arm:
+                make = functools.partial(self._result, obj, request, outcome, episodes.goal, rests, attempted, held)
+                order = [i for i in cost.argsort().tolist() if holds[i]]
+                if (found := self._on_arm(self._arm, obj, make, order, refused, progress)) is not None:
+                    return found
+                continue
             index = int(cost.argmin())
             if best is None or cost[index] < best[0]:
-                best = (float(cost[index]), outcome, episodes.goal, index, int(rests[index]))
+                best = (float(cost[index]), outcome, episodes.goal, index, rests)
             if holds.any() or prescribed(request) is not None:
                 break
+        if self._arm:
+            raise _no_motion(obj, self._arm.name, attempted, refused)
         assert best is not None
-        _, outcome, wanted, index, rest = best
-        return self._result(obj, request, outcome, wanted, index, rest, attempted, held)
+        _, outcome, wanted, index, rests = best
+        return self._result(obj, request, outcome, wanted, rests, attempted, held, index)
 
     def close(self) -> None:
         """Ends the physics' threads."""
         self._attempts.close()
+
+    def _on_arm(
+        self,
+        arm: "ArmPlanner",
+        obj: GraspObject,
+        make: Callable[[int], Grasp],
+        order: list[int],
+        refused: collections.Counter[str],
+        progress: Progress,
+    ) -> Grasp | None:
+        """The first attempt in `order` that the arm can do, made by `make`; counts the limits that forbid others."""
+        for number, index in enumerate(order):
+            progress(f"Moving {arm.name}", number + 1, len(order))
+            try:
+                found = make(index)
+                return dataclasses.replace(found, arm=arm.plan(obj, found.motion))
+            except Infeasible as limit:
+                refused[str(limit)] += 1
+            except NoReachError:
+                refused["contact of every reach"] += 1
+        return None
 
     def _episodes(
         self, obj: GraspObject, request: GraspRequest, rng: np.random.Generator
@@ -242,10 +283,10 @@ class Grasper:
         request: GraspRequest,
         outcome: Outcome,
         wanted: Goal,
-        index: int,
-        rest: int,
+        rests: np.ndarray,
         attempts: int,
         held: int,
+        index: int,
     ) -> Grasp:
         """One attempt of an outcome, with its episode, motion and the constraints that were active."""
         labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
@@ -264,7 +305,7 @@ class Grasper:
         written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
         avoid = labelled.non_graspable_points
         active += [found.message for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
-        return Grasp(episode, motion_of_episode(episode), attempts, held, rest, tuple(active))
+        return Grasp(episode, motion_of_episode(episode), attempts, held, int(rests[index]), tuple(active))
 
     def _reach(self, obj: GraspObject, episode: Message) -> Reach:
         """The way from beside the table to where an episode begins."""
@@ -273,9 +314,8 @@ class Grasper:
         turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
         first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
         heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(arrays["goal/heading_direction"])
-        return plan_reach(
-            self.hand, obj, rest, heading, first, self._approach, self.task.control_dt, self._attempts.speed
-        )
+        dt, speed, side = self.task.control_dt, self._attempts.speed, self._arm.side if self._arm else None
+        return plan_reach(self.hand, obj, rest, heading, first, self._approach, dt, speed, side)
 
 
 def grasp(
@@ -363,6 +403,17 @@ def costs(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: fl
     cost = sum(np.minimum(values[name] / _SCALES[name], 10.0) for name in [*_errors_of(constraints), "slip"])
     cost += sum(values[name] == 0 for name in _FIRM)
     return np.asarray(cost) + 1e3 * (values["success"] == 0) + 1e4 * (values["held"] == 0)
+
+
+def _no_motion(obj: GraspObject, arm: str, attempts: int, refused: collections.Counter[str]) -> CongraspError:
+    """Error where an arm can do no attempt that holds the object, with the limits that forbid them."""
+    if not refused:
+        return CongraspError(f"None of {attempts} attempts holds '{obj.name}'.", "Set more --attempts.")
+    limits = ", ".join(f"{limit} {count}" for limit, count in refused.most_common())
+    return CongraspError(
+        f"{arm} can do none of the {refused.total()} attempts that hold '{obj.name}'. Forbidden by {limits}.",
+        "Set another --base or --mount, or more --attempts.",
+    )
 
 
 def _places(obj: GraspObject, rests: np.ndarray, request: GraspRequest) -> np.ndarray:

@@ -30,6 +30,8 @@ CLEARANCE = 0.01
 """m between the hand and object or table, as long as the start of the grasp is not nearer and not far."""
 _NEAR_END = 0.8  # share of the curve from which the hand may come as near as the grasp begins
 _BESIDE, _ABOVE = 0.34, 0.04  # of the wrist from the object's centre, of the hand above the table, at first, m
+_BESIDE_WITH_ARM, _ABOVE_WITH_ARM, _DOWN_WITH_ARM = 0.12, 0.2, math.radians(60.0)
+"""The same of a hand whose arm needs room to table and base, m, and how far its fingers then point down."""
 _RELAXED = 0.15  # share of the way from the open to the closed pose, before it sets out
 _CHECKED, _ALONG = 25, 5  # poses of the curve that are checked, and points on a capsule's axis
 _AZIMUTHS = np.radians([0, 30, -30, 60, -60, 100, -100, 140, -140, 180])
@@ -38,6 +40,10 @@ _MOST_STRETCH = 50.0  # of the requested time
 _BACK = (0.08, 0.15, 0.22)  # of the curve's middle point from its end, against the heading, m
 _UP = (0.0, 0.10, 0.20, 0.32)  # and upwards, m
 _TOLERANCE = 1e-3  # m
+
+
+class NoReachError(CongraspError):
+    """Every way to the grasp touches the object or the table."""
 
 
 class Reach(NamedTuple):
@@ -94,6 +100,7 @@ def plan_reach(
     seconds: float,
     dt: float,
     speed: float = 0.0,
+    side: float | None = None,
 ) -> Reach:
     """The way to where a grasp begins.
 
@@ -106,9 +113,10 @@ def plan_reach(
       seconds: how long it takes; longer where the wrist would be faster than `SPEED`, `ACCELERATION` or `TURNING`.
       dt: length of a control step, s.
       speed: of the wrist at the end, along the heading, m/s.
+      side: of the object on which the hand's arm stands, rad; it begins there and higher. Any where there is no arm.
 
     Raises:
-      CongraspError: every way that was tried touches the object or the table.
+      NoReachError: every way that was tried touches the object or the table.
     """
     x = np.linspace(0, 1, _CHECKED)
     checked = _minimum_jerk(x, 0.0)
@@ -117,33 +125,41 @@ def plan_reach(
     fingers = np.stack([relaxed, first.q[0]])
     axes = axes_in_wrist(hand, (1 - checked[:, None]) * fingers[0] + checked[:, None] * fingers[1])
     end = clearances(hand, field, rest, axes[-1:], first)[:, 0]
-    lowest = (_palm_down(hand, np.array([1.0, 0.0, 0.0])).apply(axes[0])[:, 2] - _radii(hand)).min()
-    for curve in _curves(hand, rest, heading, first, fingers, _ABOVE - float(lowest)):
+    lowest = (_first_turn(hand, np.array([1.0, 0.0, 0.0]), side).apply(axes[0])[:, 2] - _radii(hand)).min()
+    for curve in _curves(hand, rest, heading, first, fingers, -float(lowest), side):
         steps = math.ceil(_duration(curve, seconds, speed) / dt)
         found = clearances(hand, field, rest, axes, curve.at(x, steps * dt, speed))
         far = curve.way(x, steps * dt, speed) <= _NEAR_END
         needed = np.where(far, CLEARANCE, np.minimum(CLEARANCE, end[:, None])) - _TOLERANCE
         if (found >= needed).all():
             return curve.at(np.arange(steps) / steps, steps * dt, speed)
-    raise CongraspError(
+    raise NoReachError(
         f"From beside the table no way leads to a grasp of '{obj.name}' without touching it or the table.",
         "Leave out --approach, or set another --heading.",
     )
 
 
 def _curves(
-    hand: Hand, rest: np.ndarray, heading: np.ndarray, first: Reach, fingers: np.ndarray, height: float
+    hand: Hand,
+    rest: np.ndarray,
+    heading: np.ndarray,
+    first: Reach,
+    fingers: np.ndarray,
+    height: float,
+    side: float | None,
 ) -> Iterator[_Curve]:
-    """Ways to try, the plainest first; `fingers` (2, F) where they begin and end, `height` (m) where the wrist does."""
+    """Ways to try, the plainest first; `fingers` (2, F) at both ends, `height` (m) of the wrist on the table."""
     end = first.position[0]
+    height += _ABOVE if side is None else _ABOVE_WITH_ARM
+    beside = _BESIDE if side is None else _BESIDE_WITH_ARM
     aside = end - rest[:3] if np.linalg.norm((end - rest[:3])[:2]) > 0.03 else -heading
-    side = math.atan2(aside[1], aside[0])
+    side = math.atan2(aside[1], aside[0]) if side is None else side
     for up, azimuth, back in itertools.product(_UP, _AZIMUTHS, _BACK):
         out = np.array([np.cos(side + azimuth), np.sin(side + azimuth), 0.0])
-        begin = np.array([*(rest[:3] + _BESIDE * out)[:2], height])
+        begin = np.array([*(rest[:3] + beside * out)[:2], height])
         middle = end - back * heading + [0.0, 0.0, up]
         middle[2] = max(middle[2], 0.06)
-        turns = Rotation.concatenate([_palm_down(hand, -out), first.rotation[0]])
+        turns = Rotation.concatenate([_first_turn(hand, -out, side), first.rotation[0]])
         s = np.linspace(0, 1, _FINE)[:, None]
         last = end - back / 3 * heading
         points = (1 - s) ** 3 * begin + 3 * s * (1 - s) ** 2 * middle + 3 * s**2 * (1 - s) * last + s**3 * end
@@ -151,11 +167,13 @@ def _curves(
         yield _Curve(points, length, Slerp([0, 1], turns), fingers)
 
 
-def _palm_down(hand: Hand, forward: np.ndarray) -> Rotation:
-    """The wrist with its fingers along a level direction (3,) and its palm down."""
+def _first_turn(hand: Hand, forward: np.ndarray, side: float | None) -> Rotation:
+    """The wrist with its fingers along a level direction (3,), lower on an arm, and its palm down."""
     # `upright` has the fingers up and the palm towards +x.
-    lying = Rotation.from_matrix(np.stack([[0.0, 0.0, -1.0], np.cross(forward, [0.0, 0.0, -1.0]), forward], -1))
-    return lying * upright(hand)
+    across = np.cross(forward, [0.0, 0.0, -1.0])
+    lying = Rotation.from_matrix(np.stack([[0.0, 0.0, -1.0], across, forward], -1))
+    down = 0.0 if side is None else _DOWN_WITH_ARM
+    return Rotation.from_rotvec(down * across) * lying * upright(hand)
 
 
 def axes_in_wrist(hand: Hand, q: np.ndarray) -> np.ndarray:

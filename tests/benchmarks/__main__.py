@@ -202,6 +202,36 @@ def recording(actors: int = 2, seconds: float = 20.0, turns: int = 3) -> int:
     return 0
 
 
+def arms(
+    objects: pathlib.Path,
+    robots: pathlib.Path,
+    arms: tuple[str, ...] = ("panda", "ur5e", "iiwa", "xarm7"),
+    hand: str = "allegro",
+    attempts: int = 16,
+    out: pathlib.Path | None = None,
+) -> int:
+    """Grasps of objects on several arms: how many get a motion, and what forbids the rest.
+
+    Every arm chooses among the same attempts of the policy.
+
+    Args:
+      objects: Folder of objects.
+      robots: Folder with NAME/robot.xml, such as models/assets/robots of robosuite.
+      arms: Names in it.
+      hand: The hand that they carry.
+      attempts: Of the policy, for each object.
+      out: JSON file of errors, shares of limits and refusals.
+
+    Examples:
+      python -m tests.benchmarks arms --objects my-objects --robots robots
+      python -m tests.benchmarks arms --objects my-objects --robots robots --arms panda --hand sharpa
+    """
+    from tests.benchmarks.arms import bench_arms
+
+    bench_arms(objects, robots, arms, hand, attempts, out)
+    return 0
+
+
 COMMANDS = {
     "pieces": pieces,
     "measures": measures,
@@ -212,6 +242,7 @@ COMMANDS = {
     "faults": faults,
     "recovery": recovery,
     "recording": recording,
+    "arms": arms,
 }
 
 if __name__ == "__main__":

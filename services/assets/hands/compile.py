@@ -98,6 +98,12 @@ def compiled_model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
         return mujoco.MjModel.from_binary_path(str(result))
 
 
+def robot_spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
+    """The model of a URDF or MJCF file to build on, once `compiled_model` has read it; raises as that does."""
+    compiled_model(path, notes)
+    return _spec(path, [])
+
+
 def _child(source: str, result: str) -> None:
     """Compiles a file into another; ends by itself, should the parent be gone."""
     signal.alarm(SECONDS + 5)
@@ -130,8 +136,8 @@ def _check_values(model: mujoco.MjModel) -> None:
             raise ValueError(f"its {name} holds numbers below zero")
 
 
-def _compiled(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
-    """The model of a file; a ValueError or MuJoCo's error where it cannot be read."""
+def _spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
+    """The model of a file, not compiled; a ValueError or MuJoCo's error where it cannot be read."""
     for count in _COUNTS.findall(path.read_text(errors="replace")):
         if any(float(number) > MAX_COUNT for number in count.split()):
             raise ValueError(f"it repeats a part {count[:40]} times, more than {MAX_COUNT}")
@@ -149,6 +155,12 @@ def _compiled(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
         for mesh in missing:
             spec.delete(mesh)
         notes.append(_missing(len(missing)))
+    return spec
+
+
+def _compiled(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
+    """The compiled model of a file; raises as `_spec` does."""
+    spec = _spec(path, notes)
     try:
         return spec.compile()
     except ValueError as error:

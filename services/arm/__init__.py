@@ -1,0 +1,1 @@
+"""A hand on an arm: inverse kinematics along a grasp motion, limits and collisions of the arm, joint trajectories."""

@@ -1,0 +1,202 @@
+"""The file of an arm: its joints, limits and flange, without the gripper that it may come with."""
+
+import dataclasses
+import pathlib
+import xml.etree.ElementTree as ET
+
+import mujoco
+import numpy as np
+
+from congrasp.common.errors import CongraspError, MissingPackageError
+from congrasp.services.assets.hands.compile import robot_spec
+
+SPEED = 3.14
+"""rad/s (m/s of slides), the limit of joints whose file has none: MJCF files never have one."""
+_SITES = ("attachment_site", "flange", "tool0", "ee_site")
+_KINDS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Arm:
+    """An arm of N joints from its base to its flange."""
+
+    name: str
+    spec: mujoco.MjSpec
+    """Its bodies and joints without a gripper, in the frame of its base."""
+    joints: tuple[str, ...]
+    """N names, base first."""
+    lower: np.ndarray
+    """(N,) rad or m; -inf where a joint has no limits."""
+    upper: np.ndarray
+    """(N,) rad or m."""
+    speed: np.ndarray
+    """(N,) rad/s or m/s."""
+    flange: str
+    """Name of the body that carries the hand."""
+    position: np.ndarray
+    """(3,) m, the flange's frame in that body's."""
+    quaternion: np.ndarray
+    """(4,) w x y z, the same."""
+    postures: np.ndarray
+    """(P, N) postures in the file's keyframes."""
+
+
+def arm_file(name: str) -> pathlib.Path:
+    """The path itself, or the file of a robot that `mujoco-menagerie` fetches.
+
+    Raises:
+      CongraspError: there is neither such a file nor such a robot, or it cannot be fetched.
+    """
+    path = pathlib.Path(name)
+    if path.suffix or path.exists():
+        return path
+    try:
+        import mujoco_menagerie
+    except ImportError:
+        raise MissingPackageError(f"There is no file {name}. A robot's name", "mujoco_menagerie") from None
+    names = mujoco_menagerie.names()
+    found = [name] if name in names else [other for other in names if name in other.split("_")]
+    if len(found) != 1:
+        remedy = f"Name one of {', '.join(found)}." if found else "Name an MJCF or URDF file."
+        raise CongraspError(f"MuJoCo Menagerie has {len(found)} robots called '{name}'.", remedy)
+    robot = mujoco_menagerie.get(found[0])
+    try:
+        return pathlib.Path(robot.xml(_bare_entry(robot.entry_names)))
+    except (mujoco_menagerie.MenagerieError, OSError):
+        raise CongraspError(
+            f"'{found[0]}' of MuJoCo Menagerie could not be downloaded.",
+            "Connect to the internet, or name an MJCF or URDF file.",
+        ) from None
+
+
+def _bare_entry(names: tuple[str, ...]) -> str:
+    """The entry of a robot without scene, hand and MJX variant, as far as there is one."""
+    return min(names, key=lambda name: ("scene" in name, "mjx" in name, "nohand" not in name, len(name)))
+
+
+def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
+    """Reads an arm.
+
+    Args:
+      path: MJCF or URDF.
+      flange: site or body that carries the hand; found by itself where empty.
+      speed: speed limits of the joints, one or N numbers; those of the file where empty.
+
+    Raises:
+      CongraspError: the file cannot be read, or has no such flange, or joints that are neither hinges nor slides.
+    """
+    spec = robot_spec(path, [])
+    for i, body in enumerate(spec.bodies):
+        body.name = body.name or f"body_{i}"
+    for i, joint in enumerate(spec.joints):
+        joint.name = joint.name or f"joint_{i}"
+    model = spec.compile()
+    body, position, quaternion = _flange(model, path, flange)
+    carried = [i for i in _above(model, body) if model.body_jntnum[i]]
+    joints = [int(model.body_jntadr[i]) + k for i in carried for k in range(model.body_jntnum[i])]
+    if not joints or any(model.jnt_type[j] not in _KINDS for j in joints):
+        raise CongraspError(
+            f"{path} has no chain of hinges and slides from its base to '{model.body(body).name}'.",
+            "Name the arm's last body or site with --flange.",
+        )
+    names = tuple(model.joint(j).name for j in joints)
+    limited = model.jnt_limited[joints].astype(bool)
+    lower, upper = (np.where(limited, model.jnt_range[joints, k], end) for k, end in ((0, -np.inf), (1, np.inf)))
+    postures = model.key_qpos[:, model.jnt_qposadr[joints]]
+    name = model.body(body).name
+    _strip(spec, model, body)
+    return Arm(
+        path.parent.name if path.stem in ("robot", "scene") else path.stem,
+        spec,
+        names,
+        lower,
+        upper,
+        _speeds(path, names, speed),
+        name,
+        position,
+        quaternion,
+        postures,
+    )
+
+
+def _above(model: mujoco.MjModel, body: int) -> list[int]:
+    """Bodies from the base to this one."""
+    chain: list[int] = []
+    while body:
+        chain.insert(0, body)
+        body = int(model.body_parentid[body])
+    return chain
+
+
+def _flange(model: mujoco.MjModel, path: pathlib.Path, name: str) -> tuple[int, np.ndarray, np.ndarray]:
+    """The body that carries the hand, and position (3,) and quaternion (4,) of the flange in its frame."""
+    sites = [model.site(i).name for i in range(model.nsite)]
+    bodies = [model.body(i).name for i in range(model.nbody)]
+    chosen = name or next((site for site in _SITES if site in sites), "")
+    if chosen in sites:
+        site = sites.index(chosen)
+        return int(model.site_bodyid[site]), model.site_pos[site], model.site_quat[site]
+    if chosen in bodies:
+        return bodies.index(chosen), np.zeros(3), np.array([1.0, 0, 0, 0])
+    if chosen:
+        raise CongraspError(f"{path} has no site or body '{chosen}'.", f"It ends with {', '.join(bodies[-4:])}.")
+    return _last_body(model)
+
+
+def _last_body(model: mujoco.MjModel) -> tuple[int, np.ndarray, np.ndarray]:
+    """The end of the chain of joints, before a gripper: see `_flange`.
+
+    A gripper is a body without a joint whose children move apart; where it begins with a joint, it stays.
+    """
+    children: list[list[int]] = [[] for _ in range(model.nbody)]
+    for child in range(1, model.nbody):
+        children[int(model.body_parentid[child])].append(child)
+    moving = np.zeros(model.nbody, bool)
+    for body in reversed(range(1, model.nbody)):
+        moving[body] |= model.body_jntnum[body] > 0
+        moving[int(model.body_parentid[body])] |= moving[body]
+    body = 0
+    while branches := [child for child in children[body] if moving[child]]:
+        if len(branches) > 1:
+            if body and not model.body_jntnum[body]:
+                return int(model.body_parentid[body]), model.body_pos[body], model.body_quat[body]
+            break
+        body = branches[0]
+    while len(children[body]) == 1 and not moving[children[body][0]]:
+        body = children[body][0]
+    return body, np.zeros(3), np.array([1.0, 0, 0, 0])
+
+
+def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
+    """Removes whatever moves beyond the flange, and all that is not kinematics."""
+    for group in (spec.keys, spec.sensors, spec.actuators, spec.equalities, spec.tendons, spec.excludes, spec.pairs):
+        for element in list(group):
+            spec.delete(element)
+    below = {flange}
+    for body in range(flange + 1, model.nbody):
+        if int(model.body_parentid[body]) in below:
+            below.add(body)
+    moving = {b for b in below - {flange} if any(model.body_jntnum[x] for x in below if b in _above(model, x))}
+    for body in moving:
+        if int(model.body_parentid[body]) == flange:
+            spec.delete(spec.body(model.body(body).name))
+    for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+        spec.delete(geom)
+
+
+def _speeds(path: pathlib.Path, joints: tuple[str, ...], text: str) -> np.ndarray:
+    """(N,) speed limits: the given ones, those of a URDF, or `SPEED`."""
+    if text:
+        try:
+            given = np.array([float(word) for word in text.split()])
+        except ValueError:
+            given = np.zeros(0)
+        if len(given) not in (1, len(joints)) or not (np.isfinite(given).all() and (given > 0).all()):
+            raise CongraspError(f"--arm-speed is '{text}'.", f"Write one positive number, or {len(joints)}.")
+        return np.broadcast_to(given, len(joints))
+    stated = {}
+    if path.suffix.lower() == ".urdf":
+        for joint in ET.fromstring(path.read_text(errors="replace")).iter("joint"):
+            limit = joint.find("limit")
+            stated[joint.get("name")] = 0.0 if limit is None else float(limit.get("velocity", 0.0))
+    return np.array([stated.get(name) or SPEED for name in joints])

@@ -1,0 +1,241 @@
+"""A hand on a made-up arm of seven joints: poses by forward kinematics come back, limits hold, refusals have names."""
+
+import csv
+import json
+import sys
+import types
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from congrasp.common.errors import CongraspError, MissingPackageError
+from congrasp.common.hands import get_hand
+from congrasp.services.arm.description import SPEED, arm_file, load_arm
+from congrasp.services.arm.files import CSV, PICTURE, TRAJECTORY
+from congrasp.services.arm.options import ArmOptions
+from congrasp.services.arm.planner import ArmPlanner
+from congrasp.services.arm.robot import Infeasible, build_robot, default_mount
+from congrasp.services.arm.tracking import ANGLE, POSITION, Path, follow
+from congrasp.services.assets.objects.named import one_object
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.cli.main import load
+
+LINKS = [("0 0 1", 0.3, 170), ("0 1 0", 0.0, 120), ("0 0 1", 0.4, 170), ("0 1 0", 0.0, 140), ("0 0 1", 0.4, 170),
+         ("0 1 0", 0.0, 120), ("0 0 1", 0.1, 170)]  # fmt: skip
+"""Axis of each joint, length of its link (m) and range to either side (degrees)."""
+GRIPPER = """<body name="gripper" pos="0 0 0.1">
+  <geom type="box" size=".02 .05 .02"/>
+  <body name="left" pos="0 .03 .05"><joint type="slide" axis="0 1 0" range="0 .03"/><geom size=".01"/></body>
+  <body name="right" pos="0 -.03 .05"><joint type="slide" axis="0 1 0" range="0 .03"/><geom size=".01"/></body>
+</body>"""
+
+
+def mjcf(end: str = '<site name="attachment_site" pos="0 0 0.1"/>') -> str:
+    """The arm; the compiler's angles are degrees, as MuJoCo's are by default."""
+    body = end
+    for i, (axis, length, degrees) in reversed([*enumerate(LINKS, 1)]):
+        above = LINKS[i - 2][1] if i > 1 else 0.0
+        shape = f'<geom type="capsule" size=".04" fromto="0 0 0 0 0 {length}"/>' if length else '<geom size=".05"/>'
+        joint = f'<joint name="j{i}" axis="{axis}" range="-{degrees} {degrees}"/>'
+        body = f'<body name="link{i}" pos="0 0 {above}">{joint}{shape}{body}</body>'
+    motor = '<actuator><motor name="m1" joint="j1"/></actuator>'
+    return f'<mujoco><compiler autolimits="true"/><worldbody>{body}</worldbody>{motor}</mujoco>'
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("arm")
+    (folder / "seven.xml").write_text(mjcf())
+    (folder / "gripping.xml").write_text(mjcf(GRIPPER))
+    trimesh.creation.box((0.05, 0.06, 0.14)).export(folder / "block.stl")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def block(folder):
+    return one_object(folder / "block.stl", ImportOptions(cache_dir=str(folder)))
+
+
+@pytest.fixture(scope="module")
+def robot(folder, block):
+    hand = get_hand("allegro")
+    return build_robot(load_arm(folder / "seven.xml"), hand, default_mount(hand), block)
+
+
+def path_of(robot, q: np.ndarray, at=(3.0, 0.0, 0.1), dt: float = 0.01) -> Path:
+    """Where MuJoCo has the wrist at arm joints (T, 7), with an object somewhere and no table."""
+    hand = get_hand("allegro")
+    data = mujoco.MjData(robot.model)
+    position, turns = [], []
+    for row in q:
+        data.qpos[robot.joints], data.qpos[robot.fingers] = row, hand.q_open
+        mujoco.mj_kinematics(robot.model, data)
+        position.append(data.body(robot.palm).xpos.copy())
+        turns.append(data.body(robot.palm).xquat.copy())
+    count = len(q)
+    still = np.tile([1.0, 0, 0, 0], (count, 1))
+    rotation = Rotation.from_quat(turns, scalar_first=True)
+    objects = np.tile(at, (count, 1))
+    return Path(
+        np.array(position), rotation, np.tile(hand.q_open, (count, 1)), objects, still, np.full(count, -9.0), dt
+    )
+
+
+def swing(seconds: float = 1.5) -> np.ndarray:
+    """(T, 7) joints of a smooth motion from rest to rest."""
+    begin, end = np.radians([[0, 40, 0, 80, 0, 50, 0], [50, 55, 20, 60, -30, 60, 40]])
+    x = np.linspace(0, 1, round(seconds / 0.01) + 1)[:, None]
+    return begin + (10 * x**3 - 15 * x**4 + 6 * x**5) * (end - begin)
+
+
+def test_poses_of_forward_kinematics_come_back_within_every_limit(robot):
+    path = path_of(robot, swing())
+    track = follow(robot, path, np.random.default_rng(0))
+    again = path_of(robot, track.q)
+    off = np.linalg.norm(again.position - path.position, axis=-1)
+    turned = (again.rotation.inv() * path.rotation).magnitude()
+    assert off.max() == pytest.approx(track.position_error, abs=1e-9) and off.max() < 2e-3 < POSITION
+    assert turned.max() == pytest.approx(track.rotation_error, abs=1e-6) and turned.max() < np.radians(0.5) < ANGLE
+    assert (track.q >= robot.arm.lower).all() and (track.q <= robot.arm.upper).all()
+    speed = np.abs(np.diff(track.q, axis=0)) / path.dt
+    assert (speed <= SPEED * (1 + 1e-6)).all()
+    np.testing.assert_allclose(track.speed, speed.max(0) / SPEED, rtol=1e-6)
+
+
+def test_a_wrist_beyond_the_arm_names_the_reach(robot):
+    path = path_of(robot, swing())
+    path.position[:] += [0.0, 0.0, 5.0]
+    with pytest.raises(Infeasible, match=r"the reach|the range of j"):
+        follow(robot, path, np.random.default_rng(0))
+
+
+def test_a_motion_that_is_too_fast_names_the_joint(robot):
+    with pytest.raises(Infeasible, match=r"the (speed|acceleration) of (j\d|the wrist)"):
+        follow(robot, path_of(robot, swing(0.15)), np.random.default_rng(0))
+
+
+def test_a_wrist_that_turns_on_and_on_names_the_range(robot):
+    """The last joint alone turns by 400 degrees: no other can do it in its place while the wrist stays upright."""
+    q = np.tile(np.radians([0.0, 40, 0, 80, 0, 60, 0]), (401, 1))
+    path = path_of(robot, q)
+    turns = path.rotation * Rotation.from_rotvec(np.outer(np.radians(np.arange(401)), [0.0, 0, 1]))
+    still = Path(path.position, turns, path.q, path.object_position, path.object_quaternion, path.table, 0.02)
+    with pytest.raises(Infeasible, match=r"the (range|speed|acceleration) of j\d|the reach|collision"):
+        follow(robot, still, np.random.default_rng(0))
+
+
+def test_what_the_arm_runs_into_is_named(robot):
+    path = path_of(robot, swing())
+    data = mujoco.MjData(robot.model)
+    data.qpos[robot.joints] = swing()[0]
+    mujoco.mj_kinematics(robot.model, data)
+    inside = path_of(robot, swing(), at=data.body("link3").xpos * [0.0, 0.0, 0.5] + [0.03, 0.02, 0.0])
+    with pytest.raises(Infeasible, match="collision of link1 with the object"):
+        follow(robot, inside, np.random.default_rng(0))
+    above = Path(*(getattr(path, name) for name in ("position", "rotation", "q", "object_position")),
+                 path.object_quaternion, np.full(len(path.q), 2.0), path.dt)  # fmt: skip
+    with pytest.raises(Infeasible, match="with the table"):
+        follow(robot, above, np.random.default_rng(0))
+
+
+def test_a_gripper_makes_room_for_the_hand_and_angles_keep_their_units(folder, block):
+    hand = get_hand("allegro")
+    plain, gripping = load_arm(folder / "seven.xml"), load_arm(folder / "gripping.xml")
+    assert gripping.joints == plain.joints == tuple(f"j{i}" for i in range(1, 8))
+    assert gripping.flange == plain.flange == "link7"
+    np.testing.assert_allclose(gripping.position, plain.position)
+    np.testing.assert_allclose(plain.upper, np.radians([degrees for *_, degrees in LINKS]))
+    model = build_robot(gripping, hand, default_mount(hand), block).model
+    bodies = {model.body(i).name for i in range(model.nbody)}
+    assert not {"gripper", "left", "right"} & bodies and model.nq == 7 + len(hand.joints)
+    fingers = [model.joint(f"hand/{joint.name}").id for joint in hand.joints]
+    np.testing.assert_allclose(model.jnt_range[fingers], np.stack([hand.lower, hand.upper], -1), atol=1e-6)
+
+
+def test_the_fingers_point_away_from_the_flange(robot):
+    hand = get_hand("allegro")
+    data = mujoco.MjData(robot.model)
+    mujoco.mj_kinematics(robot.model, data)
+    tips = [data.body(f"hand/{hand.links[i].name}").xpos[2] for i in hand.tip_links[1:]]
+    flange = sum(length for _, length, _ in LINKS)
+    assert min(tips) > flange and data.body(robot.palm).xpos[2] > flange - 1e-6
+
+
+def test_limits_of_a_urdf_and_of_the_user(folder):
+    limit = '<limit lower="-1" upper="1" effort="9" velocity="1.5"/>'
+    links = '<link name="a"/><link name="b"/><link name="c"/>'
+    inertia = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    joints = "".join(
+        f'<joint name="{child}j" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+        f'<axis xyz="0 0 1"/>{limit if child == "b" else limit.replace("1.5", "0")}</joint>'
+        for parent, child in (("a", "b"), ("b", "c"))
+    )
+    path = folder / "two.urdf"
+    path.write_text(f'<robot name="two">{links.replace("/>", f">{inertia}</link>")}{joints}</robot>')
+    arm = load_arm(path)
+    assert arm.joints == ("bj", "cj")
+    np.testing.assert_allclose(arm.speed, [1.5, SPEED])
+    np.testing.assert_allclose(load_arm(path, speed="0.5 2").speed, [0.5, 2.0])
+    with pytest.raises(CongraspError, match="one positive number, or 2"):
+        load_arm(path, speed="1 2 3")
+    with pytest.raises(CongraspError, match="no site or body 'wrist'"):
+        load_arm(path, flange="wrist")
+
+
+def test_a_name_needs_the_package_and_the_network(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)
+    with pytest.raises(MissingPackageError, match=r"pip install 'congrasp\[arm\]'"):
+        arm_file("panda")
+
+    class Unreachable(Exception):
+        pass
+
+    def xml(entry):
+        raise Unreachable(entry)
+
+    robot = types.SimpleNamespace(entry_names=("scene.xml", "panda.xml", "panda_nohand.xml"), xml=xml)
+    known = types.SimpleNamespace(
+        names=lambda: ["franka_panda", "ur5e"], get=lambda name: robot, MenagerieError=Unreachable
+    )
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", known)
+    with pytest.raises(CongraspError, match="'franka_panda' of MuJoCo Menagerie could not be downloaded"):
+        arm_file("panda")
+    with pytest.raises(CongraspError, match="0 robots called 'puma'"):
+        arm_file("puma")
+    robot.xml = lambda entry: tmp_path / entry
+    assert arm_file("ur5e") == tmp_path / "panda_nohand.xml"
+
+
+@pytest.mark.parametrize("option", ["base", "mount"])
+def test_numbers_that_are_none(folder, option):
+    with pytest.raises(CongraspError, match=rf'--{option} is \'1 2\'. Write "X Y Z'):
+        ArmPlanner(ArmOptions(arm=str(folder / "seven.xml"), **{option: "1 2"}), get_hand("allegro"))
+
+
+def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
+    shared = [str(folder / "block.stl"), "--hand", "allegro", "--attempts", "8", "--cache-dir", str(folder)]
+    shared += ["--arm", str(folder / "seven.xml"), "--out", str(tmp_path)]
+    assert load("grasp")([*shared, "--base", "-0.6 0 0 0", "--lift", "0.1"])() == 0
+    facts = json.loads((tmp_path / "block" / "result.json").read_text())
+    assert facts["arm"] == "seven" and facts["arm_base"] == [-0.6, 0, 0, 0] and facts["success"]
+    assert 0 < facts["arm_error_mm"] < 1e3 * POSITION and 0 < facts["arm_speed_share"] <= 1 + 1e-6
+    with (tmp_path / "block" / CSV).open() as file:
+        rows = [*csv.reader(file)]
+    names = [f"j{i}" for i in range(1, 8)] + [joint.name for joint in get_hand("allegro").joints]
+    assert rows[0] == ["time", *names]
+    message = json.loads((tmp_path / "block" / TRAJECTORY).read_text())
+    assert message["joint_names"] == names and len(message["points"]) == len(rows) - 1
+    last = message["points"][-1]
+    np.testing.assert_allclose(last["positions"], [float(x) for x in rows[-1][1:]], atol=1e-6)
+    since = last["time_from_start"]
+    assert since["sec"] + 1e-9 * since["nanosec"] == pytest.approx(float(rows[-1][0]))
+    assert len(last["velocities"]) == len(names)
+    assert np.asarray(Image.open(tmp_path / "block" / PICTURE)).std() > 10
+
+    assert load("grasp")([*shared, "--base", "3 0 0 180", "--no-pictures"])() == 2
+    said = capsys.readouterr().err
+    assert "seven can do none of the" in said and "the reach" in said and "Set another --base" in said
