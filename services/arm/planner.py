@@ -54,6 +54,14 @@ class ArmMotion:
             "arm_acceleration": float(self.track.acceleration.max()),
         }
 
+    def note(self) -> str:
+        """How near the arm is to its limits, in words."""
+        facts = self.facts()
+        return (
+            f"{facts['arm']} carries the hand within {facts['arm_error_mm']:.1f} mm and {facts['arm_error_deg']:.1f}° "
+            f"of its path, {facts['arm_speed_joint']} at {100 * facts['arm_speed_share']:.0f}% of its speed limit at most"
+        )
+
 
 class ArmPlanner:
     """An arm with a hand that follows one grasp motion after another."""

@@ -9,6 +9,8 @@ import tyro
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.config import MetricWriter, RunConfig, Split
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
 from congrasp.common.io.inputs import file_name
 from congrasp.common.task.methods import with_method
 from congrasp.learner.run_directory import CONFIG_FILE, open_run
@@ -106,13 +108,19 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
     """What a command line decides about the other options' defaults: the preset, and the configuration that it names
     together with hand and teacher.
 
-    With --resume the configuration is the run's own.
+    With --resume the configuration is the run's own; a preset for another hand is refused.
     """
-    preset = _value("--preset", arguments) or "quickstart"
-    run_dir = _value("--run-dir", arguments)
+    named, hand = _value("--preset", arguments), _value("--hand", arguments) or None
+    preset, run_dir = named or "quickstart", _value("--run-dir", arguments)
     if {"--resume", "--or-resume"} & set(arguments) and run_dir and (pathlib.Path(run_dir) / CONFIG_FILE).exists():
-        return {"preset": preset, "config": open_run(pathlib.Path(run_dir))}
-    config = get_preset(preset, _value("--hand", arguments) or None)
+        config = open_run(pathlib.Path(run_dir))
+        if named and get_preset(named, hand).task.hand != config.task.hand:
+            raise CongraspError(
+                f"{run_dir} is a run of '{get_hand(config.task.hand).name}', which --preset {named} is not for.",
+                "Leave out --preset, or choose another --run-dir.",
+            )
+        return {"preset": preset, "config": config}
+    config = get_preset(preset, hand)
     if teacher := _value("--teacher", arguments):
         config = student_of(config, teacher)
     return {"preset": preset, "config": config}

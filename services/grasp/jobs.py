@@ -148,7 +148,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "size": size_in_words(np.ptp(obj.visual_vertices, axis=0)),
             "object_mass": obj.mass,
             "shape_reliable": obj.shape_reliable,
-            "notes": [*obj.notes, *_notes(at, obj, settings.options)],
+            "notes": [*obj.notes, *_notes(at, obj, settings.options), *([found.arm.note()] if found.arm else [])],
             "rules": list(found.active),
         }
         save_grasp(folder, found, film=settings.film, pictures=settings.pictures, about=about)

@@ -222,6 +222,7 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
     assert load("grasp")([*shared, "--base", "-0.6 0 0 0", "--lift", "0.1"])() == 0
     facts = json.loads((tmp_path / "block" / "result.json").read_text())
     assert facts["arm"] == "seven" and facts["arm_base"] == [-0.6, 0, 0, 0] and facts["success"]
+    assert "seven carries the hand within" in capsys.readouterr().out
     assert 0 < facts["arm_error_mm"] < 1e3 * POSITION and 0 < facts["arm_speed_share"] <= 1 + 1e-6
     with (tmp_path / "block" / CSV).open() as file:
         rows = [*csv.reader(file)]
