@@ -57,10 +57,9 @@ class ArmMotion:
     def note(self) -> str:
         """How near the arm is to its limits, in words."""
         facts = self.facts()
-        return (
-            f"{facts['arm']} carries the hand within {facts['arm_error_mm']:.1f} mm and {facts['arm_error_deg']:.1f}° "
-            f"of its path, {facts['arm_speed_joint']} at {100 * facts['arm_speed_share']:.0f}% of its speed limit at most"
-        )
+        off = f"{facts['arm_error_mm']:.1f} mm and {facts['arm_error_deg']:.1f}°"
+        speed = f"{facts['arm_speed_joint']} at {100 * facts['arm_speed_share']:.0f}% of its speed limit at most"
+        return f"{facts['arm']} carries the hand within {off} of its path, {speed}"
 
 
 class ArmPlanner:
