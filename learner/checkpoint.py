@@ -21,6 +21,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import sync_directory, write_atomically
+from congrasp.common.io.inputs import open_file
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.common.wire.codec import checksum as checksum_of
 
@@ -146,7 +147,8 @@ def _update(path: pathlib.Path) -> int:
 def _read(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
     """Arrays and meta data of a checkpoint; a CongraspError says why it is not intact."""
     try:
-        data = path.read_bytes()
+        with open_file(path) as file:
+            data = file.read()
     except OSError as error:
         raise CongraspError(f"It cannot be read: {error.strerror}.") from None
     message = decode(data, max_bytes=len(data))

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.io.inputs import open_file
 
 AUDIT = "audit"
 """Folder of a run directory where its journals are."""
@@ -98,7 +99,7 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
     lost = damaged = unchecked = run = 0
     checked, cut = False, False
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             while line := file.readline(_MAX_LINE):
                 if not line.strip(b"\n"):
                     continue
@@ -144,11 +145,12 @@ def is_value(value: Any, kind: type) -> bool:
 
 def _is_cut(path: pathlib.Path) -> bool:
     """Whether a journal ends within a line: its writer was killed in it, or the disk took a part of it."""
-    if not path.exists() or not path.stat().st_size:
+    if not path.exists():
         return False
-    with path.open("rb") as file:
-        file.seek(-1, 2)
-        return file.read() != b"\n"
+    with open_file(path) as file:
+        size = file.seek(0, 2)
+        file.seek(max(0, size - 1))
+        return size > 0 and file.read() != b"\n"
 
 
 def _line(entry: dict[str, Any]) -> bytes:

@@ -17,7 +17,8 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.wire.codec import Message, decode, encode
+from congrasp.common.io.inputs import read_file
+from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.common.wire.messages import RolloutForm, RolloutHeader, validate_rollout
 from congrasp.learner.checkpoint import set_aside
 
@@ -89,7 +90,7 @@ class WriteAheadLog:
             self._number = int(name[1]) + 1
             identity = name[2], name[3], int(name[4])
             try:
-                message = decode(path.read_bytes())
+                message = decode(read_file(path, MAX_MESSAGE))
                 header = validate_rollout(message, form, schema=schema)
                 if (*header.owner, header.sequence) != identity:
                     raise CongraspError("The file's name is that of another rollout.")

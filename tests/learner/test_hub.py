@@ -1,6 +1,7 @@
 """The learner's end, over the in-memory transport."""
 
 import functools
+import os
 import re
 import threading
 import time
@@ -632,13 +633,14 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     damaged.write_bytes(damaged.read_bytes()[:-3] + b"xyz")
     renamed.rename(folder / renamed.name.replace("~2.", "~9."))
     (folder / f"000000000009~a~01~5.safetensors{PART}").write_bytes(b"torn, and so never acknowledged")
+    os.mkfifo(folder / "000000000008~a~01~7.safetensors")  # which would keep a reader waiting for ever
     (folder / "notes.txt").write_text("not ours")
     resumed = bench(log=log(), on_event=lambda *event: said.append(event))
     resumed.hub.publish_weights(bundle(1), 1)
     assert sequences(resumed.hub.next_batch(2, 1)) == [0, 3]
-    assert ("error", "2 accepted rollouts are damaged on disk, and left out.") in said
+    assert ("error", "3 accepted rollouts are damaged on disk, and left out.") in said
     kinds = sorted(path.suffix for path in folder.iterdir())
-    assert kinds == [".aside", ".aside", ".safetensors", ".safetensors", ".txt"]
+    assert kinds == [".aside", ".aside", ".aside", ".safetensors", ".safetensors", ".txt"]
     other = bench(log=log(), run_id="f")
     other.hub.publish_weights(bundle(0, epoch="f"), 0)
     assert not on_disk(other.hub._log) and other.ledger()["queued"] == 0

@@ -1,6 +1,7 @@
 """The audit finds what it is there to find: journals of a run in which something went wrong, by hand."""
 
 import json
+import os
 import pathlib
 import shutil
 import tempfile
@@ -46,6 +47,15 @@ def used(*sequences, version=None, checksum=None, lag=0, incarnation="1"):
 def faults(run_dir):
     report = audit(run_dir)
     return {name: count for name, count in report.counts.items() if count and name not in ("made", "accepted", "used")}
+
+
+def test_a_pipe_in_the_folder_holds_nobody_up(run_dir):
+    learner(run_dir, life(), used(0, 1))
+    os.mkfifo(run_dir / AUDIT / "b.jsonl")
+    with pytest.raises(CongraspError, match=r"b\.jsonl is no regular file"):
+        audit(run_dir)
+    with pytest.raises(CongraspError, match=r"b\.jsonl is no regular file"):
+        Journal(run_dir / AUDIT / "b.jsonl")
 
 
 def test_all_is_well(run_dir):
