@@ -166,6 +166,7 @@ class _Learner:
         self._checkpoints = Checkpoints(run_dir / CHECKPOINTS)
         self._state, meta = self._first_state(resume)
         self._dropped = self._dropped_in_a_row = 0
+        self._saved, self._unsaved = self._state.version, False
         self._run_id, self._skipped, hubs = meta["run_id"], meta["skipped"], meta["hubs"]
         if ranks.count > 1:
             # Before there is a hub, and so before an actor in this process captures its engine's graphs.
@@ -400,6 +401,7 @@ class _Learner:
                 failure = str(error)
         if failure := self._ranks.exchange({"failure": failure}).meta["entries"][0]["failure"]:
             raise CongraspError(failure)
+        self._saved = self._state.version
         self._hub.note_saved()
 
     def _save_if_possible(self) -> bool:
@@ -409,8 +411,15 @@ class _Learner:
         except ReplicasDiffer:
             raise
         except CongraspError as error:
-            self._event("error", f"{error} Training goes on; the next update tries again.")
+            if not self._unsaved:
+                at_stake = f"the {self._state.version - self._saved} update(s) since that of update {self._saved}"
+                text = f"{error} Training goes on, and every update tries again: until one can, a kill costs {at_stake}"
+                self._event("error", f"{text}, and those to come.")
+            self._unsaved = True
             return False
+        if self._unsaved:
+            self._event("info", f"Checkpoints can be written again: there is one of update {self._state.version}.")
+        self._unsaved = False
         return True
 
     def _shut_actors_down(self) -> None:

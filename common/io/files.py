@@ -26,7 +26,8 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise CongraspError(
-            f"{path} could not be written: {error.strerror}.", "Free space or choose another folder; nothing was lost."
+            f"{path} could not be written: {error.strerror}.",
+            "Free space or choose another folder; an earlier file of that name is intact.",
         ) from None
 
 
