@@ -153,9 +153,9 @@ def _curves(
     height += _ABOVE if side is None else _ABOVE_WITH_ARM
     beside = _BESIDE if side is None else _BESIDE_WITH_ARM
     aside = end - rest[:3] if np.linalg.norm((end - rest[:3])[:2]) > 0.03 else -heading
-    side = math.atan2(aside[1], aside[0]) if side is None else side
+    ahead = math.atan2(aside[1], aside[0]) if side is None else side
     for up, azimuth, back in itertools.product(_UP, _AZIMUTHS, _BACK):
-        out = np.array([np.cos(side + azimuth), np.sin(side + azimuth), 0.0])
+        out = np.array([np.cos(ahead + azimuth), np.sin(ahead + azimuth), 0.0])
         begin = np.array([*(rest[:3] + beside * out)[:2], height])
         middle = end - back * heading + [0.0, 0.0, up]
         middle[2] = max(middle[2], 0.06)
