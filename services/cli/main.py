@@ -7,6 +7,8 @@ import importlib
 import inspect
 import io
 import os
+import pathlib
+import re
 import signal
 import sys
 import traceback
@@ -45,6 +47,10 @@ COMMANDS = {
 }
 """Commands in the order of the help; `services.cli.<name>` is the module."""
 
+_READ = {".obj", ".stl", ".ply", ".glb", ".npz", ".csv", ".bvh", ".mcap", ".safetensors", ".urdf", ".xml"}
+"""Endings of files that commands read."""
+_WRITTEN = ("--out", "--json", "--png", "--video", "--pictures")
+"""Options that name what a command writes."""
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
 """The reader of the output is gone, as with `congrasp … | head`."""
@@ -120,6 +126,7 @@ def run(arguments: list[str]) -> int:
         near = difflib.get_close_matches(name, COMMANDS, 1)
         meant = f"Did you mean '{near[0]}'?" if near else f"Choose one of: {', '.join(COMMANDS)}."
         raise CongraspError(f"There is no command '{name}'.", meant)
+    _check_files(rest)
     _prepare_environment()
     with on_signal(interrupt=True) as stop:
         try:
@@ -128,6 +135,23 @@ def run(arguments: list[str]) -> int:
             result = None
             stop.wait(1.0)  # the thread that notes which signal it was may be a moment behind
         return stop.exit_code or (result if isinstance(result, int) else 0)
+
+
+def _check_files(arguments: Sequence[str]) -> None:
+    """Raises a CongraspError for a file to read that is not there, before anything that takes long is imported."""
+    option = ""
+    for argument in arguments:
+        if argument.startswith("-"):
+            option = argument
+            continue
+        path = pathlib.Path(re.sub(r":\d+$", "", argument))
+        if path.suffix.lower() not in _READ or option in _WRITTEN or path.exists():
+            continue
+        named = f"{option}: there" if option else "There"
+        siblings = [one.name for one in path.parent.iterdir()] if path.parent.is_dir() else []
+        near = difflib.get_close_matches(path.name, siblings, 1)
+        remedy = f"Did you mean {path.parent / near[0]}?" if near else "Check the path."
+        raise CongraspError(f"{named} is no file {path}.", remedy)
 
 
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:

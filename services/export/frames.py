@@ -21,8 +21,8 @@ OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""
 SKIN = "skin"
 """Name of the hand's surface."""
-COLOURS = {"flesh": palette.FLESH, "link": palette.SKIN, "joint": palette.JOINT, OBJECT: palette.OBJECT}
-"""Of a human hand, of a robot's links and joints, and of the object."""
+COLOURS = {**palette.MATERIALS, OBJECT: palette.OBJECT}
+"""Of the materials of hands, and of the object."""
 TOLERANCE_MM = 0.1
 """Files whose kinematics differ by more than this are not kept."""
 _LEVER = 0.1  # m; a point this far from a frame's origin shows its rotation

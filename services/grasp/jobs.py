@@ -20,12 +20,13 @@ from congrasp.services.assets.objects.materials import with_mass
 from congrasp.services.assets.objects.named import ObjectAt, objects_at
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sizes import size_in_words
-from congrasp.services.grasp.files import OBJECT, THUMBNAIL, VIDEO, finished, key_of, save_grasp
+from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, key_of, save_grasp
 from congrasp.services.grasp.grasper import Grasper, Progress
 from congrasp.services.grasp.parse import numbered, read_request
 from congrasp.services.viz.import_sheet import import_sheet, mesh_of_file
 from congrasp.services.viz.render import Film
 from congrasp.services.viz.sheets import contact_sheet, save_png
+from congrasp.services.viz.views import View
 
 SHEET, SUMMARY = "summary.png", "summary.json"
 _COLUMNS = 6
@@ -42,6 +43,8 @@ class Settings(NamedTuple):
     """What else makes a grasp: policy, seed, attempts."""
     film: Film | None
     """How a video is drawn; None for no video."""
+    view: View | None
+    """Where pictures and video are seen from; what shows most of the grasp if None."""
     pictures: bool
     again: bool
     """Whether to redo finished objects."""
@@ -131,7 +134,8 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
         key = key_of(_content(at), options, given, settings.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
-        if before is not None and ((folder / VIDEO).exists() or settings.film is None):
+        drawn = [settings.film and [*settings.film], settings.view and [*settings.view]]
+        if before is not None and (settings.film is None or json.loads(json.dumps(drawn)) == before.get("drawn")):
             return Result(at.name, before, skipped=True)
         progress("Importing", 0, 1)
         obj = _load(at, settings.options)
@@ -139,7 +143,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
         if settings.rest:
             request = dataclasses.replace(request, rest=rest_pose(obj, settings.rest))
         if settings.pictures and at.source:
-            save_png(folder / OBJECT, import_sheet(grasper.hand, obj, mesh_of_file(at.source)))
+            save_png(folder / OBJECT, import_sheet(grasper.hand, obj, mesh_of_file(at.source), request.avoid))
         found = grasper.grasp(obj, request, progress)
         progress("Drawing", 0, 1)
         about = {
@@ -150,8 +154,10 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "shape_reliable": obj.shape_reliable,
             "notes": [*obj.notes, *_notes(at, obj, settings.options), *([found.arm.note()] if found.arm else [])],
             "rules": list(found.active),
+            "drawn": drawn,
         }
-        save_grasp(folder, found, film=settings.film, pictures=settings.pictures, about=about)
+        drawing = {"film": settings.film, "pictures": settings.pictures, "view": settings.view}
+        save_grasp(folder, found, about=about, **drawing)
         return Result(at.name, {**found.facts(), **about})
     except CongraspError as error:
         return Result(at.name, {}, str(error))

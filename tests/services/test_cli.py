@@ -8,11 +8,13 @@ import signal
 import socket
 import subprocess
 import sys
+from pathlib import Path
 from unittest import mock
 
 import pytest
 
 import congrasp.services.cli.main as cli
+from congrasp.common.errors import CongraspError
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import COMMANDS, load
 
@@ -162,3 +164,12 @@ def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path):
         done = congrasp("learner", "--run-dir", str(run_dir), "--listen", f"tcp/127.0.0.1:{port}")
     assert done.returncode == 2 and f"127.0.0.1:{port} is in use" in done.stderr
     assert not run_dir.exists()
+
+
+def test_a_misspelt_file_is_named_before_anything_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mug.obj").touch()
+    monkeypatch.setattr(cli, "load", lambda name: pytest.fail("the command's module was imported"))
+    with pytest.raises(CongraspError, match=r"There is no file .*mugg\.obj\. Did you mean .*mug\.obj\?"):
+        cli.run(["grasp", str(tmp_path / "mugg.obj"), "--out", "new.obj"])
+    with pytest.raises(CongraspError, match=r"--pose: there is no file .*far\.npz\. Check the path\."):
+        cli.run(["grasp", str(tmp_path / "mug.obj"), "--pose", str(tmp_path / "far.npz:3")])

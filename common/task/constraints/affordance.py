@@ -181,6 +181,12 @@ class Affordance(Constraint):
         grasped, avoided = given["affordance"], given["avoid"]
         if grasped and avoided:
             region = avoided.distance < grasped.distance
+            if not (grasped.distance < avoided.distance).any():
+                raise CongraspError(
+                    f"--affordance '{grasped.text}' and --avoid '{avoided.text}' contradict each other: all that "
+                    f"may be grasped of '{obj.name}' must not be touched.",
+                    "Leave one of them out, or name different parts.",
+                )
         elif avoided:
             region = avoided.distance < _NEAR
         else:

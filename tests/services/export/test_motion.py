@@ -183,7 +183,7 @@ def test_a_glb_is_y_up_for_others_and_names_its_units(human: GraspMotion, tmp_pa
     assert root["extras"]["unit"] == "m" and root["extras"]["quaternion"] == "x, y, z, w"
     assert root["extras"]["joints"] == human.joint_names.tolist()
     assert all("matrix" not in node for node in file["nodes"])
-    assert [m["pbrMetallicRoughness"]["metallicFactor"] for m in file["materials"]] == [0.0, 0.0]
+    assert [m["pbrMetallicRoughness"]["metallicFactor"] for m in file["materials"]] == [0.0] * 4
 
 
 def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pathlib.Path) -> None:

@@ -204,7 +204,7 @@ def test_what_is_not_held_is_told_by_the_exit_code(tmp_path, capsys, monkeypatch
     assert command(folder / "loose.stl", "--out", tmp_path / "out") == 1
     assert "not held" in capsys.readouterr().out
     assert command(tmp_path / "nothing.stl", "--out", tmp_path / "out") == 2
-    assert "There is no file or folder" in capsys.readouterr().err
+    assert "There is no file" in capsys.readouterr().err
     assert command(folder / "loose.stl", "--out", tmp_path / "out", "--heading", "up there", "--again") == 2
     assert "--heading is 'up there', not 3 numbers" in capsys.readouterr().err
 

@@ -66,6 +66,8 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
     trimesh.PointCloud(np.asarray(upper.sample(4000))).export(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "cloud.ply")).avoid[clear], high[clear])
     np.testing.assert_array_equal(asked(block, affordance="near half").avoid, block.labels == 1)
+    with pytest.raises(CongraspError, match=r"--affordance 'near half' and --avoid 'near half' contradict each other"):
+        asked(block, affordance="near half", avoid="near half")
     with pytest.raises(CongraspError, match=r"no constraint option 'colour'\. Known: heading, at, affordance, avoid"):
         asked(block, colour="red")
     with pytest.raises(CongraspError, match=r"has no part 'handle'\. Its parts are: near half, far half"):
