@@ -17,7 +17,7 @@ from typing import Any, TextIO
 
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.files import cache_folder
-from congrasp.services.ops.logs import log_error
+from congrasp.services.ops.logs import announced, log_error
 from congrasp.services.ops.shutdown import follow_parent, on_signal
 
 COMMANDS = {
@@ -130,7 +130,9 @@ def run(arguments: list[str]) -> int:
     _prepare_environment()
     with on_signal(interrupt=True) as stop:
         try:
-            result = _parsed(name, load(name), rest)()
+            with announced(f"Loading 'congrasp {name}'"):
+                call = _parsed(name, load(name), rest)
+            result = call()
         except KeyboardInterrupt:
             result = None
             stop.wait(1.0)  # the thread that notes which signal it was may be a moment behind
@@ -144,7 +146,7 @@ def _check_files(arguments: Sequence[str]) -> None:
         if argument.startswith("-"):
             option = argument
             continue
-        path = pathlib.Path(re.sub(r":\d+$", "", argument))
+        path = pathlib.Path(re.sub(r":\w+$", "", argument))
         if path.suffix.lower() not in _READ or option in _WRITTEN or path.exists():
             continue
         named = f"{option}: there" if option else "There"

@@ -42,8 +42,14 @@ def view(
       congrasp view runs/mine
       congrasp view --objects my-objects --port 8080
     """
+    import contextlib
+
     from congrasp.common.errors import CongraspError
+    from congrasp.services.ops.logs import announced
     from congrasp.services.ops.shutdown import on_signal
+
+    starting = contextlib.ExitStack()
+    starting.enter_context(announced("Loading the policies and compiling the studio's rules"))
     from congrasp.services.studio.app import open_view
 
     if run_dir is not None:
@@ -55,6 +61,7 @@ def view(
         connect, run, policy, recordings = _of_folder(run_dir, certs)
     with (
         on_signal() as stop,
+        starting,
         open_view(
             objects=objects,
             policy=policy,
@@ -67,6 +74,7 @@ def view(
             certs=certs,
         ) as url,
     ):
+        starting.close()
         print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
         stop.wait()
         return stop.exit_code

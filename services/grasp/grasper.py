@@ -331,8 +331,14 @@ def grasp(
 ) -> Grasp:
     """The best grasp motion of an object under constraints; what is compiled is kept for the next call.
 
+    Example:
+      import congrasp
+
+      found = congrasp.grasp("mug:7", heading="above", attempts=8)
+      print(found.success, found.held, "of", found.attempts, "attempts hold it")
+
     Args:
-      mesh: a mesh (STL, OBJ, PLY, GLB), an object file, or an object.
+      mesh: a mesh (STL, OBJ, PLY, GLB), an object file, FAMILY:SEED of the generator, or an object.
       policy: a policy file; the one that comes with the package if none is named.
       hand: name of the hand whose pretrained policy is taken.
       options: how a mesh becomes an object.

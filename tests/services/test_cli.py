@@ -17,6 +17,7 @@ import congrasp.services.cli.main as cli
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import COMMANDS, load
+from congrasp.services.ops.logs import announced
 
 
 def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -91,7 +92,7 @@ def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words, monkeypatch
     ("arguments", "words"),
     [
         (["train", "--physics", "warp", "--run-dir", "/nonexistent-run"], "NVIDIA GPU"),
-        (["serve", "--policy", "/nonexistent.safetensors"], "cannot be read"),
+        (["serve", "--policy", "/nonexistent"], "cannot be read"),
         (["query", "--connect", "tcp/127.0.0.1:1", "--repeat", "2"], "127.0.0.1:1"),
     ],
 )
@@ -173,3 +174,14 @@ def test_a_misspelt_file_is_named_before_anything_is_imported(tmp_path: Path, mo
         cli.run(["grasp", str(tmp_path / "mugg.obj"), "--out", "new.obj"])
     with pytest.raises(CongraspError, match=r"--pose: there is no file .*far\.npz\. Check the path\."):
         cli.run(["grasp", str(tmp_path / "mug.obj"), "--pose", str(tmp_path / "far.npz:3")])
+
+
+def test_what_takes_long_says_for_how_long_and_what_does_not_says_nothing(capsys: pytest.CaptureFixture) -> None:
+    with announced("Compiling", first=60.0):
+        pass
+    assert not capsys.readouterr().err
+    lines: list[str] = []
+    with announced("Compiling", first=0.01, every=0.01):
+        while len(lines) < 2:
+            lines += capsys.readouterr().err.splitlines()
+    assert set(lines) == {"Compiling: 0 s so far."}

@@ -245,10 +245,10 @@ export class StudioPanel {
     this.watching = false;
   }
 
-  // "3. mug: held"
+  // "3. mug, affordance, from above: held"
   #name(id) {
     const motion = this.state.motions.find((other) => other.id === id);
-    return motion ? `${motion.id}. ${motion.object}: ${outcomeOf(motion.success, motion.held).outcome}` : "";
+    return motion ? `${motion.id}. ${motion.object}, ${motion.asked}: ${outcomeOf(motion.success, motion.held).outcome}` : "";
   }
 
   #motions(motions) {

@@ -1,5 +1,6 @@
 """Constraints as people write them down."""
 
+import dataclasses
 import json
 import os
 
@@ -9,6 +10,7 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.export.motion_file import motion_of_episode, save_motion
@@ -182,3 +184,13 @@ def test_a_motion_has_no_numbers(block):
     for name in ("pose", "trajectory"):
         with pytest.raises(CongraspError, match=r"grasp\.npz is one motion and has no number 3. Leave the number out"):
             asked(block, **{name: "grasp.npz:3"})
+
+
+def test_a_joint_of_a_skeleton_leads_to_where_it_is_nearest_to_the_object():
+    mug = dataclasses.replace(generate(7, "mug"), origin=(0.03, 0.0, -0.05))
+    path = asked(mug, trajectory="examples/reach.bvh").constraints["trajectory"]
+    distance = np.linalg.norm(path["position"], axis=-1)
+    assert path["position"].shape == (15, 3) and distance.argmin() == 14
+    assert distance[0] - distance[-1] > 0.1  # it comes from at least a decimetre farther away
+    with pytest.raises(CongraspError, match="LeftHand"):
+        asked(mug, trajectory="examples/reach.bvh:LeftHand")

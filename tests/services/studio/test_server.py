@@ -125,6 +125,7 @@ def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasp
     assert tuple(grasping.asked[-1][1].constraints) == ("heading", "affordance")
     motions = json.loads(page.ask("GET", "/api/state")[1])["motions"]
     assert motions[0]["held"] and motions[0]["steps"] == made_up.STEPS
+    assert motions[0]["asked"].endswith("from the side")
     played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])
     assert played.arrays["lane/affordance/met"].shape == (made_up.STEPS,)
     for kind in ("npz", "mcap"):
