@@ -55,8 +55,8 @@ def headings(
     if free and (first := min(r for r, *_ in options)) > 0:
         height = np.ptp(matrix(obj.rest_poses[0][3:])[2] @ obj.points.T)
         raise CongraspError(
-            f"'{obj.name}' lies too flat for the {hand.name} hand: {1000 * height:.0f} mm high in its likeliest resting "
-            "pose, which leaves the fingers no room over the table.",
+            f"'{obj.name}' lies too flat for the {hand.name} hand: {1000 * height:.0f} mm high in its likeliest "
+            "resting pose, which leaves the fingers no room over the table.",
             f"Set --rest {first + 1} to grasp it in another resting pose.",
         )
     shares = np.array(weights) / np.sum(weights)

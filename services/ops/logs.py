@@ -70,7 +70,7 @@ def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> Non
 
 @contextlib.contextmanager
 def announced(what: str, first: float = 3.0, every: float = 10.0) -> Iterator[None]:
-    """Prints on the standard error what takes long and for how long already, after `first` and every `every` seconds."""
+    """Prints what takes long, and for how long already, after `first` and then every `every` seconds (to stderr)."""
     done, began = threading.Event(), time.monotonic()
 
     def tell() -> None:
