@@ -168,7 +168,7 @@ class TaskConfig(_Shares):
     """Constraints that the policy knows: what it observes, and can be asked for."""
     headings: Literal["all", "above", "center"] = "all"
     """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier); `center`
-    keeps headings at which the hand's centre alone is above the table (harder: a row of the exam)."""
+    takes the paper's rules alone, with the hand's centre above the table (harder: a row of the exam)."""
     own_references: bool = True
     """Half of an object's reference poses and trajectories are remade from the policy's own grasps as it learns; the
     others, or all without, stay those that closing the hand around the objects gave."""

@@ -280,7 +280,7 @@ def within_reach(
         if avoid is not None:
             reachable &= np.array([closes_on(moved, obj.points, avoid) for moved in cleared])
         if pressed:
-            reachable &= np.array([_opposed(moved, obj, bare) for moved in cleared])
+            reachable &= np.array([opposed_at(moved, obj, bare) for moved in cleared])
         if touching:
             reachable &= np.array([_contacts_over_table(moved, rest, width) for moved, rest in pairs])
         if reachable.any():
@@ -294,7 +294,7 @@ def _contacts_over_table(headings: Headings, rest_pose: np.ndarray, width: np.nd
     return headings.position @ up + rest_pose[2] - np.abs(headings.cross @ up) * width / 2 > 0
 
 
-def _opposed(headings: Headings, obj: GraspObject, avoid: np.ndarray) -> np.ndarray:
+def opposed_at(headings: Headings, obj: GraspObject, avoid: np.ndarray) -> np.ndarray:
     """(H,) bool, true where surfaces outside of the avoid region (P,) can be pressed on from both sides."""
     points, normals, avoid = obj.points[:_WIDTH_POINTS], obj.normals[:_WIDTH_POINTS], avoid[:_WIDTH_POINTS]
     along, aside, depth = _offsets(headings, points)
