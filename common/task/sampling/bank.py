@@ -53,7 +53,7 @@ class ConstraintBank(NamedTuple):
     has_affordance: Array
     """(N, R) bool: the object has an avoid region, and its graspable one can be approached in the resting pose."""
     weight: Array
-    """(N,) how often the object is drawn, in relation to the others."""
+    """(N,) relative frequency of the object; 0 for one that lies too flat to be grasped."""
     mass: Array
     """(N,) kg, before the factor of the episode."""
     renewable: Array

@@ -85,7 +85,7 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
     surfaces = [np.stack([getattr(obj, name) for obj in objects]).astype(np.float32) for name in ("points", "normals")]
     key = jax.random.key(seed)
     references = _references(hand, *surfaces, *chosen, columns["rest"], key, waypoints=task.trajectory_points)
-    own = {"weight": np.ones(count, np.float32), "renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
+    own = {"renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
     own["mass"] = np.array([obj.mass for obj in objects], np.float32)
     return jax.device_put(ConstraintBank(**columns, **references, **own))
 
@@ -203,6 +203,8 @@ def headings_of(
 ) -> dict[str, np.ndarray]:
     """What NumPy finds out about one object; resting poses without a reachable heading are left out.
 
+    An object that lies too flat in all of them, such as a wide board, is given weight 0: no episode draws it.
+
     Args:
       task: geometry of the approach.
       obj: the object.
@@ -234,6 +236,9 @@ def headings_of(
         for headings, avoid in zip(sets, regions, strict=True)
     ]
     reachable = np.stack([fine for _, fine in found])
+    if too_flat := not reachable[0].any():
+        found[0] = within_reach(whole, obj, obj.rest_poses, own, opposed=False)
+        reachable[0] = found[0][1]
     if task.headings == "above" and reachable[0].any():
         steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
         reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
@@ -271,6 +276,7 @@ def headings_of(
         **{name: value.astype(np.float32) for name, value in floats.items()},
         "avoid": avoid,
         "heading_index": index.astype(np.int32),
+        "weight": np.float32(not too_flat),
         "has_affordance": (graspable is not None) & avoid.any() & reachable[1].any(-1),
     }
 
