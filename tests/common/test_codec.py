@@ -71,7 +71,7 @@ def test_decode_reads_what_safetensors_writes():
     crc = zlib.crc32(plain[8 + length :])
     data = safetensors.numpy.save(written, {"meta": '{"a": 1}', "crc32": f"{crc:08x}"})
     assert_equal(Message(written, {"a": 1}), decode(data))
-    with pytest.raises(CongraspError, match="lacks its meta data or its checksum"):
+    with pytest.raises(CongraspError, match="lacks its metadata or its checksum"):
         decode(plain)
 
 
@@ -136,11 +136,11 @@ TWO = np.array([1, 2], np.float32).tobytes()
         ((2).to_bytes(8, "little") + b"{]", "not JSON"),
         ((2).to_bytes(8, "little") + b"\xff\xff", "not JSON"),
         ((1 << 18).to_bytes(8, "little") + b"[" * (1 << 18), "not JSON"),
-        ((2).to_bytes(8, "little") + b"{}", "lacks its meta data"),
+        ((2).to_bytes(8, "little") + b"{}", "lacks its metadata"),
         ((13).to_bytes(8, "little") + b'{"a":1,"a":2}', "key twice"),
         (packed({"x": entry()}, TWO, crc="00000000"), "do not match their checksum"),
         (packed({"x": entry()}, TWO, crc="zz"), "do not match their checksum"),
-        (packed({"x": entry()}, TWO, crc=None, key="crc33"), "lacks its meta data or its checksum"),
+        (packed({"x": entry()}, TWO, crc=None, key="crc33"), "lacks its metadata or its checksum"),
         (packed({"x": entry()}, TWO, key="checksum"), "does not match its checksum"),
         (packed({}, meta="[1]"), "not a JSON object"),
         (packed({}, meta='{"a": NaN}'), "NaN"),
@@ -176,7 +176,7 @@ def test_damage_is_named(data, match):
 
 def test_length_is_limited():
     data = encode(Message({"x": np.zeros(100)}))
-    with pytest.raises(CongraspError, match=f"has {len(data)} bytes, more than the 100"):
+    with pytest.raises(CongraspError, match=f"has {len(data)} bytes; the limit is 100"):
         decode(data, max_bytes=100)
     assert decode(data, max_bytes=len(data)).arrays["x"].shape == (100,)
 

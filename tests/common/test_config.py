@@ -34,7 +34,7 @@ def test_a_run_of_before_a_setting_keeps_what_held_then():
 
 @pytest.mark.parametrize("task", [None, 3, [], "task", {"control": None}, {"control": [1]}])
 def test_a_task_that_is_none_is_refused(task):
-    with pytest.raises(CongraspError, match="does not fit this version"):
+    with pytest.raises(CongraspError, match="does not match this version"):
         run_config_from_json(json.dumps({"task": task}))
 
 

@@ -114,7 +114,7 @@ def test_recordings_of_others_are_one_line(tmp_path):
     raw = opaque_channel("/episode/a/raw", EPISODE_SCHEMA)
     whole = episode()
     for number, (change, why) in enumerate((
-        ({"hand": "/etc/hosts.json"}, "no hand that a message can name"),
+        ({"hand": "/etc/hosts.json"}, "not a hand that a message can name"),
         ({"success": None}, "'success' is None"),
         ({"metrics": []}, r"'metrics' is \[\]"),
     )):  # fmt: skip

@@ -165,7 +165,7 @@ def test_what_the_file_draws_is_kept_beside_the_hand_and_drawn(driven, tmp_path,
     still = loose.posed(loose.origins, np.broadcast_to(np.eye(3), (len(loose.origins), 3, 3)))
     np.testing.assert_allclose(np.linalg.norm(still[1], axis=1), 1.0, rtol=1e-5)
     refused("has no link 'wing'", {"wing": (vertices, faces)})
-    refused("has 'palm' 85 m from the wrist; 2 m is the most", {"palm": (1000 * vertices, faces)})
+    refused("has 'palm' 85 m from the wrist, more than 2 m", {"palm": (1000 * vertices, faces)})
     save_meshes(path, {})
     assert load_meshes(path, driven.hand) == {}
 
