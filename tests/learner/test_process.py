@@ -213,7 +213,7 @@ def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a
     create_run(tmp_path, config)
     monkeypatch.setattr(Admission, "check", lambda self, message: None)  # what is within the ranges breaks nothing
     actor = MadeUpActor(MemoryTransport(hub), reward=1e37)
-    with pytest.raises(PhysicsError, match=r"update 5: .* 5th batch in a row.*failure") as caught:
+    with pytest.raises(PhysicsError, match=r"update 5: .* 5th such batch in a row.*failure") as caught:
         learn(tmp_path, hub, config)
     actor.stop.set()
     actor.join(10.0)
@@ -302,7 +302,7 @@ def test_directories_that_are_no_runs_or_runs_already(tmp_path, hub):
     with pytest.raises(CongraspError, match="not a run directory"):
         learn(tmp_path, hub)
     create_run(tmp_path, CONFIG)
-    with pytest.raises(CongraspError, match="holds a run already"):
+    with pytest.raises(CongraspError, match="already has a run"):
         create_run(tmp_path, CONFIG)
     with pytest.raises(CongraspError, match="no checkpoint"):
         learn(tmp_path, hub, resume=True)

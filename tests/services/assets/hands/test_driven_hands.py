@@ -198,7 +198,7 @@ def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
     assert found[1] == expected[1] and {2, 3, 6} <= {*found[1]}  # balls, capsules and boxes
     np.testing.assert_allclose(found[0], expected[0], atol=2e-6)
     assert ours.body_mass.sum() == pytest.approx(sum(link.mass for link in driven.hand.links))
-    with pytest.raises(CongraspError, match="jax collides capsules alone"):
+    with pytest.raises(CongraspError, match="jax supports capsules only"):
         MjxPhysics(hand, TaskConfig(), [])
 
 
