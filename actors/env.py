@@ -239,7 +239,7 @@ class GraspEnv:
         stacked = jnp.stack([found[name] for name in terms(task)], -1)
         reward = jnp.sum(stacked, -1)
         error = metrics.errors(scene)
-        # # The paper's window ends `hold_steps` after the removal, however long the episode continues.
+        # The paper's window ends `hold_steps` after the removal, however long the episode continues.
         window = ~had_table & (state.time <= task.approach_steps + task.hold_steps)
         force = jnp.linalg.norm(scene.features.force, axis=-1)
         state = state._replace(
@@ -260,7 +260,7 @@ class GraspEnv:
             counts, terminal = counts | fell, terminal | fell
         finished = jnp.where(counts[:, None], self._episode(state, up), state.finished)
         state = state._replace(finished=finished, has_finished=state.has_finished | counts)
-        # # If the object is not held, any end is final: the reward already contains the fall.
+        # If the object is not held, any end is final: the reward already contains the fall.
         transition = Transition(
             reward=reward,
             terminal=terminal,

@@ -44,7 +44,7 @@ def episode_message(
     ends = np.flatnonzero(np.asarray(trace.terminal))
     steps = int(ends[0]) + 1 if len(ends) else len(np.asarray(trace.terminal))
     cut = Trace(*(np.asarray(field)[:steps] for field in trace))
-    # # For the whole trace, however early the episode ends: another length would be recompiled.
+    # For the whole trace, however early the episode ends: another length would be recompiled.
     position, quaternion = _frames(hand, trace.q, trace.wrist_position, trace.wrist_quaternion)
     arrays = {
         "link_position": position[:steps],

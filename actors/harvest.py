@@ -104,10 +104,10 @@ def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, ke
     own = jnp.arange(unused.shape[1]) < places
     slot = jnp.argmax(2.0 * unused + own * jax.random.uniform(slot_key, unused.shape), -1)
     place = grasps.object_index, grasps.region, slot
-    # # Of several grasps for one entry the last is used for all arrays: a scatter would mix them on a GPU.
+    # Of several grasps for one entry the last is used for all arrays: a scatter would mix them on a GPU.
     number = jnp.arange(slot.size)
     taken = jnp.full(bank.pose_q.shape[:3], -1).at[place].max(jnp.where(usable, number, -1))
-    # # Writes outside an array are dropped.
+    # Writes outside an array are dropped.
     row = jnp.where(usable & (taken[place] == number), grasps.object_index, objects)
     where = row, grasps.region, slot
     return bank._replace(

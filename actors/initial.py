@@ -216,7 +216,7 @@ def _drawn(
         gain_scale=gain_low + (gain_high - gain_low) * jax.random.uniform(own_key(key, "gains", 0), batch),
         stationary=jnp.broadcast_to(stationary, batch),
     )
-    # # Squared, so that short holds, whose beginning every episode shares, remain the most common.
+    # Squared, so that short holds, whose beginning every episode shares, remain the most common.
     longer = jnp.floor(length**2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
     hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
     sensors = draw_sensors(task.sensing, task.control_dt, own_key(key, "sensing", 0), len(hold))

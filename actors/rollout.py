@@ -346,7 +346,7 @@ class RolloutWorker:
 
     def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
         """Collects a rollout with an engine that JAX cannot trace; see `collect`."""
-        # # One more key than steps: the decision after the last step only yields `last_observation`.
+        # One more key than steps: the decision after the last step only yields `last_observation`.
         keys = jax.random.split(key, steps + 1)
         key_data = jax.random.key_data(keys)
         parameters, settings = _on_device((parameters, self._settings))

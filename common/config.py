@@ -19,7 +19,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import CONTACT_TIME
 from congrasp.common.io.inputs import file_name
 from congrasp.common.runtime.engines import PhysicsName
-from congrasp.common.task.constraints import CONSTRAINTS, OURS, PAPER
+from congrasp.common.task.constraints import CONSTRAINTS, OURS
 from congrasp.common.task.reward import GRASP
 
 MetricWriter = Literal["tensorboard", "wandb", "wandb-offline"]
@@ -55,7 +55,7 @@ class RewardWeights(_Weights):
 
 @dataclasses.dataclass(frozen=True)
 class ControlConfig:
-    """How actions become joint targets (paper, section Control Space)."""
+    """Mapping from actions to joint targets (paper, section Control Space)."""
 
     finger_scale: float = 0.1
     """alpha_f, rad per unit of action and control step."""
@@ -171,7 +171,7 @@ class TaskConfig(_Shares):
     """Constraints that the policy supports: it observes them, and requests may contain them."""
     headings: Literal["all", "above", "center"] = "all"
     """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier); `center`
-    keeps headings at which only the hand's centre must be above the table (harder: a row of the evaluation)."""
+    takes the paper's rules only, with the hand's centre above the table (harder: a row of the evaluation)."""
     own_references: bool = True
     """Regenerates half of an object's reference poses and trajectories from the policy's current grasps during
     training. The others, or all of them if false, come from closing the hand around the objects."""
@@ -441,10 +441,6 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         fields = json.loads(text, parse_constant=_no_constant)
         if not isinstance(fields, dict):
             raise ValueError("it is not an object")
-        if "task" in fields:
-            fields["task"] = with_older_physics(fields["task"])
-        if isinstance(fields.get("network"), dict):
-            fields["network"] = with_older_critic(fields["network"])
         config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
     except (ValueError, RecursionError) as error:  # not UTF-8, or nested too deep
         raise CongraspError(
@@ -454,42 +450,6 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         raise CongraspError(f"The configuration does not match this version: {error}.") from None
     file_name(config.name, "a run")
     return config
-
-
-def with_older_physics(task: Any) -> Any:
-    """Returns a `TaskConfig` from JSON; an older file gets the default physics and constraints of its time.
-
-    Args:
-      task: any JSON value; changed only if it is an object whose `control`, if present, is an object.
-    """
-    control = task.get("control", {}) if isinstance(task, dict) else None
-    if not isinstance(control, dict):
-        return task
-    fastest = control.get("guidance_position_limit", 0.04)
-    then = {
-        "wrist_acceleration": 0.0,
-        "wrist_angular_acceleration": 0.0,
-        "hold_acceleration": 1.0,
-        "load_rate": 0.0,
-        "approach_position_limit": fastest,
-        "closing_position_limit": fastest,
-    }
-    back_off = task.get("back_off", 0.15)
-    begun = {
-        "constraints": PAPER,
-        "constant_mass": False,
-        "torsional_friction": 0.0,
-        "object_damping": 5e-4,
-        "preshape": False,
-        "initial_speed": 0.0,
-        "back_off_range": [back_off, back_off],
-    }
-    return {"contact_time": 0.016, **begun, **task, "control": {**then, **control}}
-
-
-def with_older_critic(network: dict[str, Any]) -> dict[str, Any]:
-    """Returns a `NetworkConfig` from JSON; the critic of an older file sees the observation only."""
-    return {"privileged_critic": False, **network}
 
 
 def _no_constant(name: str) -> float:

@@ -55,7 +55,7 @@ def from_matrix(m: Array) -> Array:
         [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]],
         -1,
     )
-    # # Row k holds 4 q_k q; the candidate with the largest component is the most accurate.
+    # Row k holds 4 q_k q; the candidate with the largest component is the most accurate.
     w_row = jnp.concatenate([1.0 + trace[..., None], skew], -1)
     symmetric = m + jnp.swapaxes(m, -1, -2)
     squares = 1.0 - trace[..., None] + 2.0 * diagonal[..., 1:]
@@ -119,7 +119,7 @@ def quaternion_to_euler(q: Array, near: Array) -> Array:
       near: (..., 3) rad, such as the current angles.
     """
     m = to_matrix(q)
-    # # A weight on the current x decides where the matrix does not: it moves x by less than 0.1 degrees while y is more
+    # A weight on the current x decides where the matrix does not: it moves x by less than 0.1 degrees while y is more
     # than a third of a degree from 90. y and z are exact for any x.
     sine, cosine = _UNDECIDED * jnp.sin(near[..., 0]), _UNDECIDED * jnp.cos(near[..., 0])
     branches = [

@@ -168,7 +168,7 @@ class _Learner:
         self._saved, self._unsaved = self._state.version, False
         self._run_id, self._skipped, hubs = meta["run_id"], meta["skipped"], meta["hubs"]
         if ranks.count > 1:
-            # # Before the hub exists, and so before an actor in this process captures its engine's graphs.
+            # Before the hub exists, and so before an actor in this process captures its engine's graphs.
             self._warm_up()
         name, staleness = str(ranks.rank), config.ppo.max_staleness
         log_error = functools.partial(self._event, "error")
@@ -248,7 +248,7 @@ class _Learner:
         if self._ranks.count == 1:
             self._warm_up()
         pace, watch = Pace(), CollapseWatch(self._config.collapse_patience)
-        # # Soon after a resume: until there is a checkpoint, rollouts of new versions cannot be recovered.
+        # Soon after a resume: until there is a checkpoint, rollouts of new versions cannot be recovered.
         end, saved, due = None, -1, not self._is_new
         while self._state.version < self._config.updates and end is None:
             began = time.monotonic()
@@ -263,7 +263,7 @@ class _Learner:
             if self._ranks.rank == 0:
                 self._log("metrics", {"update": self._state.version, "version": self.version, "values": values})
             on_update({"update": float(self._state.version), "version": float(self.version), **values})
-            # # Success is expected to drop when objects are released after the stationary phase.
+            # Success is expected to drop when objects are released after the stationary phase.
             stationary = self._config.curriculum.stationary(self.version)
             if not stationary and (collapse := watch.add(values)):
                 self._ranks.close()

@@ -94,7 +94,7 @@ def exclusive(run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text
     Raises:
       CongraspError: another process holds the lock.
     """
-    # # A lock by `lockf` belongs to the process: forked children do not inherit it.
+    # A lock by `lockf` belongs to the process: forked children do not inherit it.
     with open(run_dir / _LOCK_FILE, "a+b", 0) as file:
         try:
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

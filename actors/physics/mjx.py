@@ -65,9 +65,9 @@ class MjxPhysics:
         self._where = addresses(pool.model, hand)
         self._links = np.array([pool.model.body(link.name).id for link in hand.links])
         self._nq, self._nv, self._nu = pool.model.nq, pool.model.nv, pool.model.nu
-        # # MJX has no elliptic cones without friction: links get the hand's sliding friction, a tenth.
+        # MJX has no elliptic cones without friction: links get the hand's sliding friction, a tenth.
         pool.model.geom_condim[:] = CONTACT.condim
-        # # MJX has no contact sensor between bodies; contacts are read from the contact list instead.
+        # MJX has no contact sensor between bodies; contacts are read from the contact list instead.
         pool.model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
         pool.model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN
         self._host_model = pool.model
@@ -192,7 +192,7 @@ def _strongest_contacts(body_of_geom: np.ndarray, links: np.ndarray, object_body
     index = np.asarray(contact.efc_address)
     # An elliptic contact of dimension 3 has a row for the normal and one for each tangent.
     force = jnp.where((index >= 0)[:, None], data._impl.efc_force[index[:, None] + np.arange(3)], 0.0)
-    # # Normals point from the first geom to the second; the sensors need them from the link to the object.
+    # Normals point from the first geom to the second; the sensors need them from the link to the object.
     sign = jnp.where(body[:, 1] == object_body, 1.0, -1.0)[:, None]
     found = (contact.dist < contact.includemargin).astype(jnp.float32)[:, None]
     local = jnp.concatenate([force[:, :2], force[:, 2:] * sign], -1)

@@ -28,7 +28,7 @@ class Scene:
 
     def __init__(self, model: mujoco.MjModel):
         """Wraps a model; nothing is copied yet."""
-        # # MuJoCo would silently reset a diverged environment to a pose that is not the episode's start.
+        # MuJoCo would silently reset a diverged environment to a pose that is not the episode's start.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model = model
         self.spare: list[EnvInstance] = []
@@ -68,7 +68,7 @@ class NativePhysics:
           objects: the pool indexed by `ResetState.object_index`.
           threads: threads that step environments in parallel.
         """
-        # # MuJoCo would write every warning to a file in the working directory; `diverged` detects their causes.
+        # MuJoCo would write every warning to a file in the working directory; `diverged` detects their causes.
         mujoco.set_mju_user_warning(lambda text: None)
         self._hand, self._task, self._objects = hand, task, objects
         self.threads = max(1, threads)
@@ -118,7 +118,7 @@ class NativePhysics:
         if force is not None:
             for instance, push in zip(self.instances, np.asarray(force), strict=True):
                 instance.data.xfrc_applied[self._where.object_body, :3] = push
-        # # Threads take environments from one shared iterator, since contacts make some slower than others.
+        # Threads take environments from one shared iterator, since contacts make some slower than others.
         environments = iter(range(len(self.instances)))
         list(self._pool.map(self._step_instances, [environments] * self.threads, [target] * self.threads))
         diverged = has_diverged(np, self._qpos, self._qvel)

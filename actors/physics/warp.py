@@ -72,7 +72,7 @@ class WarpPhysics:
             mesh_slots = max(most, _LEAST_SLOTS)
         self._catalogue = Catalogue(hand, task, objects[0], mesh_slots)
         model = self._catalogue.model
-        # # Measured: more iterations of either kind hold no more grasps. Dense Jacobians double the solver's time with
+        # Measured: more iterations of either kind hold no more grasps. Dense Jacobians double the solver's time with
         # elliptic cones.
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
         model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 4, 10, 1e-5

@@ -53,7 +53,7 @@ class WarpBuffers:
         self.limits = np.array([CONTACTS_PER_ENVIRONMENT * batch, CONSTRAINTS_PER_ENVIRONMENT], np.float32)
         """(2,) capacities of contacts and constraint rows."""
         with wp.ScopedDevice(device):
-            # # A single row would mark the field as shared, and meshes could then never be absent.
+            # A single row would mark the field as shared, and meshes could then never be absent.
             self._model = mujoco_warp.put_model(model, dict.fromkeys(MODEL_LEAVES, max(batch, 2)))
             self._data = mujoco_warp.make_data(
                 model, batch, naconmax=CONTACTS_PER_ENVIRONMENT * batch, njmax=CONSTRAINTS_PER_ENVIRONMENT
@@ -74,7 +74,7 @@ class WarpBuffers:
         leaves.object_body, leaves.object_dof = where.object_body, where.object_qvel[0]
         leaves.base_body, leaves.table, leaves.anchor = where.base_body, where.table_mocap, where.anchor_mocap
         leaves.weld, leaves.table_away = where.weld, TABLE_AWAY[2]
-        # # The kernels print every overflow; thousands of environments would flood the log.
+        # The kernels print every overflow; thousands of environments would flood the log.
         self._model.opt.warn_overflow = 0
         self._sensing = self._model.opt.disableflags
         self._blind = self._sensing | mujoco_warp.DisableBit.SENSOR
@@ -197,7 +197,7 @@ def _control_step(
 control_step = jax_callable(
     _control_step,
     num_outputs=5,
-    # # `WarpBuffers` captures a separate graph: Warp's would use JAX's buffers, and be recaptured wherever those move.
+    # `WarpBuffers` captures a separate graph: Warp's would use JAX's buffers, and be recaptured wherever those move.
     graph_mode=JaxCallableGraphMode.NONE,
     vmap_method=None,
     in_out_argnames=["qpos", "qvel", "qacc_warmstart"],

@@ -131,7 +131,7 @@ class _Actor:
                 bank,
                 functools.partial(sample_action, self._spec.layout),
                 batch=config.environments,
-                # # Another incarnation must not repeat the episodes of the one it replaces.
+                # Another incarnation must not repeat the episodes of the one it replaces.
                 seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
                 half_precision=config.half_observations,
                 staggered=True,
@@ -294,7 +294,7 @@ class _Actor:
 
     def _publish(self, kind: str, message: Message) -> None:
         """Publishes a message for logs under this actor's name."""
-        # # JSON has no NaN: one such number would make the whole message invalid.
+        # JSON has no NaN: one such number would make the whole message invalid.
         message = Message(message.arrays, finite(message.meta))
         self._transport.publish(self._link.keys.log(kind, "actor", self._link.actor), message)
 

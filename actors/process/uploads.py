@@ -118,7 +118,7 @@ class Uploads:
         """Sends one rollout until it has an outcome."""
         answered = time.monotonic()
         damaged = 0
-        # # Repeating a query in transit would only fill a slow link; a dead link ends the query by itself.
+        # Repeating a query in transit would only fill a slow link; a dead link ends the query by itself.
         timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience)
         delays = backoff()
         while not self.closed.is_set():

@@ -100,7 +100,7 @@ def _thumb() -> tuple[Link, ...]:
         (0.0176, 0.0119, 0.0380, 0.0556),
         (1.0, 1.0, 2.0, 6.0),
     )
-    # # The first link is a block next to its joint's axis.
+    # The first link is a block next to its joint's axis.
     middle = root - 0.0179 * up + 0.009 * forward + 0.0145 * out
     housing = Capsule(vector(middle - 0.008 * out), vector(middle + 0.008 * out), 0.0150)
     turn = np.stack([np.cross(forward, out), forward, out], -1)

@@ -44,7 +44,7 @@ def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
 @functools.cache
 def table_of_gaps(hand: Hand) -> np.ndarray:
     """Gaps (S,) in metres at `CLOSURES`, made strictly decreasing where the hand's are not."""
-    # # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
+    # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
         q = thread.submit(lambda: closure_pose(hand, CLOSURES[:, None].astype(np.float32))).result()
         gaps = np.asarray(thread.submit(lambda: jnp.min(_gaps(hand, _tips(hand, q)), -1)).result(), np.float64)
@@ -77,7 +77,7 @@ def widest_pose(hand: Hand) -> dict[str, float]:
     program = jax.jit(jax.value_and_grad(functools.partial(_cost, hand)))
 
     def cost(motors: np.ndarray) -> list[np.ndarray]:
-        # # The default tolerances of L-BFGS-B assume costs around one.
+        # The default tolerances of L-BFGS-B assume costs around one.
         return [np.asarray(part, float) / _TURN for part in program(jnp.asarray(motors, jnp.float32))]
 
     found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=np.stack([lower, upper], -1)).x

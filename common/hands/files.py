@@ -63,7 +63,7 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
     found = fields.pop("format", None)
     if found != FORMAT:
         raise CongraspError(f"{source} has the format {found!r:.20}, not {FORMAT}.", _REMEDY)
-    # # Without spaces, since the text is sent with every episode.
+    # Without spaces, since the text is sent with every episode.
     hand, wrong = _described(json.dumps({"format": FORMAT, **fields}, separators=(",", ":")))
     if hand is None or wrong:
         raise CongraspError(f"{source}: {wrong}.", _REMEDY)

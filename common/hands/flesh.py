@@ -84,7 +84,7 @@ def _spread(fingers: Sequence[Sequence[Cone]]) -> list[tuple[np.ndarray, np.ndar
     up = np.cross(across, (tips - roots).mean(0))
     turns = [(fingers[0][0].start, np.eye(3))]
     for root, place in zip(roots, (roots - roots.mean(0)) @ across, strict=True):
-        # # `across` points to the right of `up x across`: a turn about `up` by a negative angle.
+        # `across` points to the right of `up x across`: a turn about `up` by a negative angle.
         angle = -_SPREADING * place / np.linalg.norm(up)
         turns.append((root, Rotation.from_rotvec(angle * up).as_matrix()))
     return turns

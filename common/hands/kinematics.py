@@ -134,7 +134,7 @@ def _points(hand: Hand, q: Array) -> Array:
 @functools.cache
 def grasp_frame(hand: Hand) -> GraspFrame:
     """The grasp frame of the open hand; v is the direction from the wrist to the centre, made orthogonal to w."""
-    # # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
+    # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
         points = thread.submit(lambda: np.asarray(_points(hand, np.array(hand.q_open, np.float32)))).result()
     tips = points[len(hand.links) :]

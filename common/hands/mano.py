@@ -124,7 +124,7 @@ def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
     for finger in ("thumb", "index", "middle", "ring", "little"):
         i = MANO_FINGERS.index(finger)
         radii = _RADII[finger]
-        # # The skin ends at the fingertip, a capsule's axis one radius before it.
+        # The skin ends at the fingertip, a capsule's axis one radius before it.
         end = ends[i] - radii[2] * _unit(ends[i] - anchors[i, 2])
         points = [vector(point) for point in (*anchors[i], end)]
         limits = _THUMB_LIMITS if finger == "thumb" else _LIMITS

@@ -35,7 +35,7 @@ def outline(hand: Hand) -> Outline:
     """Returns the hand's capsules in the poses of `CLOSURES`."""
     frame = kinematics.grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
-    # # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
+    # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
         q = thread.submit(closure_pose, hand, CLOSURES[:, None].astype(np.float32)).result()
         ends, center = (np.asarray(part, np.float64) for part in thread.submit(_posed, hand, q).result())

@@ -91,7 +91,7 @@ def _thumb() -> tuple[Link, ...]:
         (0.13837, 0.03328, 0.00798),
         (2.0, 2.0, 6.0),
     )
-    # # The metacarpal's housing ends in front of the joint.
+    # The metacarpal's housing ends in front of the joint.
     housing = Capsule((0.0161, 0.0497, 0.0300), (0.0161, 0.0736, 0.0539), 0.0207)
     return (dataclasses.replace(metacarpal, capsules=(housing,)), *rest)
 

@@ -111,7 +111,7 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
                     continue
                 checked |= check
                 unchecked += not check
-                # # The disk took a part of the first line that it refused: `lost` counts that line as well.
+                # The disk took a part of the first line that it refused: `lost` counts that line as well.
                 refused = min(number(entry.pop("lost", 0)), MAX_NUMBER)
                 lost, damaged, run = lost + refused, damaged + max(0, run - bool(refused)), 0
                 entries.append(entry)

@@ -131,7 +131,7 @@ def _least(pieces: dict[str, _Slots], points: Array) -> Array:
     for kind, slots in pieces.items():
 
         def nearer(least: Array, slot: _Slots, of: Callable[[Array, Array], Array] = distance[kind]) -> Array:
-            # # In the piece's frame; all shapes are symmetric.
+            # In the piece's frame; all shapes are symmetric.
             return jnp.minimum(least, of(jnp.abs((points - slot.position) @ slot.rotation), slot.size))
 
         for i in range(len(slots.used)):
@@ -217,7 +217,7 @@ def _mesh_distance(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.
     mesh = trimesh.Trimesh(obj.visual_vertices, obj.visual_faces, process=False)
     count = int(np.clip(mesh.area / _SPACING**2, *_SAMPLES))
     samples, face = trimesh.sample.sample_surface(mesh, count, seed=0)
-    # # Triangles too small to be sampled contribute their centres.
+    # Triangles too small to be sampled contribute their centres.
     samples, face = np.concatenate([samples, triangles.mean(1)]), np.concatenate([face, np.arange(len(triangles))])
     distance, nearest = cKDTree(samples).query(points, workers=-1)
     on_triangle = trimesh.triangles.closest_point(triangles[face[nearest]], points)

@@ -53,7 +53,7 @@ def generate(seed: int, family: str | None = None) -> GraspObject:
     _check(seed, () if family is None else (family,))
     if family is None:
         family = BASIC_FAMILIES[np.random.default_rng((seed, len(BASIC))).integers(len(BASIC))]
-    # # Seeded by name, so that adding families does not change the objects of others; basic ones keep their first
+    # Seeded by name, so that adding families does not change the objects of others; basic ones keep their first
     # numbers.
     stream = BASIC_FAMILIES.index(family) if family in BASIC else zlib.crc32(family.encode())
     rng = np.random.default_rng((seed, stream))

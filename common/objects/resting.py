@@ -72,7 +72,7 @@ class TableScene:
         self.data.qpos[:] = pose
         damping = self.model.dof_damping.copy()
         if overdamped:
-            # # A large part of the critical damping of a pendulum with the object's weight, size and inertia.
+            # A large part of the critical damping of a pendulum with the object's weight, size and inertia.
             inertia = self.model.body_inertia[1].max()
             self.model.dof_damping[3:] += 0.25 * np.sqrt(self.model.body_mass[1] * 9.81 * self.radius * inertia)
         steps = max(1, round(seconds / CONTACT.timestep))
@@ -157,7 +157,7 @@ def quasi_static_poses(pieces: tuple[Piece, ...]) -> tuple[np.ndarray, np.ndarra
     hull = shapes.hull_of(np.concatenate([shapes.tessellate(piece)[0] for piece in pieces]))
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
     corners = hull.points[hull.simplices]
-    # # Distance of the projected centre of mass beyond the edge opposite to each corner.
+    # Distance of the projected centre of mass beyond the edge opposite to each corner.
     foot = -offsets[:, None] * normals
     start, along = np.roll(corners, -1, 1), np.roll(corners, -2, 1) - np.roll(corners, -1, 1)
     outward = np.cross(along, normals[:, None])

@@ -87,7 +87,7 @@ def unit_inertia(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
         elif piece.kind == "cylinder":
             squares = np.array([a**2 / 4, a**2 / 4, b**2 / 3])
         else:
-            # # A cylinder and two half balls whose centres of mass are 3a/8 beyond its ends.
+            # A cylinder and two half balls whose centres of mass are 3a/8 beyond its ends.
             cylinder, ball = 2 * np.pi * a**2 * b, 4 / 3 * np.pi * a**3
             axial = cylinder * b**2 / 3 + ball * (a**2 / 5 + b**2 + 3 * a * b / 4)
             radial = cylinder * a**2 / 4 + ball * a**2 / 5
@@ -220,7 +220,7 @@ def _template(kind: str) -> tuple[np.ndarray, np.ndarray]:
     elif kind == "cylinder":
         mesh = trimesh.creation.cylinder(1.0, 2.0, sections=_SEGMENTS)
     else:
-        # # An even number of rings has none on the equator, where a capsule is cut in two.
+        # An even number of rings has none on the equator, where a capsule is cut in two.
         mesh = trimesh.creation.uv_sphere(1.0, count=(9 if kind == "capsule" else 10, _SEGMENTS // 2))
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
@@ -271,7 +271,7 @@ def _propose_cylinder(radius: float, half: float, u: np.ndarray) -> tuple[np.nda
 
 def _propose_capsule(radius: float, half: float, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals (n, 3) on a capsule along z."""
-    # # The area of a sphere is uniform along its axis, like that of a cylinder: one coordinate covers both.
+    # The area of a sphere is uniform along its axis, like that of a cylinder: one coordinate covers both.
     along = (2 * u[:, 0] - 1) * (radius + half)
     center = np.clip(along, -half, half)
     z = (along - center) / radius

@@ -73,7 +73,7 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
     if not task.dynamic_center:
         fingers = kinematics.keypoints(hand, kinematics.link_transforms(hand, state.q_initial))
 
-    # # Distances are computed in the object frame, where coordinates are small and the surface does not move.
+    # Distances are computed in the object frame, where coordinates are small and the surface does not move.
     contact_shape = state.contact_found.shape
     local = rotations.inverse_transform(object_position, object_quaternion, keypoints)
     contacts = rotations.inverse_transform(

@@ -27,7 +27,7 @@ def hand_center(hand: Hand, points: Array, fingers: Array | None = None) -> Arra
         return whole
     tips, counted = points[..., len(hand.links) :, :], fingers[..., 1:, None].astype(jnp.float32)
     others = jnp.sum(tips[..., 1:, :] * counted, -2) / jnp.maximum(jnp.sum(counted, -2), 1.0)
-    # # If all fingers are selected, the result is bitwise the same as without a selection.
+    # If all fingers are selected, the result is bitwise the same as without a selection.
     return jnp.where(jnp.all(fingers, -1, keepdims=True), whole, 0.5 * (tips[..., 0, :] + others))
 
 

@@ -59,7 +59,7 @@ def _state_fields(hand: Hand) -> tuple[ObservationField, ...]:
         ("object_angular_velocity", 3, "rad/s, wrist frame", True),
         ("object_displacement", 3, "m since the start, wrist frame"),
         ("object_rotation", 3, "twice the vector part of the rotation since the start (w >= 0), wrist frame"),
-        # # It saturates: the length of a hold is hidden from the policy, which must hold indefinitely, not until a
+        # It saturates: the length of a hold is hidden from the policy, which must hold indefinitely, not until a
         # deadline.
         ("time", 1, "control steps over (approach_steps + hold_steps), at most 1; the remaining hold is hidden"),
         ("table", 1, "1 while the table is present"),

@@ -38,7 +38,7 @@ def flow(key: str) -> Flow:
     """Flow of a key or key expression, determined by the part below the run."""
     part, *rest = (*key.split("/")[2:], "")
     if part in ("rollout", "weights"):
-        # # The announcement is tiny and urgent, the weights themselves are neither.
+        # The announcement is tiny and urgent, the weights themselves are neither.
         return "control" if (part, rest[0]) == ("weights", "announce") else "bulk"
     return "log" if part == "log" else "policy" if part == "policy" else "control"
 

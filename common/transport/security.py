@@ -195,7 +195,7 @@ LIMITS: tuple[Limit, ...] = (
     Limit("weights/latest/**", _SMALL, 0.0),  # counted per peer by the hub
     Limit("ticket/*", _SMALL, 0.0),  # counted per actor by the hub
     *(Limit(f"log/{channel}/**", _LOG, 100.0) for channel in ("metrics", "event", "version", "episode", "rollout")),
-    # # The policy server's queue refuses excess with a message.
+    # The policy server's queue refuses excess with a message.
     Limit("policy/act/**", 1 << 20, 0.0),
     Limit("policy/health", _SMALL, 100.0),
 )

@@ -165,9 +165,7 @@ class PPO:
 
 @optax.inject_hyperparams
 def _optimizer(learning_rate: Array | float, max_grad_norm: Array | float) -> optax.GradientTransformation:
-    """Adam on clipped gradients, separately for each network, so that one large gradient does not shrink the
-    other's.
-    """
+    """Adam on clipped gradients; each network separately, so that a large gradient does not shrink the other's."""
     clip = optax.clip_by_global_norm(max_grad_norm)
     clips = optax.partition({"actor": clip, "critic": clip}, {"actor": "actor", "critic": "critic"})
     return optax.chain(clips, optax.adam(learning_rate, eps=1e-5))

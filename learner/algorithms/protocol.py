@@ -97,5 +97,5 @@ class NonFiniteUpdate(PhysicsError):
     """
 
     def __init__(self, term: str, source: str, state: TrainState):
-        super().__init__(f"{term} is not finite in the {source} of update {state.version + 1}.")
+        super().__init__(f"Diverged in the {source} of update {state.version + 1}: {term}.")
         self.state = state

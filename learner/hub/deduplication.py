@@ -69,7 +69,7 @@ class SequenceTable:
         sequences = self._known.setdefault(owner, Sequences())
         self._known.move_to_end(owner)
         if len(self._known) > _INCARNATIONS:
-            # # A certificate with many incarnations displaces only its own, so that it cannot displace those of others.
+            # A certificate with many incarnations displaces only its own, so that it cannot displace those of others.
             mine = (of for of in self._known if of != owner and certificate(of[0]) == certificate(owner[0]))
             self._forgotten_missing += self._known.pop(next(mine, next(iter(self._known)))).missing
         return sequences

@@ -425,9 +425,7 @@ class LearnerHub:
         return Message(meta={**retry.meta, "granted": False})
 
     def _turn_away_puller(self, key: str) -> Message | None:
-        """Returns the reply to a peer that exceeds the rate limit of weights; None for others, which are charged for a
-        chunk.
-        """
+        """Returns the reply to a peer beyond the rate limit of weights; None for others, which are charged."""
         if not self._pull_limit.admits(key):
             return Message(meta=self._state())
         self._pull_limit.charge(key, 0)
@@ -438,7 +436,7 @@ class LearnerHub:
         self._staleness.refuse_damaged()
         self._event(
             "warning",
-            "Returns the reply to a peer beyond the rate limit of weights; None for others, which are charged.",
+            f"A damaged message arrived at {key}: {error}",
             kind="damaged",
         )
 

@@ -63,7 +63,7 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
         for name in episodes
         if name.startswith("episode/mask_") or name in {f"episode/{flag}" for flag in _FLAGS}
     }
-    # # Some observations are zero in every state here, and rounding errors must not be refused.
+    # Some observations are zero in every state here, and rounding errors must not be refused.
     own, teacher, critic = (_SLACK * np.abs(found).max(0) + 1.0 for found in observed)
     return Ranges(own, reward, _ACTION, episodes, teacher, critic)
 

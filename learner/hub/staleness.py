@@ -108,7 +108,7 @@ class StalenessManager:
         self._expired: collections.OrderedDict[tuple[Owner, str], Ticket] = collections.OrderedDict()
         self._version = 0
         self._in_update = 0
-        # # Versions at the last resume: that of the checkpoint, and the new one of its policy.
+        # Versions at the last resume: that of the checkpoint, and the new one of its policy.
         self._resumed: tuple[int, int | None] = 0, 0
         self._counters = Counters()
 
@@ -143,7 +143,7 @@ class StalenessManager:
     def capacity(self) -> int:
         """Number of tickets that could be granted now."""
         with self._lock:
-            # # Every version counts for one batch, so that a resumed run, or an update of another size, leaves no debt.
+            # Every version counts for one batch, so that a resumed run, or an update of another size, leaves no debt.
             accepted = self._version * self._batch + self._in_update + self.queued
             return (self._max_staleness + self._version + 1) * self._batch - accepted - self._awaited()
 
@@ -198,7 +198,7 @@ class StalenessManager:
                 self.refuse_stale(owner, ticket_id)
                 return "stale"
             if (owner, ticket_id) not in self._tickets and self.capacity <= 0 and not beyond_capacity:
-                # # Its ticket may belong to an earlier session: any current one of its owner is used instead. Otherwise
+                # Its ticket may belong to an earlier session: any current one of its owner is used instead. Otherwise
                 # an actor with one upload at a time would hold the place for which its rollout waits.
                 ticket_id = next((other for of, other in self._tickets if of == owner), "")
                 if not ticket_id:

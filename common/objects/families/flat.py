@@ -68,7 +68,7 @@ def eyeglasses(rng: Rng) -> Draft:
     temple, thick = rng.uniform(0.1, 0.14), rng.uniform(0.0025, 0.004)
     middle, open_ = gap + wide, rng.uniform(0.05, 1.0) * np.pi / 2
     solid, rim = bool(rng.random() < 0.5), rng.uniform(0.003, 0.005)
-    # # One corner is on the bridge's side, one at the temple.
+    # One corner is on the bridge's side, one at the temple.
     turns = np.pi + np.linspace(0, 2 * np.pi, 10 if solid else 5, endpoint=False)
     outside, above = wide * np.cos(0.2 * np.pi), high * np.sin(0.2 * np.pi)
     pieces = []

@@ -104,7 +104,7 @@ def extrude(outline: np.ndarray, low: float, high: float, *, taper: float = 1.0,
     convex = _turns_left(np.roll(outline, 1, 0), outline, np.roll(outline, -1, 0))
     if convex.all() and count <= most:
         return [_prism(outline, low, high, taper, part)]
-    # # Sectors begin at a reflex corner if there is one.
+    # Sectors begin at a reflex corner if there is one.
     outline, convex = (np.roll(values, -int(convex.argmin()), 0) for values in (outline, convex))
     closed, first, pieces = np.concatenate([outline, outline[:1]]), 0, []
     while first < count:

@@ -281,7 +281,7 @@ class Constraint:
         """
         return {}
 
-    # # Display.
+    # Display.
 
     def markers(self, own: Any, blocks: Collection[str]) -> tuple[Marker, ...]:
         """Markers for pictures, recordings and the studio, shown while it is active.
@@ -344,7 +344,7 @@ class Constraint:
                 raise CongraspError(f"--{option}: {lacks} '{word}'.", f"Known: {', '.join(names)}.")
         return np.isin(names, words)
 
-    # # Derived properties.
+    # Derived properties.
 
     @property
     def optional(self) -> bool:

@@ -217,17 +217,21 @@ def headings_of(
     """
     rng = np.random.default_rng(seed)
     inward, width = scale * INWARD, max_width(hand, scale)
+    opposed = task.headings != "center" and given is None
     whole, graspable = (
-        given or sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width)
+        given
+        or sample_headings(
+            obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width, opposed=opposed
+        )
         for use in (False, True)
     )
     assert whole is not None, "only the graspable region may be unreachable"
     sets = [whole, graspable or whole]
     own = CENTER if task.headings == "center" else hand
-    # # Captured headings may be off by a centimetre, but a hand did hold their objects.
+    # Captured headings may be off by a centimetre, but a hand did hold their objects.
     regions = [None, obj.non_graspable_points if graspable is not None and given is None else None]
     found = [
-        within_reach(headings, obj.points, obj.rest_poses, own, avoid)
+        within_reach(headings, obj, obj.rest_poses, own, avoid, opposed=opposed)
         for headings, avoid in zip(sets, regions, strict=True)
     ]
     reachable = np.stack([fine for _, fine in found])

@@ -92,7 +92,7 @@ def closed_poses(
 
     open_center = jnp.broadcast_to(jnp.array(kinematics.grasp_frame(hand).center), (count, 3))
     q = close(open_center)
-    # # Closing moves the hand centre: realign the wrist with the heading position, and close again.
+    # Closing moves the hand centre: realign the wrist with the heading position, and close again.
     center = kinematics.hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)))
     q = close(center)
     position, quaternion = heading_wrist_pose(hand, goal, center)

@@ -73,7 +73,7 @@ def set_of(
         (`services.evaluate.references`).
       heading_training: (H,) bool, headings for training; by default 80 % drawn with the seed.
     """
-    # # The bank pads an object's resting poses to the most of any object by repetition.
+    # The bank pads an object's resting poses to the most of any object by repetition.
     again = np.flatnonzero((row.rest[1:] == row.rest[0]).all(-1))
     rests = int(again[0]) + 1 if len(again) else len(row.rest)
     allowed = np.zeros((len(REGIONS), rests, row.heading_position.shape[1]), bool)
