@@ -102,7 +102,7 @@ def test_what_is_left_of_a_run_is_not_begun_anew(run):
     (folder / "checkpoints" / "checkpoint_000000004.safetensors").touch()
     assert has_checkpoints(folder)
     (folder / "config.json").unlink()
-    with pytest.raises(CongraspError, match=r"holds checkpoint_000000004.* no config\.json"):
+    with pytest.raises(CongraspError, match=r"has checkpoint_000000004.* no config\.json"):
         create_run(folder, config)
 
 

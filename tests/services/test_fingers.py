@@ -161,7 +161,7 @@ def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: di
     )
     with pytest.raises(CongraspError, match="lacks the field 'fingers_allowed'"):
         ask(["heading", "fingers"])
-    with pytest.raises(CongraspError, match="nothing that guides the wrist"):
+    with pytest.raises(CongraspError, match="no constraint that guides the wrist"):
         ask(["fingers"], fingers_allowed=PINCH)
 
 

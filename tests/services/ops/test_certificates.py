@@ -68,7 +68,7 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
     ("role", "options", "words"),
     [
         ("boss", {}, "no certificate role 'boss'"),
-        ("actor", {"hosts": ["gpu"]}, "names no hosts"),
+        ("actor", {"hosts": ["gpu"]}, "cannot name hosts"),
         ("server", {"hosts": ["a b"]}, "neither a host name nor an address"),
         ("server", {"hosts": [""]}, "neither a host name nor an address"),
         ("server", {"hosts": ["../x"]}, "neither a host name nor an address"),

@@ -118,7 +118,7 @@ def test_a_hand_that_fails_its_check_is_not_trained_unless_told_so(stages, hand,
     mended = dataclasses.replace(hand, object_scale=0.8)
     train_hand(request(mended, tmp_path / "out"), lambda text: None)
     assert ran[1] == "check" and len(ran) == 4
-    with pytest.raises(CongraspError, match="another hand, or of this one before it was changed"):
+    with pytest.raises(CongraspError, match="another hand, or of an earlier version of this one"):
         train_hand(request(hand, tmp_path / "out"), lambda text: None)
     does["findings"] = BAD
     train_hand(request(hand, tmp_path / "other", anyway=True), lambda text: None)
