@@ -341,9 +341,9 @@ def test_wrong_credentials_do_not_get_in(run, evil, tmp_path):
     mixed.mkdir()
     for name, source in (("ca.crt", run.certs), ("tls.crt", evil / "actor.0"), ("tls.key", evil / "actor.0")):
         (mixed / name).write_bytes((source / name).read_bytes())
-    _refused(run.endpoint, Credentials(mixed, "actor"), "refuses: the certificate .* is not accepted")
-    _refused(run.endpoint, Credentials(run.certs / "actor.9", "actor"), "refuses: the certificate .* is expired")
-    _refused(run.endpoint, None, "asks for certificates.*Give --certs")
+    _refused(run.endpoint, Credentials(mixed, "actor"), "refuses the certificate .*: not accepted")
+    _refused(run.endpoint, Credentials(run.certs / "actor.9", "actor"), "refuses the certificate .*: expired")
+    _refused(run.endpoint, None, "requires certificates.*Pass --certs")
     _refused(run.endpoint, Credentials(tmp_path, "actor"), "cannot be used")
 
 

@@ -190,7 +190,7 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     (kept / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
     (tmp_path / "version").write_bytes(bytes(21))
     policy = (tmp_path / "policy.safetensors").read_bytes()
-    with pytest.raises(CongraspError, match=r"holds checkpoints of a run\. Continue with --resume"):
+    with pytest.raises(CongraspError, match=r"has checkpoints of a run\. Pass --resume"):
         learn(tmp_path, hub)
     seen, said = [], []
     learn(
@@ -313,5 +313,5 @@ def test_resuming_with_other_networks_is_refused(tmp_path, hub):
     stopped = threading.Event()
     stopped.set()
     learn(tmp_path, hub, CONFIG, stopped)
-    with pytest.raises(CongraspError, match="does not fit this run: 'params/actor"):
+    with pytest.raises(CongraspError, match="does not match this run: 'params/actor"):
         learn(tmp_path, hub, dataclasses.replace(CONFIG, network=NetworkConfig(hidden=(9,), encoder=2)), resume=True)

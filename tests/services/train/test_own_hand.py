@@ -132,7 +132,7 @@ def test_a_policy_of_more_experience_stays(stages, hand, tmp_path):
     does["steps"], notes = 1000, []
     train_hand(request(hand, tmp_path / "short"), notes.append)
     assert own_policy_file("claw").read_bytes() == best.read_bytes()
-    assert "has seen more (100,000,000 steps) and stays" in "\n".join(notes)
+    assert "has more training (100,000,000 steps) and remains" in "\n".join(notes)
     # But one of the hand as it was before is replaced.
     (tmp_path / "hands" / "claw.json").write_text(hand_text(dataclasses.replace(hand, object_scale=0.8)))
     get_hand.cache_clear()
