@@ -92,7 +92,7 @@ class Credentials:
             decoded: Any = ssl._ssl._test_decode_cert(str(self.certificate))  # type: ignore[attr-defined]
         except (OSError, ValueError):
             raise CongraspError(
-                f"The credentials in {self.folder} are not valid.", "Issue new ones with 'congrasp certs issue'."
+                f"The credentials in {self.folder} cannot be used.", "Issue new ones with 'congrasp certs issue'."
             ) from None
         names = [value for entry in decoded["subject"] for key, value in entry if key == "commonName"]
         found = parse_identity(names[0]) if names else None
@@ -263,7 +263,7 @@ def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Creden
             context.load_cert_chain(credentials.certificate, credentials.key)
         except OSError:  # SSLError is an OSError
             return CongraspError(
-                f"The credentials in {credentials.folder} are not valid.", "Issue new ones with 'congrasp certs issue'."
+                f"The credentials in {credentials.folder} cannot be used.", "Issue new ones with 'congrasp certs issue'."
             )
     try:
         with context.wrap_socket(raw, server_hostname=host) as connection:
@@ -283,7 +283,7 @@ def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Creden
         why = "expired" if "EXPIRED" in error.reason else "missing" if "REQUIRED" in error.reason else "not accepted"
         where = credentials.certificate if credentials else "none"
         return CongraspError(
-            f"{endpoint} refuses the certificate ({where}): {why}.", "Issue one with the authority of {endpoint}."
+            f"{endpoint} refuses the certificate ({where}): {why}.", "Issue one with its authority."
         )
 
 
