@@ -50,6 +50,7 @@ def motion(
     out: pathlib.Path | None = None,
     index: int = -1,
     success: bool = False,
+    fps: float = 0.0,
     camera: bool = False,
     force: bool = False,
 ) -> int:
@@ -66,6 +67,7 @@ def motion(
         directory.
       index: Which of the recorded episodes, from 0; -1 is the last.
       success: Count only episodes that succeeded.
+      fps: Frames a second, such as 24 for a film; the motion's own 100 by default.
       camera: Also film the motions; lerobot alone has videos.
       force: Replace a file that is there; a folder never is.
 
@@ -74,11 +76,13 @@ def motion(
       congrasp export motion runs/mine --success --to ros2 --out bag
     """
     from congrasp.services.export.frames import TOLERANCE_MM
+    from congrasp.services.export.motion_file import at_rate
     from congrasp.services.export.motion_formats import default_name, export_motions, pick_motion
 
     if not paths:
         raise CongraspError("No motion was named.", "Name a .npz of 'congrasp grasp', a recording or a run's folder.")
     motions = [pick_motion(path, index, success=success) for path in paths]
+    motions = [at_rate(motion, fps) for motion in motions] if fps else motions
     target = out or default_name(motions[0], to)
     error = export_motions(motions, to, target, camera=camera, force=force)
     frames = sum(len(motion.time) for motion in motions)

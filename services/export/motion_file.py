@@ -106,6 +106,22 @@ _COLOURS = {
 }
 
 
+def at_rate(motion: GraspMotion, fps: float) -> GraspMotion:
+    """Returns the motion at another frame rate: for each of its times the nearest frame, at most half a step off.
+
+    Raises:
+      CongraspError: the rate is above the motion's own, or not above zero.
+    """
+    own = 1 / motion.control_dt
+    if not 0 < fps <= own + 1e-6:
+        raise CongraspError(f"--fps is {fps:g}.", f"The motion has {own:g} frames a second: set at most as many.")
+    time = np.arange(int((len(motion.time) - 1) * fps / own + 1e-6) + 1) / fps
+    nearest = np.minimum(np.round(time * own).astype(int), len(motion.time) - 1)
+    timed = [name for name, meaning in _ARRAYS.items() if meaning.startswith(("(T,", "(T)"))]
+    arrays = {name: getattr(motion, name)[nearest] for name in timed}
+    return dataclasses.replace(motion, **{**arrays, "time": time.astype(motion.time.dtype)}, control_dt=1 / fps)
+
+
 def motion_of_episode(episode: Message) -> GraspMotion:
     """The motion of an episode, whether just made or read from MCAP (`services.record.reader.read_episodes`)."""
     arrays, meta = {name: np.asarray(value) for name, value in episode.arrays.items()}, dict(episode.meta)

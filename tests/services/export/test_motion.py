@@ -24,7 +24,14 @@ from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.cli.main import main
 from congrasp.services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
 from congrasp.services.export.camera import camera_for, pictures
-from congrasp.services.export.motion_file import GraspMotion, hand_arrays, load_motion, motion_of_episode, save_motion
+from congrasp.services.export.motion_file import (
+    GraspMotion,
+    at_rate,
+    hand_arrays,
+    load_motion,
+    motion_of_episode,
+    save_motion,
+)
 from congrasp.services.record.channels import Entry
 from congrasp.services.record.entries import Converter
 from congrasp.services.record.writer import LogWriter
@@ -159,6 +166,17 @@ def test_a_single_frame_is_a_motion(human: GraspMotion, kind: str, tmp_path: pat
         if name.startswith(("link_pos", "link_q", "wrist_", "object_pos", "object_q", "joint_pos", "joint_t", "time"))
     }
     assert export([dataclasses.replace(human, **cut)], kind, tmp_path)[1] < 0.01
+
+
+def test_a_usd_has_the_rate_that_is_asked_for(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    slower = at_rate(human, 24.0)
+    assert len(slower.time) == int((T - 1) * 24 / 100) + 1
+    motion_formats.export_motions([slower], "usd", tmp_path / "m.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "m.usda"))
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(24) and stage.GetEndTimeCode() == len(slower.time) - 1
+    np.testing.assert_array_equal(slower.object_position[1], human.object_position[4])  # 1/24 s is 4.2 steps
+    with pytest.raises(CongraspError, match="--fps is 200"):
+        at_rate(human, 200.0)
 
 
 def test_numbers_that_are_no_poses_are_refused(human: GraspMotion, tmp_path: pathlib.Path) -> None:
