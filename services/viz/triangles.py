@@ -147,7 +147,7 @@ def _table_top(radius: float, half_length: float, fine: bool) -> _Surface:
         faces += [np.stack([a, c, d], -1), np.stack([a, d, b], -1)]
     fading = np.clip((1 - np.linalg.norm(flat, axis=-1)) / (1 - _FADES), 0, 1)
     opacity = (fading**2 * (3 - 2 * fading)).astype(np.float32) if fine else None
-    up = np.broadcast_to(np.float32([0, 0, 1]), points.shape)
+    up = np.broadcast_to(np.array([0, 0, 1], np.float32), points.shape)
     return _Surface(points, up, np.concatenate(faces), True, opacity=opacity)
 
 

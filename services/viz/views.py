@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
-from congrasp.common.hands.skin import skin_of
+from congrasp.common.hands.skin import MATERIALS, skin_of
 from congrasp.common.task.constraints.markers import Polyline
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.goals import markers
@@ -21,8 +21,9 @@ from congrasp.services.viz.shapes import capsule_shapes, fit
 _AZIMUTHS, _ELEVATIONS = np.arange(0, 360, 30), (16, 28, 40)  # degrees, of the cameras that are compared
 _ASIDE = 75.0  # degrees between the two views of a picture
 _ROWS = 72  # of the pictures that cameras are compared by
-_CONTACT, _FINGER, _OBJECT, _BEHIND = 2.0, 1.0, 1.0, 1.0
-"""What the seen share of touching links, of all fingers and of the object counts, and a view along the forearm."""
+_CONTACT, _FINGER, _OBJECT, _BEHIND, _BEFORE = 2.0, 1.0, 1.0, 1.5, 0.8
+"""What the seen share of touching links, of all fingers and of the object counts, and a view along the forearm from
+behind it and from before the hand."""
 _FALL = 0.1  # how far the camera follows a falling object, m
 
 
@@ -104,9 +105,10 @@ class _Pictured:
         across = 2 * np.tan(np.radians(camera.field_of_view) / 2) * np.linalg.norm(camera.target - camera.position)
         seen = np.minimum(counts[:-1] / (self._areas * (_ROWS / across) ** 2), 1.0)
         contact = seen[self._touching].mean() if self._touching.any() else 0.0
-        behind = max(0.0, float(self._back @ view.direction))
+        along = float(self._back @ view.direction)
+        hidden = (_BEHIND if along > 0 else _BEFORE) * along**2
         whole = counts[-1] / max(unhidden, 1)
-        return float(_CONTACT * contact + _FINGER * seen[self._finger].mean() + _OBJECT * whole - _BEHIND * behind**2)
+        return float(_CONTACT * contact + _FINGER * seen[self._finger].mean() + _OBJECT * whole - hidden)
 
 
 def _counts(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:
@@ -116,14 +118,16 @@ def _counts(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> n
 
 
 def _extent(episode: Message, step: int) -> np.ndarray:
-    """(N, 3) points that a picture of a step must hold: the skin, the corners of the object's box and a trajectory.
+    """(N, 3) points that a picture of a step must hold: skin without sleeve, the object's box and a trajectory.
 
     An object that has fallen far may leave the picture.
     """
     arrays = episode.arrays
     hand = known_hand(episode.meta["hand"])
     turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True)
-    around = skin_of(hand).posed(arrays["link_position"][step], turns.as_matrix())[0]
+    skin = skin_of(hand)
+    around = skin.posed(arrays["link_position"][step], turns.as_matrix())[0]
+    around = around[skin.material != MATERIALS.index("sleeve")]
     if arrays["object_position"][step, 2] < arrays["object_position"][0, 2] - _FALL:
         return around
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
