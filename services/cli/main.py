@@ -147,13 +147,22 @@ def _check_files(arguments: Sequence[str]) -> None:
             option = argument
             continue
         path = pathlib.Path(re.sub(r":\w+$", "", argument))
-        if path.suffix.lower() not in _READ or option in _WRITTEN or path.exists():
+        if path.suffix.lower() not in _READ or option in _WRITTEN or _is_there(path):
             continue
         named = f"{option}: there" if option else "There"
         siblings = [one.name for one in path.parent.iterdir()] if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, siblings, 1)
         remedy = f"Did you mean {path.parent / near[0]}?" if near else "Check the path."
         raise CongraspError(f"{named} is no file {path}.", remedy)
+
+
+def _is_there(path: pathlib.Path) -> bool:
+    """Returns whether a path exists; an OSError for one that cannot be used."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
 
 
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:

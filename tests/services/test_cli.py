@@ -29,7 +29,7 @@ def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
 def is_one_line(code: int, said: str, words: str) -> None:
     """What was said on the standard error is one line with these words, and the exit code tells of bad input."""
     assert code not in (0, 1), said
-    (line,) = said.splitlines()
+    (line,) = [line for line in said.splitlines() if not line.endswith(" s so far.")]  # how long it works already
     assert line.startswith("congrasp: error: ")
     assert re.search(words, line), line
 
@@ -56,16 +56,16 @@ def test_help_names_every_command_and_every_command_exists():
         (["evaluate", "--method", "graspxl"], "has the method 'ours', not 'graspxl'.*train --method graspxl"),
         (["train", "--task.hand", "paw"], "no hand 'paw'"),
         (["train", "--resume", "--run-dir", "/nonexistent-run"], "is not a run directory"),
-        (["evaluate", "--policy", "/nonexistent.safetensors"], "cannot be read"),
+        (["evaluate", "--policy", "/nonexistent.safetensors"], "--policy: there is no file /nonexistent.safetensors"),
         (["serve", "--hand", "paw"], "no hand 'paw'"),
-        (["serve", "--policy", "a.safetensors", "--connect", "tcp/127.0.0.1:1"], "either a.safetensors or"),
+        (["serve", "--policy", "a", "--connect", "tcp/127.0.0.1:1"], "either a or"),
         (["actor", "--connect", "nonsense"], "endpoint"),
         (["plot", "/nonexistent-run"], "nonexistent-run"),
         (["plot", "x" * 300], "x cannot be used: File name too long"),
         (["export", "motion", "x" * 300], "x cannot be used: File name too long"),
         (["status", "/dev/null"], "/dev/null is not a run directory"),
         (["grasp", "x" * 300 + ".stl"], "x.stl cannot be used: File name too long"),
-        (["grasp", "mug:7", "--policy", "/nonexistent.safetensors"], "/nonexistent.safetensors cannot be read"),
+        (["grasp", "mug:7", "--policy", "/nonexistent.safetensors"], "there is no file /nonexistent.safetensors"),
         (["grasp", "mug:7", "--policy", "/"], "/ is no regular file"),
         (["grasp", "mug:7", "--seed", "-1"], "--seed: a seed is a whole number from 0 to 1e[+]15"),
         (["evaluate", "--seed", "9" * 23], "--seed: a seed is a whole number"),
