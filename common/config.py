@@ -19,7 +19,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import CONTACT_TIME
 from congrasp.common.io.inputs import file_name
 from congrasp.common.runtime.engines import PhysicsName
-from congrasp.common.task.constraints import CONSTRAINTS, OURS, PAPER
+from congrasp.common.task.constraints import CONSTRAINTS, OURS
 from congrasp.common.task.reward import GRASP
 
 MetricWriter = Literal["tensorboard", "wandb", "wandb-offline"]
@@ -168,7 +168,7 @@ class TaskConfig(_Shares):
     """Constraints that the policy knows: what it observes, and can be asked for."""
     headings: Literal["all", "above", "center"] = "all"
     """`above` keeps approach directions within 30 degrees of straight down, where there are any (easier); `center`
-    keeps headings at which the hand's centre alone is above the table (harder: a row of the exam)."""
+    takes the paper's rules alone, with the hand's centre above the table (harder: a row of the exam)."""
     own_references: bool = True
     """Half of an object's reference poses and trajectories are remade from the policy's own grasps as it learns; the
     others, or all without, stay those that closing the hand around the objects gave."""
@@ -437,10 +437,6 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         fields = json.loads(text, parse_constant=_no_constant)
         if not isinstance(fields, dict):
             raise ValueError("it is no object")
-        if "task" in fields:
-            fields["task"] = with_older_physics(fields["task"])
-        if isinstance(fields.get("network"), dict):
-            fields["network"] = with_older_critic(fields["network"])
         config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
     except (ValueError, RecursionError) as error:  # no UTF-8, or nested too deep
         raise CongraspError(
@@ -450,42 +446,6 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         raise CongraspError(f"The configuration does not fit this version: {error}.") from None
     file_name(config.name, "a run")
     return config
-
-
-def with_older_physics(task: Any) -> Any:
-    """A `TaskConfig` from JSON; physics and constraints that an older file does not name are those of then.
-
-    Args:
-      task: the value, of whatever type; only an object of which `control` is one, too, or is not there, is changed.
-    """
-    control = task.get("control", {}) if isinstance(task, dict) else None
-    if not isinstance(control, dict):
-        return task
-    fastest = control.get("guidance_position_limit", 0.04)
-    then = {
-        "wrist_acceleration": 0.0,
-        "wrist_angular_acceleration": 0.0,
-        "hold_acceleration": 1.0,
-        "load_rate": 0.0,
-        "approach_position_limit": fastest,
-        "closing_position_limit": fastest,
-    }
-    back_off = task.get("back_off", 0.15)
-    begun = {
-        "constraints": PAPER,
-        "constant_mass": False,
-        "torsional_friction": 0.0,
-        "object_damping": 5e-4,
-        "preshape": False,
-        "initial_speed": 0.0,
-        "back_off_range": [back_off, back_off],
-    }
-    return {"contact_time": 0.016, **begun, **task, "control": {**then, **control}}
-
-
-def with_older_critic(network: dict[str, Any]) -> dict[str, Any]:
-    """A `NetworkConfig` from JSON; the critic of an older file sees the observation alone."""
-    return {"privileged_critic": False, **network}
 
 
 def _no_constant(name: str) -> float:

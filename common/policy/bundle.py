@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common.config import NetworkConfig, TaskConfig, with_older_critic, with_older_physics
+from congrasp.common.config import NetworkConfig, TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import check_reference, get_hand
 from congrasp.common.io.files import write_atomically
@@ -32,7 +32,8 @@ from congrasp.common.task import privileged
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
-FORMAT = 1
+FORMAT = 2
+_SCHEMA = 1
 _MALFORMED = (LookupError, AttributeError, TypeError, ValueError, OverflowError)
 _REMEDY = "Use a bundle made by 'congrasp train' of this version."
 
@@ -67,7 +68,7 @@ class PolicySpec:
     def schema(self) -> str:
         """Sixteen hex digits that two policies share if one can stand in for the other."""
         sizes = [self.network.hidden, self.network.encoder]
-        text = json.dumps([FORMAT, self.hand, self.layout, self.action_size, sizes])
+        text = json.dumps([_SCHEMA, self.hand, self.layout, self.action_size, sizes])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def require(self, spec: "PolicySpec", source: str) -> None:
@@ -141,7 +142,7 @@ class PolicyBundle:
         meta = {
             "format": FORMAT,
             "version": self.version,
-            "epoch": self.run_id,
+            "run_id": self.run_id,
             "transitions": self.transitions,
             "schema": self.spec.schema,
             "hand": self.spec.hand,
@@ -172,11 +173,11 @@ class PolicyBundle:
                 hand=check_reference(meta["hand"]),
                 layout=tuple((str(name), int(size)) for name, size in meta["layout"]),
                 action_size=int(meta["action_size"]),
-                network=_dataclass(NetworkConfig, with_older_critic(meta["network"])),
-                privileged=tuple((str(name), int(size)) for name, size in meta.get("privileged", ())),
+                network=_dataclass(NetworkConfig, meta["network"]),
+                privileged=tuple((str(name), int(size)) for name, size in meta["privileged"]),
             )
-            task = _dataclass(TaskConfig, with_older_physics(meta["task"]))
-            version, run_id, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
+            task = _dataclass(TaskConfig, meta["task"])
+            version, run_id, transitions = int(meta["version"]), str(meta["run_id"]), int(meta["transitions"])
             inputs = (*spec.layout, *spec.privileged)
             for fault in (*network_faults(spec.network, inputs, spec.action_size), *task_faults(task)):
                 raise ValueError(fault)

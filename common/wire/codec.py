@@ -2,8 +2,8 @@
 
 The layout is that of https://github.com/huggingface/safetensors: eight bytes with the header's length, a JSON header
 that gives each array's dtype, shape and byte range, then the arrays. Encoding joins the arrays' memory once; decoding
-copies nothing, its arrays are read-only views of the message. The header's `__metadata__` holds the message's meta data
-as JSON text (`meta`) and the CRC-32 of the data section (`crc32`).
+copies nothing, its arrays are read-only views of the message. The header's `__metadata__` holds the CRC-32 of the data
+section and the header with zeros in its place (`checksum`), and the message's meta data as JSON text (`meta`).
 """
 
 import dataclasses
@@ -124,16 +124,14 @@ def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
     if 8 + length > len(data):
         raise CongraspError(f"The message is cut inside its header: {len(data)} bytes of {8 + length} or more.")
     text, section = data[8 : 8 + length], memoryview(data)[8 + length :]
-    crc, covers_header = crc32(section), text.startswith(_BEGIN)
-    if covers_header:
-        digits = slice(len(_BEGIN), len(_BEGIN) + _DIGITS)
-        crc = crc32(text[: digits.start] + b"0" * _DIGITS + text[digits.stop :], crc)
-        if text[digits] != b"%08x" % crc:
-            raise CongraspError("The message does not match its checksum.")
+    if not text.startswith(_BEGIN):
+        raise CongraspError("The message does not begin with its checksum.")
+    digits = slice(len(_BEGIN), len(_BEGIN) + _DIGITS)
+    crc = crc32(text[: digits.start] + b"0" * _DIGITS + text[digits.stop :], crc32(section))
+    if text[digits] != b"%08x" % crc:
+        raise CongraspError("The message does not match its checksum.")
     header = _header(text)
-    meta, older = _metadata(header.pop("__metadata__", None), "checksum" if covers_header else "crc32")
-    if not covers_header and older != f"{crc:08x}":
-        raise CongraspError("The message's data do not match their checksum.")
+    meta = _metadata(header.pop("__metadata__"))
     message = SharedMessage(_arrays(header, section), meta)
     vars(message)["encoded"] = data
     return message
@@ -198,13 +196,11 @@ def _no_constant(name: str) -> Any:
     raise CongraspError(f"The message's header holds {name}, which is not JSON.")
 
 
-def _metadata(entry: Any, checked_by: str) -> tuple[dict[str, Any], str]:
-    """The meta data, and the checksum as it stands there under its name."""
-    if not isinstance(entry, dict) or entry.keys() != {"meta", checked_by}:
-        raise CongraspError("The message lacks its meta data or its checksum.")
-    if not isinstance(entry["meta"], str) or not isinstance(entry[checked_by], str):
-        raise CongraspError("The message's meta data or checksum is no text.")
-    return _header(entry["meta"].encode(errors="replace")), entry[checked_by]
+def _metadata(entry: Any) -> dict[str, Any]:
+    """The meta data."""
+    if not isinstance(entry, dict) or entry.keys() != {"checksum", "meta"} or not isinstance(entry["meta"], str):
+        raise CongraspError("The message lacks its meta data.")
+    return _header(entry["meta"].encode(errors="replace"))
 
 
 def _arrays(header: dict[str, Any], section: memoryview) -> dict[str, np.ndarray]:

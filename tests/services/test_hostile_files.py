@@ -215,13 +215,11 @@ def _recomputed(data: bytes) -> bytes:
     """The message with the checksum of its damaged data, as one who means harm would write it."""
     try:
         length = int.from_bytes(data[:8], "little")
-        header = json.loads(data[8 : 8 + length])
-        header["__metadata__"] = {
-            "meta": header["__metadata__"]["meta"],
-            "crc32": f"{zlib.crc32(data[8 + length :]):08x}",
-        }
-        text = json.dumps(header).encode()
-        return len(text).to_bytes(8, "little") + text + data[8 + length :]
+        header, section = json.loads(data[8 : 8 + length]), data[8 + length :]
+        header = {"__metadata__": {"checksum": "00000000", "meta": header.pop("__metadata__")["meta"]}, **header}
+        text = json.dumps(header, separators=(",", ":")).encode()
+        text = text.replace(b"00000000", b"%08x" % zlib.crc32(text, zlib.crc32(section)), 1)
+        return len(text).to_bytes(8, "little") + text + section
     except (ValueError, KeyError, TypeError):
         return data
 

@@ -216,8 +216,12 @@ def headings_of(
     """
     rng = np.random.default_rng(seed)
     inward, width = scale * INWARD, max_width(hand, scale)
+    opposed = task.headings != "center" and given is None
     whole, graspable = (
-        given or sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width)
+        given
+        or sample_headings(
+            obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width, opposed=opposed
+        )
         for use in (False, True)
     )
     assert whole is not None, "only the graspable region may be out of reach"
@@ -226,7 +230,7 @@ def headings_of(
     # Captured headings may be off by a centimetre, and a hand held what they are of.
     regions = [None, obj.non_graspable_points if graspable is not None and given is None else None]
     found = [
-        within_reach(headings, obj.points, obj.rest_poses, own, avoid)
+        within_reach(headings, obj, obj.rest_poses, own, avoid, opposed=opposed)
         for headings, avoid in zip(sets, regions, strict=True)
     ]
     reachable = np.stack([fine for _, fine in found])

@@ -1,6 +1,6 @@
 """Heading sets: from where and how a hand may come to an object (paper, section Constraint Setup)."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,8 @@ BACK_OFF = 0.15
 _SKIN = 0.004  # m that the widest pose is wider than the object on either side
 _BREADTH = 0.03  # half the breadth of the slab in which the local width is measured: a hand is some 6 cm broad
 _BEYOND = 0.01  # the slab ends this far beyond the heading position, where the fingertips close
+_SIDE = 0.015  # depth of an object's side along the cross-finger axis, in which fingertips find a surface
+_OPPOSED = np.cos(np.arctan(1.0))  # least cosine of a normal with that axis: the edge of the cone of friction 1
 _TUBE = 0.01  # radius around the approach in which nothing may stand before the surface point
 _MARGIN = 0.01  # an approach keeps this far from the avoid region, of which closing fingers, so thick, meet nothing
 _BACK = 0.015  # longest way back from the table: to a hand whose centre is 5 mm inside the surface
@@ -56,6 +58,7 @@ def sample_headings(
     attempts: int = 6,
     along: np.ndarray | None = None,
     at: np.ndarray | None = None,
+    opposed: bool = True,
 ) -> Headings | None:
     """Samples an object's heading set by the paper's rules.
 
@@ -65,6 +68,9 @@ def sample_headings(
 
     * the object's local width along the cross-finger axis exceeds `max_width`; it is measured on the surface points
       that the closing fingers sweep (3 cm to both sides of the hand's middle plane, down to 1 cm beyond the position);
+    * there are no surfaces to press on from both sides: among the points of that slab, within 1.5 cm of either end
+      of the width, one whose normal is within 45 degrees of the axis (ours: at friction 1 two fingers that press
+      along the axis slip off anything steeper, such as two edges of a board's corner);
     * another part of the object stands before the surface point (the point would not be the first one hit);
     * with affordance, the approach comes within 1 cm of the avoid region, or the position lies nearer to it than to
       the graspable one, or it is as wide as that where the fingers close, so that they would meet it first (ours: the
@@ -88,6 +94,7 @@ def sample_headings(
       attempts: batches of candidates.
       along: (3,) unit, the direction of all of them, if it is not to be drawn; surface points that face it are taken.
       at: (3,) the position of all of them, m, if it is not to be drawn.
+      opposed: requires surfaces to press on from both sides; false applies the paper's rules alone.
 
     Returns:
       H headings, float32; None if the graspable region cannot be approached.
@@ -97,28 +104,29 @@ def sample_headings(
     """
     avoid = obj.non_graspable_points & use_affordance
     sources = _sources(obj, avoid, along)
-    points = obj.points.astype(np.float32)
+    surface = _Surface(obj.points.astype(np.float32), obj.normals.astype(np.float32), avoid)
+    points = surface.points
     found: list[Headings] = []
     total = 0
     for _ in range(attempts):
-        surface = rng.choice(sources, _BATCH)
-        direction = _in_cone(-obj.normals[surface], cone, rng)
+        source = rng.choice(sources, _BATCH)
+        direction = _in_cone(-obj.normals[source], cone, rng)
         if along is not None:
             direction = np.broadcast_to(np.float32(along), direction.shape)
-        position = points[surface] + np.float32(inward) * direction
+        position = points[source] + np.float32(inward) * direction
         if at is not None:
             position = np.broadcast_to(np.float32(at), position.shape)
         faults = _faults(points, avoid, position, direction, inward, back_off)
         position, direction, faults = (part[faults.argsort(kind="stable")] for part in (position, direction, faults))
         clean = int((faults == 0).sum())
-        cross, width = _roll(points, avoid, position[:clean], direction[:clean], rng)
+        cross, width = _roll(surface, position[:clean], direction[:clean], rng, opposed=opposed)
         good = np.flatnonzero(width <= max_width)
         found.append(Headings(position[good], direction[good], cross[good]))
         total += len(good)
         if total >= count:
             break
     if total == 0:
-        last = _last_resort(points, avoid, position, direction, faults, rng, lenient=lenient)
+        last = _last_resort(surface, position, direction, faults, rng, lenient=lenient)
         if last is None:
             return None
         width = local_width(last, points)
@@ -142,9 +150,23 @@ def _sources(obj: GraspObject, avoid: np.ndarray, along: np.ndarray | None) -> n
     return sources
 
 
+class _Surface(NamedTuple):
+    """P surface points, of which the first cover the surface."""
+
+    points: np.ndarray
+    """(P, 3) m."""
+    normals: np.ndarray
+    """(P, 3) unit, outward."""
+    avoid: np.ndarray
+    """(P,) bool, the avoid region."""
+
+    def some(self, which: np.ndarray | slice) -> "_Surface":
+        """Selected points."""
+        return _Surface(*(part[which] for part in self))
+
+
 def _last_resort(
-    points: np.ndarray,
-    avoid: np.ndarray,
+    surface: _Surface,
     position: np.ndarray,
     direction: np.ndarray,
     faults: np.ndarray,
@@ -153,14 +175,13 @@ def _last_resort(
     lenient: bool,
 ) -> Headings | None:
     """Headings among candidates (N, 3) of which none keeps all rules, see `sample_headings`; `faults` (N,) ascend."""
-    if avoid.any():
+    if surface.avoid.any():
         clean = int((faults == 0).sum())
         if not (lenient and clean):
             return None
-        bare = points[~avoid]
-        cross, _ = _roll(bare, np.zeros(len(bare), bool), position[:clean], direction[:clean], rng)
+        cross, _ = _roll(surface.some(~surface.avoid), position[:clean], direction[:clean], rng, opposed=False)
         return Headings(position[:clean], direction[:clean], cross)
-    cross, width = _roll(points, avoid, position, direction, rng)
+    cross, width = _roll(surface, position, direction, rng, opposed=False)
     # Faults count whole numbers and a width in metres less than one: together they sort in the right order.
     best = (faults + width).argsort(kind="stable")[: _BATCH // 16]
     return Headings(position[best], direction[best], cross[best])
@@ -220,35 +241,64 @@ def feasible(
 
 
 def within_reach(
-    headings: Headings, points: np.ndarray, rest_poses: np.ndarray, outline: Outline, avoid: np.ndarray | None = None
+    headings: Headings,
+    obj: GraspObject,
+    rest_poses: np.ndarray,
+    outline: Outline,
+    avoid: np.ndarray | None = None,
+    *,
+    opposed: bool = True,
 ) -> tuple[list[Headings], np.ndarray]:
     """The headings clear of the table in each of R resting poses (R, 7), and (R, H) bool whether they can be followed.
 
     They are moved back by 1.5 cm at most, since what is held by less slips: of grasps moved back by 2 to 3 cm half were
     lost, with one policy, and of the others one in 25. Flat objects, none of whose headings can be cleared by that, get
-    3 cm; and where the table leaves the hand no room at all, as beside a card, its centre alone counts.
+    3 cm; and where the table leaves the hand no room at all, as beside a card, its centre and the places that the
+    fingers close on must be over the table, or else its centre alone.
 
     Headings of a graspable region must still close on it where they end (`closes_on`), and the hand's centre alone
     never counts: what cannot be held without the rest of the object is no region.
 
     Args:
       headings: H of them, in the object frame.
-      points: (P, 3) the object's surface points, m.
-      rest_poses: (R, 7) poses of the object, with the table's top at z = 0.
+      obj: the object.
+      rest_poses: (R, 7), with the table's top at z = 0.
       outline: of the hand.
       avoid: (P,) bool, the avoid region of headings that are made for the graspable one; None for other headings.
+      opposed: requires surfaces to press on from both sides at the position to which the table moved it, but of the
+        last resort.
     """
-    width = local_width(headings, points)
-    ways = [(outline, _BACK), (outline, _FARTHEST_BACK), (CENTER, _FARTHEST_BACK)]
-    for own, farthest in ways if avoid is None else ways[:2]:
+    width = local_width(headings, obj.points)
+    bare = np.zeros(len(obj.points), bool) if avoid is None else avoid
+    ways = [(outline, _BACK, opposed, False), (outline, _FARTHEST_BACK, opposed, False)]
+    if avoid is None:
+        ways += [(CENTER, _FARTHEST_BACK, opposed, True), (CENTER, _FARTHEST_BACK, False, False)]
+    for own, farthest, pressed, touching in ways:
         cleared = [clear_table(headings, rest, own, width, farthest) for rest in rest_poses]
-        pairs = zip(cleared, rest_poses, strict=True)
+        pairs = list(zip(cleared, rest_poses, strict=True))
         reachable = np.array([feasible(moved, rest, own, width) for moved, rest in pairs])
         if avoid is not None:
-            reachable &= np.array([closes_on(moved, points, avoid) for moved in cleared])
+            reachable &= np.array([closes_on(moved, obj.points, avoid) for moved in cleared])
+        if pressed:
+            reachable &= np.array([opposed_at(moved, obj, bare) for moved in cleared])
+        if touching:
+            reachable &= np.array([_contacts_over_table(moved, rest, width) for moved, rest in pairs])
         if reachable.any():
             break
     return cleared, reachable
+
+
+def _contacts_over_table(headings: Headings, rest_pose: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """(H,) bool, true where both ends of the local width (H,) along the cross-finger axis are over the table."""
+    up = matrix(rest_pose[3:])[2]
+    return headings.position @ up + rest_pose[2] - np.abs(headings.cross @ up) * width / 2 > 0
+
+
+def opposed_at(headings: Headings, obj: GraspObject, avoid: np.ndarray) -> np.ndarray:
+    """(H,) bool, true where surfaces outside of the avoid region (P,) can be pressed on from both sides."""
+    points, normals, avoid = obj.points[:_WIDTH_POINTS], obj.normals[:_WIDTH_POINTS], avoid[:_WIDTH_POINTS]
+    along, aside, depth = _offsets(headings, points)
+    return _pressable(along, (np.abs(aside) < _BREADTH) & (depth < _BEYOND) & ~avoid, headings.cross @ normals.T)
 
 
 def closes_on(headings: Headings, points: np.ndarray, avoid: np.ndarray) -> np.ndarray:
@@ -263,10 +313,7 @@ def closes_on(headings: Headings, points: np.ndarray, avoid: np.ndarray) -> np.n
       avoid: (P,) bool, the avoid region.
     """
     points, avoid = points[:_WIDTH_POINTS], avoid[:_WIDTH_POINTS]
-    along, aside, depth = (
-        axis @ points.T - (axis * headings.position).sum(-1)[:, None]
-        for axis in (headings.cross, np.cross(headings.direction, headings.cross), headings.direction)
-    )
+    along, aside, depth = _offsets(headings, points)
     (low, high), first = _region_first(along, np.abs(aside) < _BREADTH, depth, avoid)
     squared = along**2 + aside**2 + depth**2
     nearer = squared[:, ~avoid].min(-1, initial=np.inf) < squared[:, avoid].min(-1, initial=np.inf)
@@ -283,13 +330,20 @@ def local_width(headings: Headings, points: np.ndarray) -> np.ndarray:
       points: (..., P, 3) surface points, of which the first 256 are taken, m.
     """
     xp = headings.position.__array_namespace__()
-    along, aside, depth = (
-        axis @ points[..., :_WIDTH_POINTS, :].mT - (axis * headings.position).sum(-1)[..., None]
-        for axis in (headings.cross, xp.cross(headings.direction, headings.cross), headings.direction)
-    )
+    along, aside, depth = _offsets(headings, points[..., :_WIDTH_POINTS, :])
     inside = (xp.abs(aside) < _BREADTH) & (depth < _BEYOND)
     low, high = xp.where(inside, along, xp.inf).min(-1), xp.where(inside, along, -xp.inf).max(-1)
     return xp.maximum(high - low, 0.0)
+
+
+def _offsets(headings: Headings, points: Any) -> tuple[Any, Any, Any]:
+    """Surface points (..., P, 3) along the axes w, v x w and v of headings (..., H, 3): (..., H, P) m each."""
+    aside = headings.position.__array_namespace__().cross(headings.direction, headings.cross)
+    along, aside, depth = (
+        axis @ points.mT - (axis * headings.position).sum(-1)[..., None]
+        for axis in (headings.cross, aside, headings.direction)
+    )
+    return along, aside, depth
 
 
 def max_width(outline: Outline, scale: float) -> float:
@@ -337,23 +391,23 @@ def _spin(side: np.ndarray, other: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def _roll(
-    points: np.ndarray, avoid: np.ndarray, position: np.ndarray, direction: np.ndarray, rng: np.random.Generator
+    surface: _Surface, position: np.ndarray, direction: np.ndarray, rng: np.random.Generator, *, opposed: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cross-finger axes (N, 3), one of a few evenly spaced rolls each, and the object's local widths (N,) along them.
 
-    The width is infinite where the fingers would meet the avoid region first.
+    The width is infinite where the fingers would meet the avoid region first, or find nothing to press on.
 
     Args:
-      points: (P, 3) surface points, the first of which cover the surface.
-      avoid: (P,) bool, the avoid region.
+      surface: of the object.
       position: (N, 3) heading positions.
       direction: (N, 3).
       rng: draws the rolls.
+      opposed: requires surfaces to press on from both sides.
     """
     side, other = _frame(direction)
     turn = rng.uniform(0, np.pi, len(direction))[:, None] + np.pi / _ROLLS * np.arange(_ROLLS)
     axes = _spin(side[:, None], other[:, None], turn).astype(np.float32)
-    points, avoid = points[:_WIDTH_POINTS], avoid[:_WIDTH_POINTS]
+    points, normals, avoid = surface.some(slice(_WIDTH_POINTS))
     along = (axes.reshape(-1, 3) @ points.T).reshape(*turn.shape, len(points))
     along -= (axes * position[:, None]).sum(-1, keepdims=True)
     depth = (direction @ points.T - (direction * position).sum(-1, keepdims=True))[:, None]
@@ -364,11 +418,27 @@ def _roll(
     width = high - low
     if avoid.any():
         width[~_region_first(along, slab, depth, avoid)[1]] = np.inf
+    if opposed:
+        width[~_pressable(along, slab & (depth < _BEYOND) & ~avoid, axes @ normals.T)] = np.inf
     # Gumbel's trick draws a roll with probability exp(-width / preference).
     pick = (rng.gumbel(size=width.shape) - width / _PREFERENCE).argmax(-1)
     rows = np.arange(len(width))
     sign = rng.choice(np.array([-1.0, 1.0], np.float32), len(width))
     return sign[:, None] * axes[rows, pick], width[rows, pick]
+
+
+def _pressable(along: np.ndarray, between: np.ndarray, facing: np.ndarray) -> np.ndarray:
+    """(...,) bool, true where both sides of what lies between closing fingers have a surface to press on.
+
+    Args:
+      along: (..., P) m, surface points along the cross-finger axis.
+      between: (..., P) bool, points that the fingers sweep and may touch.
+      facing: (..., P) cosines of the outward normals with the axis.
+    """
+    low, high = (extreme[..., None] for extreme in _extent(along, between))
+    below = between & (along < low + _SIDE) & (facing < -_OPPOSED)
+    above = between & (along > high - _SIDE) & (facing > _OPPOSED)
+    return below.any(-1) & above.any(-1)
 
 
 def _region_first(
