@@ -143,8 +143,8 @@ def signed(rest):
         ((2).to_bytes(8, "little") + b"[]", "does not begin with its checksum"),
         (packed({"x": entry()}, TWO, crc="00000001"), "does not match its checksum"),
         (packed({"x": entry()}, TWO, crc="zz"), "does not match its checksum"),
-        (packed({"x": entry()}, TWO, more="x"), "lacks its meta data"),
-        (packed({}, meta=3), "lacks its meta data"),
+        (packed({"x": entry()}, TWO, more="x"), "lacks its metadata"),
+        (packed({}, meta=3), "lacks its metadata"),
         (signed(b"]"), "not JSON"),
         (signed(b',"a":\xff}'), "not JSON"),
         (signed(b',"a":' + b"[" * (1 << 18)), "not JSON"),
@@ -183,7 +183,7 @@ def test_damage_is_named(data, match):
 
 def test_length_is_limited():
     data = encode(Message({"x": np.zeros(100)}))
-    with pytest.raises(CongraspError, match=f"has {len(data)} bytes, more than the 100"):
+    with pytest.raises(CongraspError, match=f"has {len(data)} bytes; the limit is 100"):
         decode(data, max_bytes=100)
     assert decode(data, max_bytes=len(data)).arrays["x"].shape == (100,)
 

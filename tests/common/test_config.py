@@ -22,7 +22,7 @@ def test_unknown_keys_are_named():
 
 @pytest.mark.parametrize("task", [None, 3, [], "task", {"control": None}, {"control": [1]}])
 def test_a_task_that_is_none_is_refused(task):
-    with pytest.raises(CongraspError, match="does not fit this version"):
+    with pytest.raises(CongraspError, match="does not match this version"):
         run_config_from_json(json.dumps({"task": task}))
 
 

@@ -75,7 +75,7 @@ def test_reasons_say_what_is_missing():
     (graspxl,) = find(cells, "objects", "heading", method="graspxl", group="small")
     assert graspxl.reason == "no policy of the method 'graspxl': its training failed"
     (allegro,) = find(cells, "hands", "pose", hand="allegro")
-    assert allegro.reason == "the hand 'allegro' was not asked for"
+    assert allegro.reason == "the hand 'allegro' was not requested"
     assert any("GraspXL" not in why and "graspxl" in what and "small objects" in what
                for what, why, _ in not_comparable(cells))  # fmt: skip
 

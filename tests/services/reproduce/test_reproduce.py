@@ -53,7 +53,12 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, 
         assert cell["difference"] == pytest.approx(cell["ours"] - cell["paper"])
     assert len(first["not_comparable"]) == len(rates) - len(compared)
     page = Reader(text := (tmp_path / "reproduction.html").read_text())
-    assert not page.links and len(page.sources) == 2 and "--quick trains none" in text and failed in html.unescape(text)
+    assert (
+        not page.links
+        and len(page.sources) == 2
+        and "not trained with --quick" in text
+        and failed in html.unescape(text)
+    )
     assert (tmp_path / "tables.tex").read_text().count(r"\begin{tabular}") == 6
     assert not list((tmp_path / "tables").glob("*.pools"))
 
@@ -99,7 +104,7 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, 
     assert asked[2:6] == ["human-ours-single", "human-pd-single", "human-ours-composed", "human-ours-noise"]
     assert what["human-ours"].startswith("policy.safetensors, version 0") and what["human-pd"] == "needs none"
     assert what["allegro-ours"] == what["human-graspxl"] == "none: it failed"
-    assert what["human-dgrasp"] == "none: it was not asked for"
+    assert what["human-dgrasp"] == "none: not requested"
     assert account.failures == ["it failed", "it failed"]
     assert (tmp_path / "reproduction.html").read_text().count("Half of the headings are kept.") == 1
 
