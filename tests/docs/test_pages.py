@@ -8,7 +8,10 @@ import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "deploy/README.md")),
+    *(
+        ROOT / name
+        for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "deploy/README.md", "checkpoints/README.md")
+    ),
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 FREE = ("docs/notes/", "docs/reference/", "CHANGELOG.md")
