@@ -8,7 +8,8 @@ import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PAGES = [
-    *(
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *(ROOT / folder / "README.md" for folder in ("deploy", "checkpoints")),
         ROOT / name
         for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "deploy/README.md", "checkpoints/README.md")
     ),
