@@ -10,9 +10,6 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     *(ROOT / folder / "README.md" for folder in ("deploy", "checkpoints")),
-        ROOT / name
-        for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "deploy/README.md", "checkpoints/README.md")
-    ),
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 FREE = ("docs/notes/", "docs/reference/", "CHANGELOG.md")
