@@ -263,7 +263,8 @@ def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Creden
             context.load_cert_chain(credentials.certificate, credentials.key)
         except OSError:  # SSLError is an OSError
             return CongraspError(
-                f"The credentials in {credentials.folder} cannot be used.", "Issue new ones with 'congrasp certs issue'."
+                f"The credentials in {credentials.folder} cannot be used.",
+                "Issue new ones with 'congrasp certs issue'.",
             )
     try:
         with context.wrap_socket(raw, server_hostname=host) as connection:
@@ -282,9 +283,7 @@ def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Creden
             return None
         why = "expired" if "EXPIRED" in error.reason else "missing" if "REQUIRED" in error.reason else "not accepted"
         where = credentials.certificate if credentials else "none"
-        return CongraspError(
-            f"{endpoint} refuses the certificate ({where}): {why}.", "Issue one with its authority."
-        )
+        return CongraspError(f"{endpoint} refuses the certificate ({where}): {why}.", "Issue one with its authority.")
 
 
 def _is_loopback(endpoint: str) -> bool:
