@@ -65,5 +65,5 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
     both = stacked([*rows_of(bank), *rows_of(build_bank(hand, task, beside, seed))])
     if share := objects.folder_share:
         weights = [share / len(pool)] * len(pool) + [(1 - share) / len(beside)] * len(beside)
-        both = both._replace(weight=np.array(weights, np.float32))
+        both = both._replace(weight=both.weight * np.array(weights, np.float32))
     return TrainingSet(pool + beside, with_columns(hand, task, both))

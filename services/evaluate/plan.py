@@ -62,7 +62,7 @@ def plan_row(
     constraint, aligned = name.removesuffix(ALIGNED), name.endswith(ALIGNED)
     require_known(constraint.split("+"), task)
     allowed = initial.allowing(dataclasses.replace(task, aligned_references=aligned), bank, constraint.split("+"))
-    allowed = allowed & ~repeated_rests(np.asarray(bank.rest))
+    allowed = allowed & ~repeated_rests(np.asarray(bank.rest)) & (np.asarray(bank.weight) > 0)[:, None]
     covered = np.asarray(allowed.any(1))
     if not covered.any():
         raise CongraspError(

@@ -343,12 +343,12 @@ def test_a_corner_has_no_surfaces_to_press_on_and_a_strip_has():
 
 @pytest.mark.parametrize(("thick", "over"), [(0.03, True), (0.05, False)])
 def test_where_a_hand_has_no_room_its_fingers_still_close_over_the_table(thick, over):
-    """2 cm over the table, fingers that close vertically on 3 cm end 5 mm over it, on 5 cm they end 5 mm beneath it.
+    """3 cm over the table: fingers 12 mm thick that close vertically on 3 cm reach 27 mm down, on 5 cm 37 mm.
 
     A second heading, half a metre aside, closes level on a plate 1 cm thick.
     """
     reaching = Outline(0.05 * np.array([[[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]]), np.array([0.01]), ANY)
-    position = np.array([[0, 0, -0.03], [-0.5, 0.5, -0.03]])
+    position = np.array([[0, 0, -0.02], [-0.5, 0.5, -0.02]])
     headings = Headings(position, np.array([LEVEL] * 2), np.array([UP, [0, 1, 0]], float))
     half = np.array([0, 0, thick / 2]), np.array([0, 0.005, 0])
     points = np.concatenate([[p + h, p - h] for p, h in zip(position, half, strict=True)])

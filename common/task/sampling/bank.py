@@ -53,7 +53,7 @@ class ConstraintBank(NamedTuple):
     has_affordance: Array
     """(N, R) bool: the object has an avoid region, and its graspable one can be approached in the resting pose."""
     weight: Array
-    """(N,) relative frequency of the object."""
+    """(N,) relative frequency of the object; 0 if it lies too flat to be grasped."""
     mass: Array
     """(N,) mass before the factor of the episode, kg."""
     renewable: Array

@@ -20,6 +20,7 @@ BACK_OFF = 0.15
 _SKIN = 0.004  # m by which the widest pose exceeds the object on either side
 _BREADTH = 0.03  # half the breadth of the slab in which the local width is measured: a hand is about 6 cm broad
 _BEYOND = 0.01  # the slab ends this far beyond the heading position, at the fingertips
+_FINGER = 0.012  # thickness of a thin finger that closes from below
 _SIDE = 0.015  # depth of an object's side along the cross-finger axis, in which fingertips need a surface
 _OPPOSED = np.cos(np.arctan(1.0))  # least cosine of a normal with that axis: the edge of the cone of friction 1
 _TUBE = 0.01  # radius around the approach that must be free in front of the surface point
@@ -253,8 +254,8 @@ def within_reach(
 
     They move back by at most 1.5 cm, because a shallower grip slips: with one policy, half of the grasps moved back by
     2 to 3 cm were lost, against one in 25 of the others. If no heading of a flat object can be cleared that way, the
-    limit is 3 cm. If the table leaves no room for the hand at all, as around a card, only the hand's centre and the
-    places that the fingers close on must be over the table, or else only its centre.
+    limit is 3 cm. If the table leaves no room for the whole hand, as around a card, its centre and the closed fingers
+    must be over the table. An object that allows not even that lies too flat.
 
     Headings of a graspable region must still close on it after the move (`closes_on`), and clearing only the hand's
     centre is never enough: a region must be graspable without the rest of the object.
@@ -265,33 +266,30 @@ def within_reach(
       rest_poses: (R, 7) poses of the object, with the table's top at z = 0.
       outline: outline of the hand.
       avoid: (P,) bool, avoid region, for headings of the graspable region; None for other headings.
-      opposed: requires opposing surfaces at the position to which the table moved the heading, except in the last
-        resort.
+      opposed: requires opposing surfaces at the position to which the table moved the heading, and closed fingers
+        over the table; False applies the paper's rules alone.
     """
     width = local_width(headings, obj.points)
     bare = np.zeros(len(obj.points), bool) if avoid is None else avoid
-    ways = [(outline, _BACK, opposed, False), (outline, _FARTHEST_BACK, opposed, False)]
-    if avoid is None:
-        ways += [(CENTER, _FARTHEST_BACK, opposed, True), (CENTER, _FARTHEST_BACK, False, False)]
-    for own, farthest, pressed, touching in ways:
+    ways = [(outline, _BACK), (outline, _FARTHEST_BACK), (CENTER, _FARTHEST_BACK)]
+    for own, farthest in ways if avoid is None else ways[:2]:
         cleared = [clear_table(headings, rest, own, width, farthest) for rest in rest_poses]
         pairs = list(zip(cleared, rest_poses, strict=True))
         reachable = np.array([feasible(moved, rest, own, width) for moved, rest in pairs])
         if avoid is not None:
             reachable &= np.array([closes_on(moved, obj.points, avoid) for moved in cleared])
-        if pressed:
+        if opposed:
             reachable &= np.array([opposed_at(moved, obj, bare) for moved in cleared])
-        if touching:
-            reachable &= np.array([_contacts_over_table(moved, rest, width) for moved, rest in pairs])
+            reachable &= np.array([_closed_over_table(moved, rest, width) for moved, rest in pairs])
         if reachable.any():
             break
     return cleared, reachable
 
 
-def _contacts_over_table(headings: Headings, rest_pose: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """(H,) bool, true where both ends of the local width (H,) along the cross-finger axis are over the table."""
+def _closed_over_table(headings: Headings, rest_pose: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """(H,) bool, true where fingers that hold the local width (H,) along the cross-finger axis are over the table."""
     up = matrix(rest_pose[3:])[2]
-    return headings.position @ up + rest_pose[2] - np.abs(headings.cross @ up) * width / 2 > 0
+    return headings.position @ up + rest_pose[2] > np.abs(headings.cross @ up) * (width / 2 + _FINGER)
 
 
 def opposed_at(headings: Headings, obj: GraspObject, avoid: np.ndarray) -> np.ndarray:
