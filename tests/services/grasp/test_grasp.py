@@ -68,7 +68,7 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     assert motion.constraints == ("heading", "affordance") and motion.about["attempts"] == found.attempts
     assert len(motion.time) == steps and motion.table.sum() == steps - 26  # gone with its last step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
-    np.testing.assert_array_equal(motion.surface_minus, minus[:256])
+    np.testing.assert_array_equal(motion.surface_avoid, minus[:256])
     # The hand came along the block's own z axis: from its start to its end the wrist moved mostly that way.
     way = motion.wrist_position[48] - motion.wrist_position[0]
     axis = np.asarray(rotate(motion.object_quaternion[0], np.array([0.0, 0.0, -1.0])))
