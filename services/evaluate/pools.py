@@ -29,12 +29,14 @@ from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank, headings_of
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
+from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.evaluate.exam import FAMILIES, Exam, first_seed
 
 _MOST = {True: 4096, False: 128}
 """Objects of a pool, for engines on a device and for others; each has a compiled scene in the latter."""
 _MESHES = 512
 """Objects of a pool of a folder, whose surfaces may be large."""
+_UNCHANGED = ImportOptions()
 _log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
 
@@ -80,7 +82,7 @@ def most_objects(physics: PhysicsName) -> int:
     return min(_MOST[ENGINES[physics].on_device], _MESHES)
 
 
-def listed_pools(found: Sequence[ObjectAt], most: int) -> Pools:
+def listed_pools(found: Sequence[ObjectAt], most: int, options: ImportOptions = _UNCHANGED) -> Pools:
     """Objects of different names in pools of at most `most`; meshes are imported when their turn comes, and those that
     cannot be are left out."""
     number, size = _divided(len(found), most)
@@ -92,7 +94,7 @@ def listed_pools(found: Sequence[ObjectAt], most: int) -> Pools:
             _log.warning("%s is left out: %s", one.name, error)
             left_out.append(one.name)
 
-        objects = load_each(part, on_error=leave_out)
+        objects = load_each(part, options, on_error=leave_out)
         names = [one.name for one in part if one.name not in left_out]
         return Loaded([dataclasses.replace(obj, name=n) for obj, n in zip(objects, names, strict=True)], left_out)
 
