@@ -24,15 +24,15 @@ from congrasp.services.dataset.card import CARD
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 
 
-def arguments(policy: pathlib.Path, out: pathlib.Path, *more: str) -> list[str]:
+def arguments(out: pathlib.Path, *more: str) -> list[str]:
     """Six episodes of each of three objects, a shard each."""
-    own = ["dataset", "box:1-3", "--out", str(out), "--policy", str(policy), "--per-object", "6", "--shard", "1"]
+    own = ["dataset", "box:1-3", "--out", str(out), "--per-object", "6", "--shard", "1"]
     return [*own, "--constraints", "heading", "affordance", "--keep", "all", "--physics", "native", *more]
 
 
-def made(policy: pathlib.Path, out: pathlib.Path, *more: str) -> dict:
+def made(out: pathlib.Path, *more: str) -> dict:
     """Makes a dataset in a process of its own, whose programs the next ones find compiled; returns its card."""
-    command = [sys.executable, "-m", "congrasp", *arguments(policy, out, *more)]
+    command = [sys.executable, "-m", "congrasp", *arguments(out, *more)]
     subprocess.run(command, check=True, timeout=500, stdout=subprocess.DEVNULL)
     return json.loads((out / CARD).read_text())
 
@@ -43,10 +43,10 @@ def contents(folder: pathlib.Path) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def whole(paper_policy, tmp_path_factory) -> pathlib.Path:
+def whole(tmp_path_factory) -> pathlib.Path:
     """A dataset that was made at once."""
     out = tmp_path_factory.mktemp("dataset")
-    made(paper_policy, out)
+    made(out)
     return out
 
 
@@ -62,8 +62,8 @@ def columns(whole) -> dict[str, np.ndarray]:
     return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
 
 
-def test_a_killed_run_resumes_and_parts_make_the_same_shards(whole, paper_policy, tmp_path):
-    command = [sys.executable, "-m", "congrasp", *arguments(paper_policy, tmp_path)]
+def test_a_killed_run_resumes_and_parts_make_the_same_shards(whole, tmp_path):
+    command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
     while len(contents(tmp_path)) < 2 and time.monotonic() < deadline and process.poll() is None:
@@ -75,8 +75,8 @@ def test_a_killed_run_resumes_and_parts_make_the_same_shards(whole, paper_policy
     (tmp_path / "grasps" / f".00002-of-00003.parquet.{process.pid}.tmp").write_bytes(b"half a shard")
     first = sorted(tmp_path.rglob("*.parquet"))[0]
     changed = first.stat().st_mtime_ns
-    made(paper_policy, tmp_path, "--part", "3/3")
-    card = made(paper_policy, tmp_path)
+    made(tmp_path, "--part", "3/3")
+    card = made(tmp_path)
     assert first.stat().st_mtime_ns == changed, "what was finished is not made again"
     assert contents(tmp_path) == contents(whole)
     assert card["counts"] == json.loads((whole / CARD).read_text())["counts"]
@@ -94,7 +94,7 @@ def test_rows_say_what_was_requested_and_what_came_of_it(whole, columns):
         assert np.isnan(columns["goal_heading_direction"][rows]).all() == (asked != "heading")
         assert np.isfinite(columns["affordance_ratio"][rows]).all() == (asked == "affordance")
     assert (columns["held"] >= columns["lifted"]).all() and (columns["lifted"] >= columns["pushed"]).all()
-    assert columns["held"].any(), "the guidance alone holds some boxes"
+    assert columns["held"].any()
     unit = np.linalg.norm(columns["goal_heading_direction"][columns["constraints"] == "heading"], axis=-1)
     np.testing.assert_allclose(unit, 1.0, atol=1e-5)
 
@@ -117,8 +117,8 @@ def test_objects_are_beside_their_grasps(whole):
     np.testing.assert_allclose(np.reshape(table.column("points")[row].as_py(), (512, 3)), box.points, atol=1e-6)
 
 
-def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, paper_policy, tmp_path):
-    card = made(paper_policy, tmp_path, "--keep", "held", "clean", "--part", "1/3")
+def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tmp_path):
+    card = made(tmp_path, "--keep", "held", "clean", "--part", "1/3")
     of_first = columns["object"] == "box_1"
     wanted = of_first & columns["held"] & columns["clean"]
     assert pq.read_table(tmp_path / "grasps").num_rows == wanted.sum()
@@ -137,9 +137,9 @@ def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, pa
         (("--shard", "100000"), "--shard"),
     ],
 )
-def test_what_cannot_be_made_is_refused_in_one_line(whole, paper_policy, more, words):
+def test_what_cannot_be_made_is_refused_in_one_line(whole, more, words):
     with pytest.raises(CongraspError, match=words) as error:
-        cli.run(arguments(paper_policy, whole, *more))
+        cli.run(arguments(whole, *more))
     assert "\n" not in str(error.value)
 
 
