@@ -49,17 +49,17 @@ class Loaded(NamedTuple):
 
 
 class Pools(NamedTuple):
-    """Objects that are made pool by pool."""
+    """Objects that are loaded in pools."""
 
     source: str
-    """What they are, as far as results depend on it."""
+    """Description of the objects, for the identity of results."""
     size: int
     """Objects of a pool; the last pools may have one less."""
     make: list[Callable[[], Loaded]]
 
 
 def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
-    """At least `count` procedural objects of an exam, in pools of one size."""
+    """Returns at least `count` procedural objects of an evaluation set, in pools of one size."""
     number, size = _divided(count, _MOST[ENGINES[physics].on_device])
     seed = first_seed(exam, number * size)
     families = procedural.family_turns(number * size, seed, FAMILIES)
@@ -91,7 +91,7 @@ def listed_pools(found: Sequence[ObjectAt], most: int, options: ImportOptions = 
         left_out: list[str] = []
 
         def leave_out(one: ObjectAt, error: CongraspError) -> None:
-            _log.warning("%s is left out: %s", one.name, error)
+            _log.warning("%s is skipped: %s", one.name, error)
             left_out.append(one.name)
 
         objects = load_each(part, options, on_error=leave_out)
@@ -103,27 +103,27 @@ def listed_pools(found: Sequence[ObjectAt], most: int, options: ImportOptions = 
 
 
 class Pool(NamedTuple):
-    """A pool that is ready to be simulated."""
+    """A pool that is ready for simulation."""
 
     number: int
     objects: list[GraspObject]
-    """In the hand's size; those from `real` on repeat others, so that all pools have one size."""
+    """Objects scaled for the hand; those from `real` on are repetitions that pad the pool."""
     bank: ConstraintBank | None
-    """None where no object is left."""
+    """None if no object remains."""
     field: DistanceField | None
     real: int
     left_out: list[str]
 
 
 def _divided(count: int, most: int) -> tuple[int, int]:
-    """Number of pools and their size, for so many objects, of which a pool has at most `most`."""
+    """Number and size of pools for `count` objects, at most `most` in each."""
     number = -(-count // most)
     return number, -(-count // number)
 
 
 @contextlib.contextmanager
 def one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
-    """The same items, each made in a thread while the one before it is in use."""
+    """Yields the same items, each computed in a thread while the previous one is in use."""
     with concurrent.futures.ThreadPoolExecutor(1) as background:
 
         def taken() -> Iterator[_Item]:
@@ -138,7 +138,7 @@ def one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
 def prepared(
     hand: Hand, task: TaskConfig, pools: Pools, seed: int, wanted: Sequence[int], measured: bool
 ) -> Iterator[Pool]:
-    """Pools with their constraints."""
+    """Yields pools with their constraints."""
     for number in wanted:
         loaded, left_out = pools.make[number]()
         objects = scale_objects(hand, task, loaded)
@@ -150,14 +150,14 @@ def prepared(
 
 
 def _filled(objects: Sequence[GraspObject], size: int) -> list[GraspObject]:
-    """So many objects, the first ones again where there are fewer."""
+    """Pads objects to `size` by repeating the first ones."""
     return list(itertools.islice(itertools.cycle(objects), size))
 
 
 def _with_bank(
     hand: Hand, task: TaskConfig, objects: list[GraspObject], size: int, seed: int
 ) -> tuple[list[GraspObject], ConstraintBank | None]:
-    """Those objects that the hand can approach in some resting pose, and the bank of `size` of them (`_filled`)."""
+    """Returns the objects that the hand can approach in some resting pose, and a bank of `size` of them (`_filled`)."""
     while objects:
         filled = _filled(objects, size)
         try:
@@ -175,9 +175,8 @@ def _with_bank(
 
 
 def _approachable(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, own: Outline) -> bool:
-    """True if an object has a heading for the hand with this outline."""
+    """True if an object has a heading for the hand with this outline, and does not lie too flat for all of them."""
     try:
-        headings_of(task, obj, seed, None, scale, own)
+        return bool(headings_of(task, obj, seed, None, scale, own)["weight"])
     except CongraspError:
         return False
-    return True

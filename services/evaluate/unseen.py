@@ -1,7 +1,7 @@
-"""The test on unseen geometry: the heading constraint over as many different objects as there is time for.
+"""Test on unseen geometry: the heading constraint over many different objects.
 
-Objects come in pools of equal size (`services.evaluate.pools`). What stays of a pool is a few numbers an episode, which
-can be kept on disk, so that a stopped evaluation goes on with the pool that it had come to.
+Objects come in pools of equal size (`services.evaluate.pools`). The result of a pool is a few numbers per episode. They
+can be stored on disk, so that a stopped evaluation resumes at its current pool.
 """
 
 import contextlib
@@ -46,22 +46,22 @@ def evaluate_objects(
     keep: pathlib.Path | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Row]:
-    """Rows of the heading constraint: all objects, then by size, mass and family.
+    """Evaluates rows of the heading constraint: all objects, then by size, mass and family.
 
     Args:
       bundle: the policy.
-      pools: the objects.
-      episodes: in all, at least; every object has the same number of them.
-      physics: engine; not `auto`.
-      batch: worlds that run side by side; 0 chooses by the engine.
+      pools: pools of objects.
+      episodes: least total number; every object has the same number.
+      physics: engine, except `auto`.
+      batch: number of parallel worlds; 0 uses the engine's default.
       threads: threads of the `native` engine.
       seed: seed of constraints and episodes.
       friction: sliding friction between hand and object.
-      keep: folder for results of pools, from which an evaluation with the same arguments goes on; None keeps none.
-      progress: is told how many episodes there are.
+      keep: folder for results of pools, from which an evaluation with the same arguments resumes; None stores none.
+      progress: called with the number of finished episodes.
 
     Raises:
-      CongraspError: no object is left that the hand can approach.
+      CongraspError: the hand can approach none of the objects.
     """
     hold, hand, number = two_seconds(bundle.task), get_hand(bundle.spec.hand), len(pools.make)
     task = protocol(bundle.task, hold, friction)
@@ -96,7 +96,7 @@ def evaluate_objects(
 
 
 class _Result(NamedTuple):
-    """What is kept of a pool: its episodes, and of each object its name, largest side (m), mass (kg) and family."""
+    """Result of a pool: its episodes, and name, largest side (m), mass (kg) and family of each object."""
 
     sample: Sample
     names: list[str]
@@ -112,7 +112,7 @@ class _Result(NamedTuple):
 
 
 def _nothing(left_out: list[str]) -> _Result:
-    """The result of a pool of which no object is left."""
+    """Returns the result of a pool without objects."""
     return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], np.zeros((0, 2)), [], left_out)
 
 
@@ -126,7 +126,7 @@ def _simulated(
     progress: Callable[[int], None],
     stressed: int,
 ) -> _Result:
-    """The episodes of a pool."""
+    """Simulates the episodes of a pool."""
     assert pool.bank is not None
     plan = plan_row(task, pool.bank, pool.objects, _ROW, each * len(pool.objects))
     conditions = batches(hand, task, pool.bank, plan, seed, running.batch)
@@ -138,16 +138,16 @@ def _simulated(
 
 
 def _without_forces(sample: Sample) -> Sample:
-    """Only the metrics: forces are read from the first pool."""
+    """Drops everything but the metrics: forces are read from the first pool."""
     return dataclasses.replace(sample, link_force=sample.link_force[:0], torque=sample.torque[:0])
 
 
 def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
-    """All objects, then groups of them."""
+    """Returns the rows of all objects, then of groups."""
     left_out = [name for result in results for name in result.left_out]
     results = [result for result in results if result.episodes]
     if not results:
-        raise CongraspError("None of the objects can be approached.", "Scale them to the hand, or name others.")
+        raise CongraspError("None of the objects can be approached.", "Scale them for the hand, or pass others.")
     firsts = np.cumsum([0, *(len(result.names) for result in results)])
     for result, first in zip(results, firsts, strict=False):
         result.sample.values["object_index"] = result.sample.values["object_index"] + first
@@ -167,12 +167,12 @@ def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
 
 
 def _file(folder: pathlib.Path, number: int) -> pathlib.Path:
-    """Where the result of a pool is kept."""
+    """Path of a pool's result."""
     return folder / f"pool-{number:05d}.safetensors"
 
 
 def _write(path: pathlib.Path, result: _Result, about: dict[str, Any]) -> None:
-    """Keeps a result beside what it depends on."""
+    """Writes a result and its identity."""
     arrays = {f"values/{name}": column for name, column in result.sample.values.items()}
     arrays |= {"link_force": result.sample.link_force, "torque": result.sample.torque, "traits": result.traits}
     lists = {"names": result.names, "families": result.families, "left_out": result.left_out}
@@ -180,7 +180,7 @@ def _write(path: pathlib.Path, result: _Result, about: dict[str, Any]) -> None:
 
 
 def _read(path: pathlib.Path, about: dict[str, Any]) -> _Result | None:
-    """A kept result of the same arguments, if there is one and it is whole."""
+    """Reads a result with the same arguments; returns None if it is missing or damaged."""
     try:
         message = decode(read_file(path, MAX_MESSAGE))
         if message.meta["about"] != json.dumps(about):

@@ -146,6 +146,7 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(simulate
     def headings_of(task, obj, seed, given, scale, own):
         if obj.name == lost:
             raise CongraspError("no heading")
+        return {"weight": np.float32(1.0)}
 
     monkeypatch.setattr(of_objects, "build_bank", build_bank)
     monkeypatch.setattr(of_objects, "headings_of", headings_of)
