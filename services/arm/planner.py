@@ -55,7 +55,7 @@ class ArmMotion:
         }
 
     def note(self) -> str:
-        """How near the arm is to its limits, in words."""
+        """Describes the arm's distance from its limits."""
         facts = self.facts()
         off = f"{facts['arm_error_mm']:.1f} mm and {facts['arm_error_deg']:.1f}°"
         speed = f"{facts['arm_speed_joint']} at {100 * facts['arm_speed_share']:.0f}% of its speed limit at most"

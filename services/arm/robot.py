@@ -148,7 +148,7 @@ def _hand_spec(hand: Hand, degrees: bool) -> mujoco.MjSpec:
 
 
 def _depths(spec: mujoco.MjSpec, arm: Arm) -> dict[str, int]:
-    """How many joints are between the base and each body."""
+    """Number of joints between the base and each body."""
     found = {"world": 0}
     for body in spec.bodies:
         if body.name != "world":

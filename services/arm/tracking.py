@@ -227,7 +227,7 @@ class _Solver:
         return "the acceleration of the wrist" if off < POSITION / 2 else "the reach"
 
     def _collision(self, q: np.ndarray, t: int) -> str:
-        """What touches what at step t, in words; empty where nothing does."""
+        """Describes the collision at step t; empty if there is none."""
         path, data = self.path, self.scene
         self.robot.place(data, self.whole(q, t), path.object_position[t], path.object_quaternion[t], path.table[t])
         touching = self.robot.collision(data)

@@ -32,7 +32,7 @@ def actor(
       threads: Threads of the native engine; 0 takes all cores.
       patience: Seconds without a learner after which the actor gives up.
       audit: Journal of every rollout and the learner's answer to it, for 'congrasp audit'; nothing is written without.
-      references: File by which the next start goes on with the policy's own grasps as reference poses.
+      references: File that preserves the reference poses from the policy's grasps for the next start.
       watch: How it is watched.
       certs: Folder of an actor's certificate (congrasp certs), whose number its name on the wire begins with.
 

@@ -7,10 +7,10 @@ import tyro
 
 
 def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tuple[pathlib.Path, ...] = ()) -> int:
-    """Compares the journals of a run's actors and of its learner: was every accepted rollout used once, and whole?
+    """Compares the journals of a run's actors and of its learner: was every accepted rollout used once, and unchanged?
 
-    Exits with 1 if a rollout was lost, else with 5 if there is a surplus (one was used twice, or nobody made it), else
-    with 6 if a rollout or a journal is damaged.
+    Exits with 1 if a rollout was lost, else with 5 if there is a surplus (one was used twice, or no actor made it),
+    else with 6 if a rollout or a journal is damaged.
 
     Args:
       run_dir: Directory of the run.

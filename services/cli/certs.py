@@ -15,10 +15,10 @@ def init(
     host: tuple[str, ...] = (),
     force: bool = False,
 ) -> int:
-    """Make a private authority, and number 0 of every role: all that a run on one machine needs.
+    """Create a private authority, and number 0 of every role: all that a run on one machine needs.
 
-    A certificate serves the one run that it names. The authority's ca.key signs certificates: keep it where nobody else
-    can read it. Commands on this machine take --certs FOLDER.
+    A certificate is valid for the run that it names. The authority's ca.key signs certificates: keep it unreadable for
+    others. Commands on this machine take --certs FOLDER.
 
     Args:
       folder: Folder for the authority and the certificates.
@@ -76,10 +76,10 @@ def issue(
 
 
 def revoke(folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, run: str | None = None) -> int:
-    """Revoke a certificate whose key is lost or stolen: learners and servers let its owner in no more.
+    """Revoke a certificate whose key is lost or stolen: learners and servers no longer admit its owner.
 
-    Those on this machine notice within seconds, and all their peers connect anew. If it is a learner's or a server's
-    own, those who are connected to it end. Elsewhere, copy the file 'revoked' into the folders of the certificates.
+    Those on this machine notice within seconds, and all their peers reconnect. If it belongs to a learner or a server,
+    its peers disconnect. Elsewhere, copy the file 'revoked' into the folders of the certificates.
 
     Args:
       folder: Folder of the authority.

@@ -1,4 +1,4 @@
-"""What commands show beside plain lines: tables on standard output, progress bars and errors on standard error."""
+"""Console output of commands: tables on standard output, progress bars and errors on standard error."""
 
 import contextlib
 import sys

@@ -200,7 +200,7 @@ def _save(
 
 
 def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathlib.Path) -> None:
-    """What was kept, what was dropped by which rule, and where it all is."""
+    """Prints what was kept, what each rule dropped, and the locations of the results."""
     from congrasp.services.cli.console import show_table
 
     kept, dropped = report.kept, report.dropped

@@ -161,7 +161,7 @@ def _check_hand(made_for: str, hands: Sequence[str]) -> None:
 
 
 def _who(lineup: "Lineup") -> str:
-    """What was evaluated: a policy, a method that has none, or several."""
+    """Describes what was evaluated: a policy, a method without one, or several."""
     from congrasp.common.task.methods import get_method
 
     if len(lineup.entrants) > 1:

@@ -152,7 +152,7 @@ def check(
     png: pathlib.Path | None = None,
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
 ) -> int:
-    """Decide whether a hand can grasp at all, before it is trained: one line for each check, with what mends it.
+    """Check whether a hand can grasp at all, before it is trained: one line for each check, with its remedy.
 
     Palm, joints, opening and strength are measured; servos, overlaps, and grips of a ball, a cylinder and a box, which
     are lifted and pushed, are simulated. The picture shows the grips and every joint. The exit code is 1 if a check
@@ -200,11 +200,11 @@ def train(
     training: str = "",
     patience: int = 240,
 ) -> int:
-    """From a URDF or MJCF to a policy and a report: import, self-check, training, evaluation.
+    """Train a hand from a URDF or MJCF to a policy and a report: import, self-check, training, evaluation.
 
     On a GPU it trains the full task by the recipe for all hands; afterwards grasp, serve, evaluate and view take the
-    policy as --hand NAME. Without a GPU the training is short and of an easier task. It stops where the self-check
-    fails. The same command goes on where it was stopped.
+    policy as --hand NAME. Without a GPU the training is short and of an easier task. It stops if the self-check fails.
+    Repeat the command to resume a stopped one.
 
     Args:
       hand: The hand's URDF (.urdf) or MJCF (.xml), which is imported unless a hand of its name is among your own
@@ -259,7 +259,7 @@ def train(
 
 
 def _taken(hand: str, choices: "Choices") -> str:
-    """What commands call a hand by; that of a URDF or MJCF is imported, unless it was before."""
+    """Name of a hand in commands; that of a URDF or MJCF is imported, unless it was before."""
     from congrasp.common.hands import own_hands
     from congrasp.services.assets.hands.model_files import import_hand as proposed
 
@@ -269,7 +269,7 @@ def _taken(hand: str, choices: "Choices") -> str:
     proposal = proposed(file, choices)
     name = proposal.hand.name
     if name in own_hands():
-        print(f"The hand '{name}' is {own_hands()[name]}; 'congrasp hands import' would make it anew.")
+        print(f"The hand '{name}' is {own_hands()[name]}; 'congrasp hands import' would replace it.")
     else:
         _keep(proposal, None, None)
     return name

@@ -53,10 +53,9 @@ def learner(
       insecure: Listen beyond loopback without certificates.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
       teacher: A policy file, or the hand of a pretrained policy, to distil, as for `congrasp train`; ranks read it.
-      resume: Resume the run in --run-dir from its newest intact checkpoint; a run that has not come to one
-        begins anew.
-      or_resume: Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command
-        every time.
+      resume: Resume the run in --run-dir from its newest intact checkpoint; a run without a checkpoint starts again.
+      or_resume: Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command every
+        time.
       rank: Number of this process among several that train together; each needs a GPU of its own
         (CUDA_VISIBLE_DEVICES).
       ranks: Learner processes that train together: data parallel, each with actors of its own. The run is that in the

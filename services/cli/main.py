@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _said_of(error: OSError) -> str:
-    """What a full disk, or a path that cannot be used, is to a user; raises other errors, which are faults of ours."""
+    """Describes a full disk, or an unusable path, to the user; raises other errors, which are bugs."""
     if error.errno in _FULL:
         where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
         return f"{where}: {error.strerror}. Free space and start again."

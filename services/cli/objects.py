@@ -258,7 +258,7 @@ def set_affordance(
     name: str = "",
     folder: str = "objects",
 ) -> int:
-    """Divide an object's surface anew into graspable region and avoid region.
+    """Divide an object's surface into graspable region and avoid region.
 
     Graspable is what lies on the mesh of a part, what is painted in a colour, or what lies beyond a plane. It must have
     a tenth of the surface at least. Sets of constraints and evaluation then keep to it.
@@ -317,7 +317,7 @@ def _size(obj: "GraspObject") -> str:
 
 
 def _errors(obj: "GraspObject") -> str:
-    """How faithful its pieces are, where it was imported."""
+    """Describes the errors of its pieces, if it was imported."""
     if obj.surface_error is None:
         return "the object is its pieces"
     volume = "" if obj.volume_error is None else f", volume {obj.volume_error:+.1%}"

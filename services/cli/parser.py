@@ -115,14 +115,14 @@ _SEED = tyro.constructors.PrimitiveConstructorSpec(
 
 
 def _value(kind: Any) -> str:
-    """How one value of a tuple is shown."""
+    """Display form of one value of a tuple."""
     if typing.get_origin(kind) is typing.Literal:
         return "{" + ",".join(map(str, typing.get_args(kind))) + "}"
     return "PATH" if kind.__name__ == "Path" else kind.__name__.upper()
 
 
 def _hint(default: str) -> str:
-    """What stands behind an option's help."""
+    """Suffix of an option's help."""
     shown = default.strip("[']")  # a choice is shown as a list
     return "" if shown in _QUIET else f"(default: {shown})"
 
@@ -151,7 +151,7 @@ def _dataclass(info: tyro.constructors.StructTypeInfo) -> tyro.constructors.Stru
 
 
 def _meaning(kind: type, field: str) -> str | None:
-    """What a field means, on one line: the string under it."""
+    """Help of a field, on one line: the string under it."""
     for base in kind.__mro__:
         if found := _meanings(base).get(field):
             return found
@@ -160,7 +160,7 @@ def _meaning(kind: type, field: str) -> str | None:
 
 @functools.cache
 def _meanings(kind: type) -> Mapping[str, str]:
-    """What the fields of one class mean."""
+    """Help of the fields of one class."""
     if kind is object:
         return types.MappingProxyType({})
     params = docstring_parser.parse_from_object(kind).params

@@ -1,8 +1,8 @@
-"""The hands that DexGraspBench has, and which joint of a hand of this project is which of theirs.
+"""Hands of DexGraspBench, and the correspondence between their joints and those of this project's hands.
 
 The benchmark takes them from MuJoCo Menagerie (Allegro V3: SimLab, BSD-2; Shadow: Shadow Robot Company, Apache-2.0).
-Here are their names and kinematics as facts, in the frame of the palm's body with every joint at zero. A hand is told
-by these, not by names: it is the benchmark's if its joints are where the benchmark has them.
+Here are their names and kinematics as facts, in the frame of the palm's body with every joint at zero. A hand is
+recognised by these, not by names: it is the benchmark's if its joints are at the same places.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from congrasp.services.export.motion_file import GraspMotion
 Row = tuple[float, float, float, float, float, float]
 """Anchor (m) and axis (unit) of a joint, in the palm's frame at zero."""
 PLACES_MM = 0.1
-"""How far a joint may be from where the benchmark has it."""
+"""Tolerance of a joint's position relative to the benchmark."""
 _FACING = 1e-3  # rad, how far an axis may be turned
 
 
@@ -44,7 +44,7 @@ class BenchmarkHand(NamedTuple):
     fingers: dict[str, tuple[Row, ...]]
     """The joints of each finger from the palm on; the key with a number is a joint's name."""
     from_tip: bool
-    """Whether they are numbered from the tip, from 1 on, instead of from the palm, from 0 on."""
+    """True if they are numbered from the tip, from 1 on, instead of from the palm, from 0 on."""
     position: tuple[float, float, float]
     """m, of the palm in the frame of the root, which is what the benchmark places."""
     quaternion: tuple[float, float, float, float]
@@ -56,7 +56,7 @@ class BenchmarkHand(NamedTuple):
     torque_limit: float
     """N.m of every motor."""
     shapes: tuple[Shape, ...] = ()
-    """What collides; empty where that is meshes."""
+    """Collision shapes; empty if those are meshes."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -233,14 +233,14 @@ class Match(NamedTuple):
         return found
 
     def joint_frames(self, qpos: np.ndarray) -> tuple[np.ndarray, Rotation]:
-        """Where the benchmark's kinematics has what each joint moves, by the product of exponentials.
+        """Frames of each joint's link in the benchmark's kinematics, by the product of exponentials.
 
         Args:
           qpos: (7 + F,), see `qpos`.
 
         Returns:
-          (F, 3) m, the joints' anchors in the world; and the turn of what follows each from this project's zero pose
-          to the world.
+          (F, 3) m, the joints' anchors in the world; and the turn of what follows each from this project's zero pose to
+          the world.
         """
         root = Rotation.from_quat(qpos[3:7], scalar_first=True)
         palm = root * Rotation.from_quat(self.hand.quaternion, scalar_first=True)
@@ -327,7 +327,7 @@ def _chains(motion: GraspMotion) -> list[np.ndarray]:
 
 
 def _laid_over(name: str, hand: BenchmarkHand, order: np.ndarray, motion: GraspMotion) -> tuple[float, Match | None]:
-    """How far in mm the farthest joint is off with these joints for the benchmark's, and the match."""
+    """Error in mm of the farthest joint for this assignment of joints, and the match."""
     theirs, anchors, axes = hand.rows, motion.joint_anchor[order].astype(float), motion.joint_axis[order].astype(float)
     middle, center = theirs[:, 0].mean(0), anchors.mean(0)
     turn = Rotation.align_vectors(theirs[:, 0] - middle, anchors - center)[0]

@@ -39,7 +39,7 @@ def convex_object(motion: GraspMotion) -> GraspObject:
         bodies = [trimesh.Trimesh(*shape)]
     pieces = [piece for body in bodies for piece in _pieces(body, max(1, MAX_MESH_PIECES // len(bodies)))]
     if not pieces:
-        raise CongraspError(f"The mesh of '{motion.object}' has no volume.", "Make the motion anew.")
+        raise CongraspError(f"The mesh of '{motion.object}' has no volume.", "Generate the motion again.")
     return plain_object(motion.object, tuple(pieces), _DENSITY)
 
 

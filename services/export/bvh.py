@@ -80,13 +80,13 @@ def _row(values: np.ndarray) -> str:
 
 
 def _end(motion: GraspMotion, index: int) -> np.ndarray:
-    """Where the end of a last link is drawn, m in its frame: the far end of its last capsule."""
+    """Drawn end of a last link, in its frame, m: the far end of its last capsule."""
     capsules = np.flatnonzero(motion.capsule_link == index)
     return motion.capsule_ends[capsules[-1], 1] if len(capsules) else np.array([0.0, 0.0, 0.01])
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """What bvhio reads, put together from the root to the tips."""
+    """Reads a file with bvhio, composed from the root to the tips."""
     import bvhio
 
     names = json.loads(path.with_name(f"{path.name}.json").read_text())["frames"]

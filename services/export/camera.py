@@ -1,4 +1,4 @@
-"""What a camera that stands still sees of motions: hand, object and table, without what only a simulation knows."""
+"""Video of motions from a fixed camera: hand, object and table, without simulation-only elements."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor

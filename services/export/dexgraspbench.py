@@ -56,7 +56,7 @@ class State(NamedTuple):
 
 
 class Grasp(NamedTuple):
-    """What the benchmark is given of a motion."""
+    """Data of a motion for the benchmark."""
 
     name: str
     hand: Hand
@@ -201,7 +201,7 @@ def squeezed(hand: Hand, motion: GraspMotion, t: int, kp: float) -> np.ndarray:
 
 
 def arrays_of(grasp: Grasp) -> dict[str, np.ndarray]:
-    """What the benchmark reads of a grasp, by its names.
+    """Arrays of a grasp for the benchmark, by its names.
 
     Returns:
       `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + F,): the root's place (m) and quaternion (w, x, y, z) in the
@@ -234,7 +234,7 @@ def write_grasp(grasp: Grasp, folder: pathlib.Path) -> float:
     arrays: dict[str, Any] = arrays_of(grasp)
     np.savez(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
-    error = error_mm(grasp, read_npz(path, "Export it anew."))
+    error = error_mm(grasp, read_npz(path, "Export it again."))
     if error <= TOLERANCE_MM:
         write_object(folder / OBJECTS / grasp.name, grasp.obj, grasp.origin, grasp.scale)
     else:

@@ -38,7 +38,7 @@ TO_Y_UP = Rotation.from_matrix(FROM_Y_UP[:3, :3].T)
 
 
 class Track(NamedTuple):
-    """What a file says about one motion, worked out by its reader."""
+    """Content of a file for one motion, computed by its reader."""
 
     time: np.ndarray
     """(T,) s, from zero."""
@@ -116,7 +116,7 @@ def skin_of_motion(motion: GraspMotion) -> Skin:
 
 
 def _same_hand(motion: GraspMotion, hand: Hand) -> bool:
-    """Whether a hand of the motion's name still is as in the motion."""
+    """True if the hand of the motion's name is unchanged."""
     arrays = hand_arrays(hand)
     return all(np.array_equal(arrays[name], getattr(motion, name)) for name in _KINEMATICS)
 
@@ -179,7 +179,7 @@ def error_mm(motion: GraspMotion, track: Track) -> float:
 
 
 def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dict[str, Any]:
-    """What goes into every file: where the motion comes from, and what its numbers mean in this format."""
+    """Metadata of every file: origin of the motion, and meaning of its numbers in this format."""
     return {
         "generator": "congrasp",
         "hand": motion.hand,

@@ -96,7 +96,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
 
 
 class _Film(NamedTuple):
-    """What a camera saw."""
+    """Recording of a camera."""
 
     camera: Camera
     pixels: list[np.ndarray]
@@ -121,7 +121,7 @@ def _film(path: pathlib.Path, motions: Sequence[GraspMotion], fps: int) -> _Film
 
 
 def _filmed(pixels: np.ndarray, frames: int, seconds: np.ndarray) -> dict[str, Any]:
-    """What the row of an episode says of its part of the video, from one second (2,) to another."""
+    """Entries of an episode's row for its part of the video, from one second (2,) to another."""
     begin, end = seconds.tolist()
     place = {**_PLACE, "from_timestamp": begin, "to_timestamp": end}
     statistics = _image_statistics(pixels, frames)
@@ -205,7 +205,7 @@ def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
 
 
 def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int) -> dict[str, Any]:
-    """What the data set holds: features with their shapes and names, counts, where files are."""
+    """Description of the data set: features with their shapes and names, counts, paths of files."""
     joints = motion.joint_names.tolist()
     wrist = [f"wrist_{name}" for name in _POSE]
     names = {

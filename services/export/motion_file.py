@@ -48,7 +48,7 @@ class GraspMotion:
     object: str
     """Name of the object."""
     success: bool
-    """Whether the object was held a quarter of a second after table removal; `metrics["held"]`: to the end."""
+    """True if the object was held a quarter of a second after table removal; `metrics["held"]`: to the end."""
     control_dt: float
     """Seconds between two frames."""
     constraints: tuple[str, ...]
@@ -56,7 +56,7 @@ class GraspMotion:
     metrics: dict[str, float]
     """Errors, forces and reward of the episode, by the names in `actors.env.metric_names`."""
     about: dict[str, Any]
-    """Where it comes from: version of the policy, file of the object, command."""
+    """Origin: version of the policy, file of the object, command."""
     time: Annotated[np.ndarray, "(T,) s"]
     table: Annotated[np.ndarray, "(T,) bool, whether the table stands"]
     wrist_position: Annotated[np.ndarray, "(T, 3) m, world"]
@@ -189,7 +189,7 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
     Raises:
       CongraspError: there is no such file, it is another kind of file, larger than `MAX_BYTES`, or damaged.
     """
-    remedy = "Make it anew with 'congrasp grasp'."
+    remedy = "Run 'congrasp grasp' again."
     arrays = read_npz(pathlib.Path(path), remedy, kind="a grasp motion", largest=MAX_BYTES)
     try:
         meta = json.loads(str(arrays.pop(_META)))

@@ -112,13 +112,13 @@ def export_motions(
 
 
 def default_name(motion: GraspMotion, kind: str) -> pathlib.Path:
-    """Where a motion goes unless told otherwise: the object's name in the working directory."""
+    """Default path of a motion: the object's name in the working directory."""
     return pathlib.Path(f"{motion.object}{FORMATS[kind] or f'-{kind}'}")
 
 
 def _check(motion: GraspMotion) -> None:
     """Raises a CongraspError for numbers that are not finite, or quaternions that are not of length one."""
-    remedy = "Make it anew with 'congrasp grasp'."
+    remedy = "Run 'congrasp grasp' again."
     for name in _NUMBERS:
         values = np.asarray(getattr(motion, name))
         if not np.isfinite(values).all():

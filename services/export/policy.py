@@ -35,7 +35,7 @@ _PLATFORMS = ("cpu", "cuda", "tpu")
 
 
 def describe(bundle: PolicyBundle) -> dict[str, Any]:
-    """What a user of the exported policy must know, as JSON: every number that goes in and comes out, in order."""
+    """Description of the exported policy for its user, as JSON: every input and output number, in order."""
     hand, task = get_hand(bundle.spec.hand), bundle.task
     joints = [joint.name for joint in hand.joints]
     frame = grasp_frame(hand)

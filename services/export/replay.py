@@ -41,7 +41,7 @@ _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
 class Replayed(NamedTuple):
-    """What became of one grasp."""
+    """Result of one grasp."""
 
     name: str
     from_grasp: bool
@@ -57,7 +57,7 @@ class Replayed(NamedTuple):
 
 
 def replay(grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda done: None) -> list[Replayed]:
-    """What becomes of grasps of one hand; `progress` is told how many are done."""
+    """Replays grasps of one hand; `progress` is called with the number of finished ones."""
     hand = benchmarked(grasps[0].hand, grasps[0].match)
     found: list[Replayed] = []
     for first in range(0, len(grasps), _TOGETHER):
@@ -83,7 +83,7 @@ def save_replay(folder: pathlib.Path, found: Sequence[Replayed]) -> None:
 
 
 def _replay(hand: Hand, grasps: Sequence[Grasp]) -> list[Replayed]:
-    """What becomes of grasps side by side."""
+    """Replays grasps in parallel."""
     physics = NativePhysics(hand, _TASK, [grasp.obj for grasp in grasps], cores())
     try:
         _begin(physics, grasps, "grasp")
