@@ -22,9 +22,9 @@ def init(
 
     Args:
       folder: Folder for the authority and the certificates.
-      run: Name of the run that they are for.
+      run: Name of the run.
       host: Names and addresses of this machine, under which others will connect to its learner or policy server.
-      force: Replace an authority that is there; certificates that it issued are useless then.
+      force: Replace an existing authority; its certificates become invalid.
 
     Examples:
       congrasp certs init certs --run human --host 10.0.0.5
@@ -51,17 +51,17 @@ def issue(
 ) -> int:
     """Issue a certificate: a folder to copy to the machine where the role runs, whose commands take --certs FOLDER.
 
-    Learners need not be told of new certificates. Several actors may share one, if they trust one another.
+    Learners accept new certificates without changes. Several actors may share one, if they trust one another.
 
     Args:
       folder: Folder of the authority.
       role: Certificate role: learner, actor, server (of a policy), client (of a policy server) or observer (status,
         recorder).
-      run: Name of the run that it is for; by default the one that the authority was made for.
-      number: Tells the certificates of a role apart; the lowest that is free by default.
+      run: Name of the run; by default that of the authority.
+      number: Distinguishes the certificates of a role; by default the lowest free one.
       host: Names and addresses under which others will connect to it (learner and server).
       days: Days until it expires.
-      force: Replace the certificate of this number; the old one works until it expires, too.
+      force: Replace the certificate of this number; the old one stays valid until it expires.
 
     Examples:
       congrasp certs issue certs --role actor
@@ -71,7 +71,7 @@ def issue(
     from congrasp.services.ops.certificates import issue, read
 
     made = issue(folder, role, run=run, number=number, hosts=host, days=days, force=force)
-    print(f"{made}: good until {read(made / CERTIFICATE_FILE).expires:%Y-%m-%d}")
+    print(f"{made}: valid until {read(made / CERTIFICATE_FILE).expires:%Y-%m-%d}")
     return 0
 
 
@@ -85,7 +85,7 @@ def revoke(folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, r
       folder: Folder of the authority.
       role: The certificate's role.
       number: The certificate's number.
-      run: Name of the run that it was for; by default the one that the authority was made for.
+      run: Name of the certificate's run; by default that of the authority.
 
     Examples:
       congrasp certs revoke certs --role actor --number 1

@@ -450,7 +450,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
         (["mug.npz", "--out", "logs"], "Use --out logs/grasp.glb"),
         (["nothing.npz"], "There is no nothing.npz"),
         (["logs", "--index", "4"], "holds 1 episodes"),
-        ([], "No motion was named"),
+        ([], "No motion was given"),
     ):
         assert run(*arguments) == 2
         said = capsys.readouterr().err
