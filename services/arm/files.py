@@ -1,4 +1,4 @@
-"""The files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
+"""Files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
 
 import json
 import pathlib

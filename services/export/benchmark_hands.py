@@ -21,7 +21,7 @@ Row = tuple[float, float, float, float, float, float]
 """Anchor (m) and axis (unit) of a joint, in the palm's frame at zero."""
 PLACES_MM = 0.1
 """Tolerance of a joint's position relative to the benchmark."""
-_FACING = 1e-3  # rad, how far an axis may be turned
+_FACING = 1e-3  # tolerance of an axis's direction, rad
 
 
 class Shape(NamedTuple):
@@ -69,7 +69,7 @@ class BenchmarkHand(NamedTuple):
 
     @property
     def rows(self) -> np.ndarray:
-        """(F, 2, 3) anchors and axes."""
+        """Anchors and axes (F, 2, 3)."""
         return np.array([*itertools.chain(*self.fingers.values())]).reshape(-1, 2, 3)
 
 
@@ -189,7 +189,7 @@ BENCHMARK_HANDS = {
 
 
 class Match(NamedTuple):
-    """A hand of this project as the benchmark has it."""
+    """Assignment of a hand of this project to the benchmark's."""
 
     name: str
     """Of the benchmark's hand."""
@@ -204,7 +204,8 @@ class Match(NamedTuple):
     """From the wrist frame to the root's."""
 
     def qpos(self, position: np.ndarray, rotation: Rotation, q: np.ndarray) -> np.ndarray:
-        """(7 + F,) root's place and quaternion (w, x, y, z) in the world and the joints, as the benchmark stores them.
+        """Position and quaternion (w, x, y, z) of the root in the world and joints (7 + F,), as the benchmark stores
+        them.
 
         Args:
           position: (3,) m, of the wrist in the world.
@@ -261,9 +262,9 @@ class Match(NamedTuple):
 
 
 def match_hand(motion: GraspMotion) -> Match:
-    """The benchmark's hand that a motion's hand is, whatever its joints are called.
+    """Returns the benchmark's hand for a motion's hand, whatever the names of its joints.
 
-    Every way of pairing fingers with the benchmark's is laid over it (Kabsch); the best must fit to `PLACES_MM`.
+    Every assignment of fingers is aligned with the benchmark's (Kabsch); the best must match to `PLACES_MM`.
 
     Raises:
       CongraspError: the benchmark has no such hand.
@@ -290,7 +291,7 @@ def match_hand(motion: GraspMotion) -> Match:
 
 
 def benchmarked(hand: Hand, match: Match) -> Hand:
-    """The hand with the benchmark's motors, damping, and collision shapes where they are no meshes."""
+    """Returns the hand with the benchmark's motors, damping, and collision shapes unless those are meshes."""
     motor = match.hand
 
     def driven(joint: Joint) -> Joint:
@@ -311,7 +312,7 @@ def benchmarked(hand: Hand, match: Match) -> Hand:
 
 
 def _chains(motion: GraspMotion) -> list[np.ndarray]:
-    """Indices of the joints of each finger, from the palm on; none for a hand that is no palm with chains."""
+    """Joint indices of each finger, from the palm on; empty if the hand is not a palm with chains."""
     parents, links = motion.link_parent, motion.joint_link
     found = []
     for tip in sorted({*range(len(parents))} - {*parents.tolist()}):

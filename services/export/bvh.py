@@ -1,6 +1,6 @@
 """Biovision hierarchy: centimetres and y-up, as motion-capture programs expect; read back by bvhio.
 
-The format has no place for comments, so that what the numbers mean is written beside it, to `<name>.json`.
+The format has no comments, so the meaning of the numbers is written to `<name>.json` next to it.
 """
 
 import json
@@ -22,7 +22,7 @@ _ROOT = "world"
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
-    """Writes one motion, and what it means beside it."""
+    """Writes one motion, and the description of its numbers next to it."""
     (motion,) = motions
     found = bodies(motion)
     names = identifiers([_ROOT, *(body.name for body in found)])[1:]
