@@ -48,7 +48,7 @@ COMMANDS = {
 
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
-"""The reader of the output is gone, as with `congrasp … | head`."""
+"""Raised when the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PATH = (
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except CongraspError as error:
         code = _fail(str(error), error.exit_code, debug)
     except BrokenPipeError:
-        if _last_words(sys.stdout, "\n"):  # it is another pipe that broke
+        if _last_words(sys.stdout, "\n"):  # another pipe broke
             raise
         code = UNREAD
     except OSError as error:
@@ -87,22 +87,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
-    if code in SIGNALLED:  # no time for what an interpreter does at its end
+    if code in SIGNALLED:  # skips the interpreter's shutdown
         os._exit(code)
     sys.exit(code)
 
 
 def _said_of(error: OSError) -> str:
-    """What a full disk, or a path that cannot be used, is to a user; raises other errors, which are faults of ours."""
+    """Describes a full disk, or an unusable path, to the user; raises other errors, which are bugs."""
     if error.errno in _FULL:
         where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
         return f"{where}: {error.strerror}. Free space and start again."
     if error.errno in _PATH and error.filename:
         return str(
-            CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its rights.")
+            CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its permissions.")
         )
     if error.errno == errno.EIO:
-        return "A file could not be read or written: the disk that it is on failed. Try another path."
+        return "A file could not be read or written, because its disk failed. Try another path."
     raise error
 
 
@@ -127,12 +127,12 @@ def run(arguments: list[str]) -> int:
             result = _parsed(name, load(name), rest)()
         except KeyboardInterrupt:
             result = None
-            stop.wait(1.0)  # the thread that notes which signal it was may be a moment behind
+            stop.wait(1.0)  # the thread that records the signal may be slightly late
         return stop.exit_code or (result if isinstance(result, int) else 0)
 
 
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
-    """The command's module as a function from its arguments to the call that they ask for."""
+    """Returns the command's module as a function from its arguments to the requested call."""
     module = importlib.import_module(f"congrasp.services.cli.{name}")
     from congrasp.services.cli import parser
 
@@ -143,7 +143,7 @@ def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
 
 
 def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: list[str]) -> Callable[[], Any]:
-    """Parses a command line; what is wrong with it becomes one line instead of the parser's box."""
+    """Parses a command line; errors are one line instead of the parser's box."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -162,7 +162,7 @@ def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: li
 
 
 def usage() -> str:
-    """The text of `congrasp --help`."""
+    """Text of `congrasp --help`."""
     width = max(map(len, COMMANDS))
     rows = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
     return (
@@ -175,8 +175,10 @@ def usage() -> str:
 
 
 def _prepare_environment() -> None:
-    """Keeps compiled programs between runs, the compilers' chatter off the screen, and OpenGL, for which MuJoCo would
-    start processes, out; what the user set stays."""
+    """Configures caches of compiled programs, compiler output and OpenGL (for which MuJoCo would start processes).
+
+    Variables set by the user are kept.
+    """
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder("jax")))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("MUJOCO_GL", "disable")
@@ -193,7 +195,7 @@ def _fail(text: str, code: int, debug: bool) -> int:
 
 
 def _last_words(stream: TextIO, text: str = "") -> bool:
-    """Writes and flushes, if that is possible; a log on a full disk must not turn the exit code into another."""
+    """Writes and flushes if possible; a log on a full disk must not change the exit code."""
     try:
         stream.write(text)
         stream.flush()

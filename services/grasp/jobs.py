@@ -32,19 +32,19 @@ _COLUMNS = 6
 
 
 class Settings(NamedTuple):
-    """What the grasps of all objects share."""
+    """Settings shared by the grasps of all objects."""
 
     out: pathlib.Path
     options: ImportOptions
     constraints: dict[str, Any]
     """See `services.grasp.parse.read_request`."""
     identity: tuple[Any, ...]
-    """What else makes a grasp: policy, seed, attempts."""
+    """Further identity of a grasp: policy, seed, attempts."""
     film: Film | None
-    """How a video is drawn; None for no video."""
+    """Style of a video; None for no video."""
     pictures: bool
     again: bool
-    """Whether to redo finished objects."""
+    """Repeats finished objects."""
     rest: str = ""
     """Resting pose: `upright` or a number from 1 on; any where empty."""
 
@@ -107,7 +107,7 @@ def find_objects(paths: Sequence[pathlib.Path], folder: str = "objects") -> tupl
 
 
 def _is_name(path: pathlib.Path) -> bool:
-    """Whether a path may be an object's name: there is no such file, and it has neither a folder nor a suffix."""
+    """True if a path can be an object's name: there is no such file, and it has neither a folder nor a suffix."""
     return not path.exists() and path.name == str(path) and not path.suffix and ":" not in path.name
 
 
@@ -177,7 +177,7 @@ def rest_pose(obj: GraspObject, text: str) -> int:
 
 
 def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
-    """Where a mesh's mass comes from, where the user has not set it."""
+    """Notes on the source of a mesh's mass, if the user has not set it."""
     if not at.source or options.mass is not None:
         return []
     basis = f"of {options.material}" if options.material else "by its surface and volume"
@@ -195,7 +195,7 @@ def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
 
 
 def _identity(text: str) -> str:
-    """What a constraint asks for: its file's content, where it names one."""
+    """Identity of a constraint: the content of its file, if it names one."""
     path, number = numbered(text)
     return f"{hashlib.sha256(path.read_bytes()).hexdigest()}:{number}" if path.is_file() else text
 

@@ -1,4 +1,4 @@
-"""How each constraint was met, step by step: a lane is green where the hand keeps to it."""
+"""Lanes: fulfilment of each constraint step by step, green where the hand satisfies it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ _UNITS = {"rad": (180 / np.pi, "°"), "m": (100.0, " cm"), "": (100.0, " %")}
 MEANINGS = {term.name: term.meaning for term in GRASP} | {
     weight.name: weight.meaning for constraint in CONSTRAINTS for weight in constraint.weights
 }
-"""What each term of the reward is, by its name."""
+"""Descriptions of the reward terms by name."""
 
 
 class Lane(NamedTuple):
@@ -34,7 +34,7 @@ class Lane(NamedTuple):
     counts: np.ndarray
     """(T,) bool: the constraint is meant for this step (a heading for the grasp, a path for the approach)."""
     legend: str
-    """What is measured, and up to where it is met."""
+    """Measured quantity, and its tolerance."""
     errors: Mapping[str, np.ndarray]
     """(T,) by name with its unit."""
 

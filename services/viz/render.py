@@ -42,7 +42,7 @@ _FALL = 0.1  # how far the camera follows a falling object, m
 
 
 class Film(NamedTuple):
-    """How a video is drawn."""
+    """Style of a video."""
 
     size: tuple[int, int] = (1280, 720)
     """Width and height in pixels, both even."""
@@ -125,7 +125,7 @@ def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -
     pictured = [_worths(episode, steps[i]) for i in sorted({len(steps) // 2, len(steps) - 1})]
 
     def score(camera: Camera) -> float:
-        """How much of object, touching links and constraints a camera shows."""
+        """Score of a camera: visible share of object, touching links and constraints."""
         total = 0.0
         for shapes, worth in pictured:
             seen = visible(shapes, camera, (round(72 * aspect), 72))
@@ -138,7 +138,7 @@ def best_camera(episode: Message, steps: Sequence[int], aspect: float = 4 / 3) -
 
 
 def _worths(episode: Message, step: int) -> tuple[list[Shape], list[float]]:
-    """What there is at a step, the hand as capsules, and what a sample of each is worth to a picture."""
+    """Shapes at a step, with the hand as capsules, and the weight of a sample of each in a picture."""
     arrays = episode.arrays
     hand = known_hand(episode.meta["hand"])
     capsules = capsule_shapes(hand, arrays["link_position"][step], arrays["link_quaternion"][step])
@@ -276,7 +276,7 @@ def grasp_steps(episode: Message) -> tuple[int, int]:
 
 
 def _phase(episode: Message, step: int) -> str:
-    """What a step is part of, as far as it is worth saying: approach, lift, hold, or that the table was removed."""
+    """Phase of a step, if worth showing: approach, lift, hold, or table removed."""
     if not episode.arrays["table"][step]:
         return "table removed"
     phases = phases_of(episode.meta)

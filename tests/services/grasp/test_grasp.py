@@ -252,7 +252,7 @@ def test_nothing_to_grasp(tmp_path):
     with pytest.raises(CongraspError, match="nothing to grasp"):
         command()
     for option, value in (("--approach", "-1"), ("--approach", "11"), ("--lift", "0.6"), ("--lift", "nan")):
-        with pytest.raises(CongraspError, match=f"{option} is .* It is from 0 to"):
+        with pytest.raises(CongraspError, match=f"{option} is .* It must be from 0 to"):
             command(tmp_path, option, value)
     with pytest.raises(CongraspError, match="--attempts is 0"):
         command(tmp_path, "--attempts", "0")

@@ -142,7 +142,7 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
     ("change", "why"),
     [
         ({"object_position": np.zeros((2001, 3))}, "shape"),
-        ({"visual_faces": np.array([[0, 1, 10**6]])}, "vertices that are not there"),
+        ({"visual_faces": np.array([[0, 1, 10**6]])}, "vertices that do not exist"),
         ({"goal/heading_direction": np.zeros(20_000)}, "more than 10000 values"),
         ({f"reward/{i}": np.zeros(12) for i in range(200)}, "more than 128 rewards"),
         ({"link_position": np.zeros((12, 3, 3), np.float32)}, "has shape"),
