@@ -1,4 +1,4 @@
-"""The files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
+"""Files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
 
 import json
 import pathlib
@@ -68,7 +68,7 @@ def save_picture(path: pathlib.Path, motion: "ArmMotion", episode: Message, step
 
 
 def _arm_shapes(motion: "ArmMotion", step: int) -> list[Shape]:
-    """What the arm's file draws of it at a control step, in the world."""
+    """Visual shapes of the arm's file at a control step, in the world frame."""
     robot, scene, base = motion.robot, motion.scene, motion.world_base
     data = mujoco.MjData(robot.model)
     q = robot.model.qpos0.copy()

@@ -27,6 +27,7 @@ COMMANDS = {
     "actor": "one actor that works for a learner elsewhere",
     "serve": "answer live queries with a run's newest policy or a policy file",
     "grasp": "a grasp motion for an object of your own, under constraints",
+    "dataset": "verified grasps of many objects, in shards, with a card",
     "evaluate": "measure a policy by the paper's protocol",
     "reproduce": "the paper's tables: train what is missing, evaluate, compare",
     "query": "ask a policy server for one action, or measure its latency",
@@ -53,7 +54,7 @@ _WRITTEN = ("--out", "--json", "--png", "--video", "--pictures")
 """Options that name what a command writes."""
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
-"""The reader of the output is gone, as with `congrasp … | head`."""
+"""Raised when the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PATH = (
@@ -81,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except CongraspError as error:
         code = _fail(str(error), error.exit_code, debug)
     except BrokenPipeError:
-        if _last_words(sys.stdout, "\n"):  # it is another pipe that broke
+        if _last_words(sys.stdout, "\n"):  # another pipe broke
             raise
         code = UNREAD
     except OSError as error:
@@ -92,22 +93,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
-    if code in SIGNALLED:  # no time for what an interpreter does at its end
+    if code in SIGNALLED:  # skips the interpreter's shutdown
         os._exit(code)
     sys.exit(code)
 
 
 def _said_of(error: OSError) -> str:
-    """What a full disk, or a path that cannot be used, is to a user; raises other errors, which are faults of ours."""
+    """Describes a full disk, or an unusable path, to the user; raises other errors, which are bugs."""
     if error.errno in _FULL:
         where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
         return f"{where}: {error.strerror}. Free space and start again."
     if error.errno in _PATH and error.filename:
         return str(
-            CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its rights.")
+            CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its permissions.")
         )
     if error.errno == errno.EIO:
-        return "A file could not be read or written: the disk that it is on failed. Try another path."
+        return "A file could not be read or written, because its disk failed. Try another path."
     raise error
 
 
@@ -135,7 +136,7 @@ def run(arguments: list[str]) -> int:
             result = call()
         except KeyboardInterrupt:
             result = None
-            stop.wait(1.0)  # the thread that notes which signal it was may be a moment behind
+            stop.wait(1.0)  # the thread that records the signal may be slightly late
         return stop.exit_code or (result if isinstance(result, int) else 0)
 
 
@@ -166,7 +167,7 @@ def _is_there(path: pathlib.Path) -> bool:
 
 
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
-    """The command's module as a function from its arguments to the call that they ask for."""
+    """Returns the command's module as a function from its arguments to the requested call."""
     module = importlib.import_module(f"congrasp.services.cli.{name}")
     from congrasp.services.cli import parser
 
@@ -177,7 +178,7 @@ def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
 
 
 def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: list[str]) -> Callable[[], Any]:
-    """Parses a command line; what is wrong with it becomes one line instead of the parser's box."""
+    """Parses a command line; errors are one line instead of the parser's box."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -196,7 +197,7 @@ def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: li
 
 
 def usage() -> str:
-    """The text of `congrasp --help`."""
+    """Text of `congrasp --help`."""
     width = max(map(len, COMMANDS))
     rows = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
     return (
@@ -209,8 +210,10 @@ def usage() -> str:
 
 
 def _prepare_environment() -> None:
-    """Keeps compiled programs between runs, the compilers' chatter off the screen, and OpenGL, for which MuJoCo would
-    start processes, out; what the user set stays."""
+    """Configures caches of compiled programs, compiler output and OpenGL (for which MuJoCo would start processes).
+
+    Variables set by the user are kept.
+    """
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder("jax")))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("MUJOCO_GL", "disable")
@@ -227,7 +230,7 @@ def _fail(text: str, code: int, debug: bool) -> int:
 
 
 def _last_words(stream: TextIO, text: str = "") -> bool:
-    """Writes and flushes, if that is possible; a log on a full disk must not turn the exit code into another."""
+    """Writes and flushes if possible; a log on a full disk must not change the exit code."""
     try:
         stream.write(text)
         stream.flush()

@@ -20,7 +20,7 @@ def view(
     insecure: bool = False,
     certs: pathlib.Path | None = None,
 ) -> int:
-    """Ask for a grasp in the browser and see it: set the heading, paint the avoid region, draw the wrist's path.
+    """Request a grasp in the browser and watch it: set the heading, paint the avoid region, draw the wrist's path.
 
     With a run's folder, or with --connect, it takes the newest weights of a run that is being trained and shows the
     run: its curves, its actors and their episodes. With --recordings a click on a curve finds the episodes of that
@@ -33,7 +33,7 @@ def view(
       connect: A learner's endpoint, such as tcp/10.0.0.5:7447, to attach to.
       run: Name of the run that is attached to.
       recordings: Folder of a run's recordings (*.mcap), of a live run or of one that is over.
-      host: Interface of the page. There is no password: whoever reaches it can use it.
+      host: Interface of the page. There is no password: every client that reaches it can use it.
       port: Port of the page; 0 takes a free one.
       insecure: Offer the page beyond loopback.
       certs: Folder of an observer's certificate (congrasp certs), for --connect.

@@ -150,7 +150,7 @@ def _new_mesh(stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """What the text says, put together from the root to the tips."""
+    """Reads a file's text, composed from the root to the tips."""
     layer = _parse(path.read_text(encoding="utf-8"))
     assert layer["upAxis"] == "Z" and layer["metersPerUnit"] == 1
     codes = np.arange(layer["startTimeCode"], layer["endTimeCode"] + 1)

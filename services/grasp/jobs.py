@@ -33,21 +33,21 @@ _COLUMNS = 6
 
 
 class Settings(NamedTuple):
-    """What the grasps of all objects share."""
+    """Settings shared by the grasps of all objects."""
 
     out: pathlib.Path
     options: ImportOptions
     constraints: dict[str, Any]
     """See `services.grasp.parse.read_request`."""
     identity: tuple[Any, ...]
-    """What else makes a grasp: policy, seed, attempts."""
+    """Further identity of a grasp: policy, seed, attempts."""
     film: Film | None
-    """How a video is drawn; None for no video."""
+    """Style of a video; None for no video."""
     view: View | None
     """Where pictures and video are seen from; what shows most of the grasp if None."""
     pictures: bool
     again: bool
-    """Whether to redo finished objects."""
+    """Repeats finished objects."""
     rest: str = ""
     """Resting pose: `upright` or a number from 1 on; any where empty."""
 
@@ -113,7 +113,7 @@ def find_objects(paths: Sequence[pathlib.Path], folder: str = "objects") -> tupl
 
 
 def _is_name(path: pathlib.Path) -> bool:
-    """Whether a path may be an object's name: there is no such file, and it has neither a folder nor a suffix."""
+    """True if a path can be an object's name: there is no such file, and it has neither a folder nor a suffix."""
     return not path.exists() and path.name == str(path) and not path.suffix and ":" not in path.name
 
 
@@ -135,7 +135,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             if text
         }
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
-        key = key_of(_content(at), options, given, settings.identity, settings.rest)
+        key = key_of(at.digest(), options, given, settings.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
         drawn = [settings.film and [*settings.film], settings.view and [*settings.view]]
         if before is not None and (settings.film is None or json.loads(json.dumps(drawn)) == before.get("drawn")):
@@ -186,21 +186,13 @@ def rest_pose(obj: GraspObject, text: str) -> int:
 
 
 def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
-    """Where a mesh's mass comes from, where the user has not set it."""
+    """Notes on the source of a mesh's mass, if the user has not set it."""
     if not at.source or options.mass is not None:
         return []
     basis = f"of {options.material}" if options.material else "by its surface and volume"
     if options.density is not None:
         basis = f"by {options.density:g} kg/m³"
     return [f"its mass is {1000 * obj.mass:.0f} g, {basis} (--material or --mass sets another)"]
-
-
-def _content(at: ObjectAt) -> str:
-    """A hash of an object's files, or what the generator makes it of."""
-    if not at.source and not at.path.exists():
-        return str(at.path)
-    files = [file.path for file in at.source.files()] if at.source else [at.path]
-    return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
 
 
 def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
@@ -212,7 +204,7 @@ def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
 
 
 def _identity(text: str) -> str:
-    """What a constraint asks for: its file's content, where it names one."""
+    """Identity of a constraint: the content of its file, if it names one."""
     path, number = numbered(text)
     return f"{hashlib.sha256(path.read_bytes()).hexdigest()}:{number}" if path.is_file() else text
 

@@ -40,7 +40,7 @@ _FAR = 1.0  # m from an object beyond which nobody grasps it
 
 
 class Target(NamedTuple):
-    """What constraints are written for."""
+    """Context of constraints: the hand and the object they apply to."""
 
     obj: GraspObject
     hand: Hand
@@ -79,7 +79,7 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
 
 
 def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
-    """What an option says, by its kind; None if it is not given."""
+    """Returns the value of an option, by its kind; None if it is not given."""
     if not text:
         return None
     if isinstance(text, tuple) or option.kind == "text" or text in option.words:
@@ -88,7 +88,7 @@ def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
 
 
 def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]) -> str | tuple[str, ...]:
-    """What was written for an option: its words where it takes several, else one text, empty for a switch that is off.
+    """Returns the text of an option: its words if it takes several, else one text, empty for a flag that is off.
 
     A number stands for its text.
     """

@@ -42,7 +42,7 @@ class Motions:
         self._kept.pop(key, None)
 
     def view(self) -> list[dict[str, Any]]:
-        """What a list shows of each, the newest first."""
+        """List entries of the motions, the newest first."""
         return [_described(key, episode) for key, episode in self._kept.items()][::-1]
 
 
@@ -56,7 +56,7 @@ def _asked(episode: Message) -> str:
 
 
 def _described(key: str, episode: Message) -> dict[str, Any]:
-    """What a list shows of a motion."""
+    """List entry of a motion."""
     meta, metrics = episode.meta, episode.meta.get("metrics", {})
     return {
         "id": key,

@@ -38,7 +38,7 @@ LIGHTEST_G, HEAVIEST_G = 1, 5000
 _OWN_WEIGHT = {"mass_g": 0.0, "material": ""}
 """The object weighs what it came with."""
 _DRAWING = "drawing"
-"""What a job says it made when that is a picture or a video, and no motion."""
+"""Kinds of results of a job that are a picture or a video instead of a motion."""
 
 
 class Grasping(Protocol):
@@ -48,7 +48,7 @@ class Grasping(Protocol):
     task: TaskConfig
 
     def newest(self) -> dict[str, Any]:
-        """Where the policy comes from and its version, after a look for newer weights."""
+        """Source of the policy and its version, after a check for newer weights."""
 
     def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
         """The episode of a grasp."""
@@ -107,7 +107,7 @@ class Session:
         self._folder.cleanup()
 
     def state(self) -> dict[str, Any]:
-        """What the page shows of studio, policy, objects, motions and job."""
+        """State of studio, policy, objects, motions and job for the page."""
         with self._lock:
             upload = self._uploads.of(self._object)
             return {
@@ -164,7 +164,7 @@ class Session:
         return self._drawn
 
     def training(self, names: str) -> dict[str, Any]:
-        """What the window shows; `names`: curves, separated by commas."""
+        """Content of the window; `names`: curves, separated by commas."""
         if self._window is None:
             raise CongraspError("The studio follows no run.", "Start it with --connect, or with --recordings.")
         return self._window.view([name for name in names.split(",") if name])
@@ -219,7 +219,7 @@ class Session:
             return self._jobs.state()
 
     def _choose_unit(self, unit: str) -> None:
-        """Imports the uploaded mesh anew in another unit."""
+        """Imports the uploaded mesh again in another unit."""
         upload, replaces = self._uploads.of(self._object), "" if self._uploads.pending else self._object
         if upload is None or unit not in METRES:
             raise CongraspError(f"The unit cannot be '{str(unit)[:20]}'.", "Open a mesh, then choose m, cm, mm or in.")

@@ -42,7 +42,7 @@ def _bodies(episode: Message, step: int, *, overlays: bool) -> list[Shape]:
 def _object(episode: Message, step: int, *, painted: bool = True) -> Shape:
     """The object at a step in its own colours, or painted with its two regions where these are a constraint."""
     arrays = episode.arrays
-    avoid = np.asarray(arrays["surface_minus"], bool)
+    avoid = np.asarray(arrays["surface_avoid"], bool)
     paint = None
     if painted and avoid.any() and any(isinstance(marker, Paint) for _, marker in markers(arrays)):
         paint = arrays["surface_points"], np.where(avoid[:, None], AVOID, GRASPABLE)

@@ -1,4 +1,4 @@
-"""What an import made of a mesh, as a picture: before and after, beside a hand at true scale."""
+"""Picture of a mesh's import: before and after, with a hand at true scale."""
 
 from typing import Any, NamedTuple
 

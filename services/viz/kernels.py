@@ -19,7 +19,7 @@ _SMALL = 1e-6  # samples: a triangle of a smaller area covers nothing
 
 
 def _kept() -> bool:
-    """Whether machine code can be kept in the user's cache; a process that may write nowhere compiles for itself."""
+    """True if machine code can be cached in the user's cache; otherwise each process compiles it."""
     folder = cache_folder("kernels")
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""How much of a soft lamp and of the sky reaches a surface: both are many lamps, from each of which bodies are seen."""
+"""Visibility of a soft lamp and of the sky from a surface: both are sets of lamps, each with visible bodies."""
 
 from typing import NamedTuple
 

@@ -21,7 +21,7 @@ _GAP = 3  # between two views of a picture, pixels
 
 
 class Film(NamedTuple):
-    """How a video is drawn."""
+    """Style of a video."""
 
     size: tuple[int, int] = (1280, 720)
     """Width and height in pixels, both even."""
@@ -132,7 +132,7 @@ def grasp_steps(episode: Message) -> tuple[int, int]:
 
 
 def _phase(episode: Message, step: int) -> str:
-    """What a step is part of, as far as it is worth saying: approach, lift, hold, or that the table was removed."""
+    """Phase of a step, if worth showing: approach, lift, hold, or table removed."""
     if not episode.arrays["table"][step]:
         return "table removed"
     phases = phases_of(episode.meta)

@@ -1,4 +1,4 @@
-"""What a picture is made of: shapes in the world, and a camera that sees them."""
+"""Scene of a picture: shapes in the world frame, and a camera."""
 
 import dataclasses
 from typing import Literal

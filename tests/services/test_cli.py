@@ -70,7 +70,7 @@ def test_help_names_every_command_and_every_command_exists():
         (["grasp", "mug:7", "--seed", "-1"], "--seed: a seed is a whole number from 0 to 1e[+]15"),
         (["evaluate", "--seed", "9" * 23], "--seed: a seed is a whole number"),
         (["train", "--objects.seed", "9" * 23], "--objects.seed: a seed is a whole number"),
-        (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It is from 0 to 1024"),
+        (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It must be from 0 to 1024"),
         (["serve", "--metrics-port", "99999999"], "metrics cannot be served at .*:99999999.*--metrics-port"),
         (["view", "--recordings", "/dev/null", "--port", "0"], "/dev/null is no recording"),
         (["learner", "--run-dir", "/nonexistent-run", "--listen", "tcp/0.0.0.0:7447"], "other machines.*--certs"),
@@ -111,7 +111,7 @@ def test_libraries_add_nothing_to_the_line(arguments, words):
         ),
         (
             OSError(errno.EIO, os.strerror(errno.EIO)),
-            "A file could not be read or written: the disk that it is on failed. Try another path.",
+            "A file could not be read or written, because its disk failed. Try another path.",
         ),
     ],
 )

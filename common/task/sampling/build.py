@@ -75,6 +75,11 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
         itertools.repeat(scale, count),
         itertools.repeat(outline(hand), count),
     )
+    if not any(row["weight"] for row in rows):
+        raise CongraspError(
+            f"None of {count} objects can be grasped: in every resting pose they lie too flat on the table.",
+            "Add other objects.",
+        )
     rests = max(len(row["rest"]) for row in rows)
     for row in rows:
         fill = np.resize(np.arange(len(row["rest"])), rests)
@@ -229,57 +234,72 @@ def headings_of(
     )
     assert whole is not None, "only the graspable region may be unreachable"
     sets = [whole, graspable or whole]
-    own = CENTER if task.headings == "center" else hand
     # Captured headings may be off by a centimetre, but a hand did hold their objects.
-    regions = [None, obj.non_graspable_points if graspable is not None and given is None else None]
-    found = [
-        within_reach(headings, obj, obj.rest_poses, own, avoid, opposed=opposed)
-        for headings, avoid in zip(sets, regions, strict=True)
-    ]
-    reachable = np.stack([fine for _, fine in found])
-    if too_flat := not reachable[0].any():
-        found[0] = within_reach(whole, obj, obj.rest_poses, own, opposed=False)
-        reachable[0] = found[0][1]
-    if task.headings == "above" and reachable[0].any():
-        steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
-        reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
+    avoid = obj.non_graspable_points if graspable is not None and given is None else None
+    cleared, reachable, too_flat = _reachable(task, obj, sets, hand, avoid, opposed=opposed)
     usable = np.flatnonzero(reachable[0].any(-1))
     if len(usable) == 0:
         raise CongraspError(
             f"The object '{obj.name}' cannot be approached in any of its resting poses.",
             "Scale it or remove it.",
         )
-    reachable, rest = reachable[:, usable], obj.rest_poses[usable]
+    reachable = reachable[:, usable]
+    # (V, R, H, 3), the positions that the table leaves.
+    positions = np.array([[region[rest].position for rest in usable] for region in cleared])
     index = np.array([[_repeated(row) for row in region] for region in reachable])
-    back = np.array(
-        [
-            [np.linalg.norm(cleared[rest].position - headings.position, axis=-1) for rest in usable]
-            for headings, (cleared, _) in zip(sets, found, strict=True)
-        ]
-    )
+    back = np.linalg.norm(positions - np.array([headings.position for headings in sets])[:, None], axis=-1)
     chosen = [_spread(rng, region) for region in reachable]
-    at = [
-        np.stack([cleared[usable[r]].position[h] for r, h in zip(*some, strict=True)])
-        for some, (cleared, _) in zip(chosen, found, strict=True)
-    ]
     keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
-    avoid = obj.non_graspable_points[keep]
+    avoided = obj.non_graspable_points[keep]
     floats = {
         "points": obj.points[keep],
-        "rest": rest,
+        "rest": obj.rest_poses[usable],
         **{f"heading_{name}": np.stack([getattr(s, name) for s in sets]) for name in Headings._fields},
         "heading_back": np.take_along_axis(back, index, -1),
-        "chosen_position": np.stack(at),
+        "chosen_position": np.stack([p[r, h] for p, (r, h) in zip(positions, chosen, strict=True)]),
         "chosen_direction": np.stack([s.direction[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
         "chosen_cross": np.stack([s.cross[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
     }
     return {
         **{name: value.astype(np.float32) for name, value in floats.items()},
-        "avoid": avoid,
+        "avoid": avoided,
         "heading_index": index.astype(np.int32),
         "weight": np.float32(not too_flat),
-        "has_affordance": (graspable is not None) & avoid.any() & reachable[1].any(-1),
+        "has_affordance": (graspable is not None) & avoided.any() & reachable[1].any(-1),
     }
+
+
+def _reachable(
+    task: TaskConfig,
+    obj: GraspObject,
+    sets: Sequence[Headings],
+    hand: Outline,
+    avoid: np.ndarray | None,
+    *,
+    opposed: bool,
+) -> tuple[list[list[Headings]], np.ndarray, bool]:
+    """Headings of V = 2 regions moved clear of the table, (V, R, H) bool where they are feasible, and "too flat".
+
+    Args:
+      task: kind of headings.
+      obj: the object.
+      sets: headings for the whole surface, and for the graspable region.
+      hand: outline that must clear the table.
+      avoid: (P,) bool, avoid region of sampled headings; None for captured ones, or without a graspable region.
+      opposed: see `within_reach`.
+    """
+    own = CENTER if task.headings == "center" else hand
+    found = [
+        within_reach(headings, obj, obj.rest_poses, own, region, opposed=opposed)
+        for headings, region in zip(sets, (None, avoid), strict=True)
+    ]
+    if too_flat := not found[0][1].any():
+        found[0] = within_reach(sets[0], obj, obj.rest_poses, own, opposed=False)
+    reachable = np.stack([fine for _, fine in found])
+    if task.headings == "above" and reachable[0].any():
+        steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
+        reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
+    return [cleared for cleared, _ in found], reachable, too_flat
 
 
 def _repeated(which: np.ndarray) -> np.ndarray:

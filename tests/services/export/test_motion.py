@@ -451,7 +451,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     changed = tmp_path / "cylinder-0.glb"
     changed.write_bytes(b"mine")
     assert run("mug.npz") == 2
-    assert changed.read_bytes() == b"mine" and "cylinder-0.glb is there already" in capsys.readouterr().err
+    assert changed.read_bytes() == b"mine" and "cylinder-0.glb exists already" in capsys.readouterr().err
     assert run("mug.npz", "--force") == 0 and changed.read_bytes().startswith(b"glTF")
     (tmp_path / "cylinder-0.bvh").rename(tmp_path / "taken.bvh")
     assert run("mug.npz", "--to", "bvh") == 2  # what goes beside the file is there already, too
@@ -463,12 +463,12 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     capsys.readouterr()
     for arguments, words in (
         (["mug.npz", "logs", "--to", "glb"], "one motion, and 2 were named"),
-        (["mug.npz", "--to", "lerobot"], "is there already"),
+        (["mug.npz", "--to", "lerobot"], "exists already"),
         (["mug.npz", "--to", "usd", "--out", "x.glb"], "ends in .usda, and x.glb does not"),
         (["mug.npz", "--out", "logs"], "Use --out logs/grasp.glb"),
         (["nothing.npz"], "There is no nothing.npz"),
         (["logs", "--index", "4"], "holds 1 episodes"),
-        ([], "No motion was named"),
+        ([], "No motion was given"),
     ):
         assert run(*arguments) == 2
         said = capsys.readouterr().err

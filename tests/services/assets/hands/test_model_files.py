@@ -64,7 +64,7 @@ def test_thumb_tips_poses_and_frame_are_proposed(claw):
     np.testing.assert_allclose(frame.cross, (1.0, 0.0, 0.0), atol=0.1)
     words = "\n".join(describe(claw))
     assert "opposing_lower - opposing_upper" in words and "no torque limit" not in words
-    assert "'opposing_upper' is taken for the thumb" in words and "(--thumb)" in words
+    assert "'opposing_upper' is assumed to be the thumb" in words and "(--thumb)" in words
 
 
 def test_the_same_hand_as_mjcf_on_an_arm_is_the_same(claw):
