@@ -1,9 +1,13 @@
 """A picture of a constraint set: headings, affordance, trajectories and reference poses on the table."""
 
+import dataclasses
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
 from congrasp.common.task.sampling.headings import INWARD
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, WAYPOINT
@@ -18,6 +22,66 @@ _VIEW = (0.8, 0.6, 0.45)
 _SIZE = (460, 360)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Placed:
+    """Constraints of an object in one of its resting poses, as shapes in the world frame."""
+
+    arrays: Mapping[str, np.ndarray]
+    """Of the constraint set."""
+    rest: int
+    """Index of the resting pose."""
+    hand: Hand
+
+    @property
+    def position(self) -> np.ndarray:
+        """Position (3,) of the object, m."""
+        return np.asarray(self.arrays["rest"][self.rest][:3], float)
+
+    @property
+    def rotation(self) -> Rotation:
+        """Rotation of the object."""
+        return Rotation.from_quat(self.arrays["rest"][self.rest][3:], scalar_first=True)
+
+    def headings(self, region: int, chosen: np.ndarray) -> list[Shape]:
+        """Arrows of headings, which end two centimetres before the heading positions."""
+        shapes = []
+        for h in chosen:
+            direction = self.rotation.apply(self.arrays["heading/direction"][region, h])
+            target = self.rotation.apply(self.arrays["heading/position"][region, h]) + self.position
+            tip = target - (INWARD + _GAP) * direction
+            shapes += arrow(tip - _ARROW_LENGTH * direction, tip, 0.0016, HEADING)
+        return shapes
+
+    def paths(self, region: int, chosen: np.ndarray) -> list[Shape]:
+        """Strings of beads along trajectories."""
+        points = self.arrays["trajectory/position"][region]
+        return [beads(self.rotation.apply(points[m]) + self.position, 0.003, WAYPOINT) for m in chosen]
+
+    def grasps(self, region: int, chosen: np.ndarray) -> list[Shape]:
+        """Hands in reference poses."""
+        q, position, quaternion = (self.arrays[f"pose/{name}"][region] for name in ("q", "position", "quaternion"))
+        shapes: list[Shape] = []
+        for m in chosen:
+            wrist = self.rotation * Rotation.from_quat(quaternion[m], scalar_first=True)
+            shapes.append(posed_hand(self.hand, q[m], self.rotation.apply(position[m]) + self.position, wrist))
+        return shapes
+
+    @property
+    def body(self) -> Shape:
+        """The object with its painted regions."""
+        return Shape(
+            "mesh",
+            (0, 0),
+            OBJECT,
+            self.position,
+            np.asarray(self.arrays["rest"][self.rest][3:], float),
+            vertices=self.arrays["visual/vertices"],
+            faces=self.arrays["visual/faces"],
+            paint_points=self.arrays["surface/points"],
+            paint_colours=np.where(self.arrays["surface/avoid"][:, None], AVOID, GRASPABLE),
+        )
+
+
 def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.ndarray:
     """Six pictures of the object in one of its resting poses, with some of its constraints drawn by the seed.
 
@@ -29,63 +93,29 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
     """
     arrays, meta = constraints.arrays, constraints.meta
     rng = np.random.default_rng(seed)
-    place = arrays["rest"][rest]
-    turn = Rotation.from_quat(place[3:], scalar_first=True)
-    hand = get_hand(meta.get("hand_reference", meta["hand"]))
+    placed = _Placed(arrays, rest, get_hand(meta.get("hand_reference", meta["hand"])))
 
     def some(which: np.ndarray, count: int) -> np.ndarray:
-        """At most `count` of those that are true, drawn."""
-        found = np.flatnonzero(which)
-        return rng.permutation(found)[:count]
+        """Draws at most `count` indices of true entries."""
+        return rng.permutation(np.flatnonzero(which))[:count]
 
-    def headings(v: int) -> list[Shape]:
-        """Arrows of a region's headings."""
-        shapes = []
-        for h in some(arrays["heading/allowed"][v, rest], _ARROWS):
-            direction = turn.apply(arrays["heading/direction"][v, h])
-            tip = turn.apply(arrays["heading/position"][v, h]) + place[:3] - (INWARD + _GAP) * direction
-            shapes += arrow(tip - _ARROW_LENGTH * direction, tip, 0.0016, HEADING)
-        return shapes
-
-    def paths(v: int, chosen: np.ndarray) -> list[Shape]:
-        """Strings of a region's trajectories."""
-        return [beads(turn.apply(arrays["trajectory/position"][v, m]) + place[:3], 0.003, WAYPOINT) for m in chosen]
-
-    def grasp(v: int, chosen: np.ndarray) -> list[Shape]:
-        """Hands of a region's reference poses."""
-        shapes: list[Shape] = []
-        for m in chosen:
-            wrist = turn * Rotation.from_quat(arrays["pose/quaternion"][v, m], scalar_first=True)
-            position = turn.apply(arrays["pose/position"][v, m]) + place[:3]
-            shapes.append(posed_hand(hand, arrays["pose/q"][v, m], position, wrist))
-        return shapes
-
-    avoid = arrays["surface/avoid"]
-    body = Shape(
-        "mesh",
-        (0, 0),
-        OBJECT,
-        np.asarray(place[:3], float),
-        np.asarray(place[3:], float),
-        vertices=arrays["visual/vertices"],
-        faces=arrays["visual/faces"],
-        paint_points=arrays["surface/points"],
-        paint_colours=np.where(avoid[:, None], AVOID, GRASPABLE),
-    )
-    clear = arrays["pose/allowed"][:, rest]
+    allowed, clear = arrays["heading/allowed"][:, rest], arrays["pose/allowed"][:, rest]
     whole, region = some(clear[0], _PATHS), some(clear[1], _PATHS)
+    reference = placed.grasps(1, region[:1]) + placed.paths(1, region[:1])
     panels = {
-        f"headings, {int(arrays['heading/allowed'][0, rest].sum())} allowed": headings(0),
-        f"headings on the graspable region, {int(arrays['heading/allowed'][1, rest].sum())} allowed": headings(1),
-        f"wrist trajectories, {int(clear[0].sum())} allowed": paths(0, whole),
-        "reference pose and its trajectory": grasp(0, whole[:1]) + paths(0, whole[:1]),
-        "another reference pose": grasp(0, whole[1:2]),
-        "reference pose on the graspable region and its trajectory": grasp(1, region[:1]) + paths(1, region[:1]),
+        f"headings, {int(allowed[0].sum())} allowed": placed.headings(0, some(allowed[0], _ARROWS)),
+        f"headings on the graspable region, {int(allowed[1].sum())} allowed": placed.headings(
+            1, some(allowed[1], _ARROWS)
+        ),
+        f"wrist trajectories, {int(clear[0].sum())} allowed": placed.paths(0, whole),
+        "reference pose and its trajectory": placed.grasps(0, whole[:1]) + placed.paths(0, whole[:1]),
+        "another reference pose": placed.grasps(0, whole[1:2]),
+        "reference pose on the graspable region and its trajectory": reference,
     }
-    images = []
+    body, images = placed.body, []
     for shapes in panels.values():
         extent = np.concatenate([shape_points(shape) for shape in [*shapes, body]])
         camera = fit(extent, np.array(_VIEW), _SIZE[0] / _SIZE[1])
-        images.append(render_scene([*shapes, body, table_shape(place[:3])], camera, _SIZE))
+        images.append(render_scene([*shapes, body, table_shape(placed.position)], camera, _SIZE))
     title = f"{meta['object']}, {meta['hand']} hand, resting pose {rest + 1} of {len(arrays['rest'])}"
     return contact_sheet(images, list(panels), columns=3, title=f"{title}; avoid region in dark red")
