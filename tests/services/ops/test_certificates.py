@@ -91,7 +91,7 @@ def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
     other = issue(folder, "actor")
     assert find(folder, "actor") == Credentials(folder / "actor.0", "actor")
     assert find(other, "actor").identity.number == 1
-    with pytest.raises(CongraspError, match=r"for the role actor, not learner.*--role learner"):
+    with pytest.raises(CongraspError, match=r"has the role actor, not learner.*--role learner"):
         find(other, "learner")
     with pytest.raises(CongraspError, match="missing"):
         find(folder, "client")
