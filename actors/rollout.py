@@ -28,7 +28,7 @@ from congrasp.common.task.observation import observe
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.types import Action, Array
 
-Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
+ActFunction = Callable[[Any, Array, Array], tuple[Array, Array]]
 """(parameters, observation (B, D) float32, random key) -> action (B, A), log-probability (B,)."""
 Probe = Callable[[Scene, Array, Any], Any]
 """(scene after a control step, indices of the objects (B,), `Settings.probe_data`) -> a pytree of arrays to record for
@@ -125,7 +125,7 @@ class RolloutWorker:
         task: TaskConfig,
         physics: Physics,
         bank: ConstraintBank | None,
-        policy: Policy,
+        policy: ActFunction,
         *,
         batch: int,
         seed: int,

@@ -28,7 +28,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, encode, finite
 from congrasp.learner.algorithms import make_algorithm
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
+from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
 from congrasp.learner.batch import collate, rollout_form
 from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
 from congrasp.learner.collapse import CollapseWatch
@@ -198,7 +198,7 @@ class _Learner:
         initial = None
         if ranks.rank == 0 and not resume and (self._run_dir / INITIAL_FILE).exists():
             given = bundles.load(self._run_dir / INITIAL_FILE)
-            initial = Policy(given.params, given.observation, given.value, given.privileged)
+            initial = LearnedPolicy(given.params, given.observation, given.value, given.privileged)
         state = self._algorithm.init(config.seed, initial)
         meta: dict[str, Any] = {"run_id": secrets.token_hex(8), "skipped": 0, "hubs": []}
         if ranks.rank == 0:
@@ -361,7 +361,7 @@ class _Learner:
         self._hub.publish_weights(self.bundle().to_message(), self.version)
         if self._ranks.rank:
             return
-        meta = {"version": self.version, "epoch": self._run_id, "schema": self._spec.schema}
+        meta = {"version": self.version, "run_id": self._run_id, "schema": self._spec.schema}
         self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
 
     def _skip_lost_versions(self, version: int, newest: int) -> int:

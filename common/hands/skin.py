@@ -10,7 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
+from congrasp.common import mirror
 from congrasp.common.hands.flesh import Surface, flesh
+from congrasp.common.hands.left import right_name
 from congrasp.common.hands.meshes import Meshes, own_meshes
 from congrasp.common.hands.skeleton import Skeleton, skeleton_of
 from congrasp.common.hands.spec import Hand, Link, link_origin
@@ -69,7 +71,12 @@ def skin_of(hand: Hand) -> Skin:
 
 
 def skin_on(skeleton: Skeleton) -> Skin:
-    """Returns the surface of the hand with this skeleton."""
+    """Returns the surface of the hand with this skeleton; a left hand's is the mirror image of the right hand's."""
+    right, left = right_name(skeleton.hand)
+    if left:
+        own = _mirrored(skeleton, ("origins", "capsules", "anchors"))
+        skin = skin_on(skeleton._replace(hand=right, axes=mirror.axial(skeleton.axes), **own))
+        return skin._replace(faces=skin.faces[:, ::-1].copy(), **_mirrored(skin, ("points", "normals", "origins")))
     human = skeleton.hand in HUMAN_HANDS and _anatomical(skeleton)
     if human:
         surface = flesh(skeleton)
@@ -85,6 +92,11 @@ def skin_on(skeleton: Skeleton) -> Skin:
         human,
         joint,
     )
+
+
+def _mirrored(shape: Skeleton | Skin, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Mirrored points of a shape, by their names."""
+    return {name: mirror.vector(getattr(shape, name)) for name in names}
 
 
 def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:

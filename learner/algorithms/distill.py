@@ -26,7 +26,7 @@ from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import RECORDABLE, Schema
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
 from congrasp.learner.batch import partition_specs
 from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
@@ -72,7 +72,7 @@ class Distillation:
         self._layouts = (spec.layout, teacher.spec.layout)
         self._teacher = teacher.inference_parameters
 
-    def init(self, seed: int, initial: Policy | None = None) -> TrainState:
+    def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
         """Returns the state before the first update, with the teacher's action noise."""
         initial = initial or random_policy(seed, self._spec)
         params = jax.tree.map(jnp.asarray, initial.params)
@@ -89,9 +89,9 @@ class Distillation:
             privileged=initial.privileged,
         )
 
-    def policy(self, state: TrainState) -> Policy:
+    def policy(self, state: TrainState) -> LearnedPolicy:
         """Returns parameters and normalisers."""
-        return Policy(state.params, state.observation, state.value, state.privileged)
+        return LearnedPolicy(state.params, state.observation, state.value, state.privileged)
 
     def update(
         self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None

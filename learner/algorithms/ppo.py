@@ -29,7 +29,7 @@ from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
 from congrasp.learner.algorithms import gae, losses
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
 from congrasp.learner.batch import partition_specs
 from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
@@ -79,7 +79,7 @@ class PPO:
         self._spec, self._config, self._updates = spec, config, updates
         self.batch_schema: Schema = {**RECORDED, **PRIVILEGED} if spec.privileged else RECORDED
 
-    def init(self, seed: int, initial: Policy | None = None) -> TrainState:
+    def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
         """Returns the state before the first update."""
         initial = initial or random_policy(seed, self._spec)
         params = jax.tree.map(jnp.asarray, initial.params)
@@ -97,9 +97,9 @@ class PPO:
             privileged=privileged,
         )
 
-    def policy(self, state: TrainState) -> Policy:
+    def policy(self, state: TrainState) -> LearnedPolicy:
         """Returns parameters and normalisers."""
-        return Policy(state.params, state.observation, state.value, state.privileged)
+        return LearnedPolicy(state.params, state.observation, state.value, state.privileged)
 
     def update(
         self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None

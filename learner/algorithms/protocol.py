@@ -18,7 +18,7 @@ from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import Schema
 
 
-class Policy(NamedTuple):
+class LearnedPolicy(NamedTuple):
     """Published part of a policy: the entries of a `PolicyBundle` that learning changes."""
 
     params: Params
@@ -31,10 +31,10 @@ class Policy(NamedTuple):
     """Statistics of the critic's privileged inputs (P,), on the host; None without inputs or samples."""
 
 
-def random_policy(seed: int, spec: PolicySpec) -> Policy:
+def random_policy(seed: int, spec: PolicySpec) -> LearnedPolicy:
     """Returns networks with random weights, and empty normalisers."""
     params = network.init(seed, spec.layout, spec.action_size, spec.network, spec.privileged_size)
-    return Policy(params, normalizer.empty((sum(size for _, size in spec.layout),)), normalizer.empty())
+    return LearnedPolicy(params, normalizer.empty((sum(size for _, size in spec.layout),)), normalizer.empty())
 
 
 class TrainState(NamedTuple):
@@ -67,7 +67,7 @@ class Algorithm(Protocol):
         They determine what actors send, what the hub admits, warm-up batches, and how a batch is sharded over ranks.
         """
 
-    def init(self, seed: int, initial: Policy | None = None) -> TrainState:
+    def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
         """Returns the state before the first update, with the `initial` policy or random weights."""
 
     def update(
@@ -85,7 +85,7 @@ class Algorithm(Protocol):
           NonFiniteUpdate: a term is not finite; the error names the first one, and the batch is dropped.
         """
 
-    def policy(self, state: TrainState) -> Policy:
+    def policy(self, state: TrainState) -> LearnedPolicy:
         """Returns the policy to publish; its arrays remain valid after further updates."""
 
 

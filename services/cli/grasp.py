@@ -77,7 +77,7 @@ def grasp(
       overlays: Draw constraints and contacts into the video; grasp.png shows them in any case.
       pictures: Write pictures.
       policy: A policy file, or 'allegro-student'; by default the hand's that comes with the package.
-      hand: Hand whose pretrained policy is taken.
+      hand: Hand whose pretrained policy is taken; human:left takes its mirror image.
       attempts: How many are simulated side by side, 1024 at most.
       seed: Draws what is attempted.
       approach: Seconds in which the hand first comes from beside the table; longer where an arm needs it (1 m/s).
@@ -94,6 +94,7 @@ def grasp(
       congrasp grasp mug:7 --hand allegro --arm panda --base "-0.7 0 0 0"
     """
     from congrasp.common.hands import get_hand
+    from congrasp.common.hands.left import right_name
     from congrasp.common.policy import bundle as bundles
     from congrasp.common.policy.pretrained import policy_file
     from congrasp.services.cli.console import at_least, at_most, bars
@@ -111,11 +112,16 @@ def grasp(
     at_most(120.0, "frames a second", fps=fps)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
-    file = policy_file(policy, hand)
+    right, left = right_name(hand)
+    if left and arm.arm:
+        raise CongraspError("An arm carries right hands alone.", "Leave out --arm or :left.")
+    file = policy_file(policy, right)
     bundle = bundles.load(file)
     found, results = find_objects(objects, folder)
     film = Film(_pixels(size), fps, overlays) if video else None
     identity: tuple[Any, ...] = (bundles.content_hash(file.read_bytes()), attempts, seed, approach, lift)
+    if left:
+        identity = (*identity, "left")
     planner = None
     if arm.arm:
         from congrasp.services.arm.planner import ArmPlanner
@@ -123,7 +129,7 @@ def grasp(
         planner = ArmPlanner(arm, get_hand(bundle.spec.hand), seed)
         identity = (*identity, planner.identity)
     settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, film, pictures, again, rest)
-    grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed, arm=planner)
+    grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed, arm=planner, left=left)
 
     for result in results:
         _show(result)

@@ -25,6 +25,7 @@ COMMANDS = {
     "actor": "one actor that works for a learner elsewhere",
     "serve": "answer live queries with a run's newest policy or a policy file",
     "grasp": "a grasp motion for an object of your own, under constraints",
+    "dataset": "verified grasps of many objects, in shards, with a card",
     "evaluate": "measure a policy by the paper's protocol",
     "reproduce": "the paper's tables: train what is missing, evaluate, compare",
     "query": "ask a policy server for one action, or measure its latency",

@@ -131,7 +131,7 @@ class _Packer:
         self._episode = np.zeros(layout["size"], np.float32)
         points = self._fields["surface_points"][1]
         for name, value in episode.items():
-            if name in ("surface_points", "surface_minus") and len(value) != points:
+            if name in ("surface_points", "surface_avoid") and len(value) != points:
                 value = value[np.arange(points) * len(value) // points]
             self._write(self._episode, name, value)
 
@@ -181,7 +181,7 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
         "object_position_initial": request.object_pose[0],
         "object_quaternion_initial": request.object_pose[1],
         "surface_points": request.surface,
-        **({} if request.avoid is None else {"surface_minus": request.avoid}),
+        **({} if request.avoid is None else {"surface_avoid": request.avoid}),
         **{f"{name}_{field}": value for name, own in request.constraints.items() for field, value in own.items()},
     }
     return {name: _numbers(name, value) for name, value in given.items()}

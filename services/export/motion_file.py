@@ -83,7 +83,7 @@ class GraspMotion:
     capsule_ends: Annotated[np.ndarray, "(C, 2, 3) m, link frame"]
     capsule_radius: Annotated[np.ndarray, "(C,) m"]
     surface_points: Annotated[np.ndarray, "(N, 3) m, object frame, points of the surface"]
-    surface_minus: Annotated[np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"]
+    surface_avoid: Annotated[np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"]
     colours: Colours | None
     """The object's own, in its frame."""
     goal: dict[str, np.ndarray]
@@ -136,7 +136,7 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         object_file_scale=np.asarray(meta.pop("object_file_scale", 1.0), np.float64),
         **hand_arrays(hand),
         surface_points=arrays["surface_points"],
-        surface_minus=arrays["surface_minus"].astype(bool),
+        surface_avoid=arrays["surface_avoid"].astype(bool),
         colours=Colours(arrays["colour_points"], arrays["colour_values"]) if "colour_values" in arrays else None,
         goal={
             name.removeprefix("goal/"): value for name, value in arrays.items() if name.removeprefix("goal/") in _GOALS

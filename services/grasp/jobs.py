@@ -129,7 +129,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             if text
         }
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
-        key = key_of(_content(at), options, given, settings.identity, settings.rest)
+        key = key_of(at.digest(), options, given, settings.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
         if before is not None and ((folder / VIDEO).exists() or settings.film is None):
             return Result(at.name, before, skipped=True)
@@ -184,14 +184,6 @@ def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
     if options.density is not None:
         basis = f"by {options.density:g} kg/m³"
     return [f"its mass is {1000 * obj.mass:.0f} g, {basis} (--material or --mass sets another)"]
-
-
-def _content(at: ObjectAt) -> str:
-    """A hash of an object's files, or what the generator makes it of."""
-    if not at.source and not at.path.exists():
-        return str(at.path)
-    files = [file.path for file in at.source.files()] if at.source else [at.path]
-    return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
 
 
 def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:

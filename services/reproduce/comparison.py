@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from congrasp.services.evaluate.paper import PaperLine, paper_lines
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.reproduce.evaluation import Result
-from congrasp.services.reproduce.plan import Policy
+from congrasp.services.reproduce.plan import RequiredPolicy
 
 SUCCESS = "success"
 CAPTURED_DATA = {"captured": "GRAB and OakInk", "cross": "DexYCB"}
@@ -59,7 +59,7 @@ class Cell:
         return "better" if (self.low > self.paper) == (self.quantity == SUCCESS) else "worse"
 
 
-def compare(results: Sequence[Result], absent: Mapping[Policy, str], hands: Sequence[str]) -> list[Cell]:
+def compare(results: Sequence[Result], absent: Mapping[RequiredPolicy, str], hands: Sequence[str]) -> list[Cell]:
     """Returns a cell for every figure of the paper and every comparable result.
 
     Args:
@@ -121,11 +121,13 @@ def _filled(cell: Cell, data: str, row: Row) -> Cell:
     return dataclasses.replace(cell, ours=ours, low=low, high=high, difference=ours - cell.paper)
 
 
-def _reason(line: PaperLine, results: Sequence[Result], absent: Mapping[Policy, str], hands: Sequence[str]) -> str:
+def _reason(
+    line: PaperLine, results: Sequence[Result], absent: Mapping[RequiredPolicy, str], hands: Sequence[str]
+) -> str:
     """Reason why no result is comparable with a line."""
     if line.hand not in hands:
         return f"the hand '{line.hand}' was not requested"
-    if reason := absent.get(Policy(line.hand, line.method)):
+    if reason := absent.get(RequiredPolicy(line.hand, line.method)):
         return f"no policy of the method '{line.method}': {reason}"
     if line.source in CAPTURED_DATA and not any(result.source == line.source for result in results):
         return (

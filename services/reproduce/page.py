@@ -16,7 +16,7 @@ from congrasp.services.reproduce.comparison import CONDITIONS, SUCCESS, Cell, un
 from congrasp.services.reproduce.evaluation import Result
 from congrasp.services.reproduce.latex import latex
 from congrasp.services.reproduce.layout import not_comparable, tables
-from congrasp.services.reproduce.plan import Policy
+from congrasp.services.reproduce.plan import RequiredPolicy
 
 PAGE, JSON, LATEX = "reproduction.html", "reproduction.json", "tables.tex"
 _LARGEST_PICTURE = 32 << 20
@@ -27,7 +27,7 @@ class Account(NamedTuple):
 
     results: list[Result]
     cells: list[Cell]
-    policies: list[tuple[Policy, str]]
+    policies: list[tuple[RequiredPolicy, str]]
     """Policies, each with its file or the reason why there is none."""
     failures: list[str]
     conditions: str

@@ -12,7 +12,7 @@ _ON_MANY_OBJECTS = ("ours", "graspxl", "no-dynamic-center")
 """Methods tested by the paper on large-scale objects."""
 
 
-class Policy(NamedTuple):
+class RequiredPolicy(NamedTuple):
     """A policy that a reproduction needs."""
 
     hand: str
@@ -27,7 +27,7 @@ class Policy(NamedTuple):
 class Part(NamedTuple):
     """Rows that are evaluated and stored together."""
 
-    policy: Policy
+    policy: RequiredPolicy
     table: str
     """`services.evaluate.tables.evaluate_tables`, or `captured`."""
     data: pathlib.Path | None = None
@@ -39,13 +39,13 @@ class Part(NamedTuple):
         return f"{self.policy.name}-{self.data.resolve().name if self.data else self.table}"
 
 
-def policies(hands: Sequence[str], methods: Sequence[str]) -> list[Policy]:
+def policies(hands: Sequence[str], methods: Sequence[str]) -> list[RequiredPolicy]:
     """Returns the full system of every hand, then the other methods of the first hand, learning or not."""
-    full = [Policy(hand, "ours") for hand in hands]
-    return full + [Policy(hands[0], method) for method in BASELINES if method in methods]
+    full = [RequiredPolicy(hand, "ours") for hand in hands]
+    return full + [RequiredPolicy(hands[0], method) for method in BASELINES if method in methods]
 
 
-def parts(needed: Sequence[Policy], captured: Sequence[pathlib.Path], *, noise: bool) -> list[Part]:
+def parts(needed: Sequence[RequiredPolicy], captured: Sequence[pathlib.Path], *, noise: bool) -> list[Part]:
     """Returns all parts; the first policy is the one with every table.
 
     Args:

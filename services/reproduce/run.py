@@ -21,7 +21,7 @@ from congrasp.services.reproduce import training
 from congrasp.services.reproduce.comparison import compare
 from congrasp.services.reproduce.evaluation import Numbers, Result, evaluate_part
 from congrasp.services.reproduce.page import Account, page, write
-from congrasp.services.reproduce.plan import BASELINES, Policy, parts, policies
+from congrasp.services.reproduce.plan import BASELINES, RequiredPolicy, parts, policies
 
 RUNS = "policies"
 """Folder of trainings within the output folder."""
@@ -35,7 +35,7 @@ class Request:
     hands: tuple[str, ...]
     """Hands; the first is used in all tables except that of hands."""
     methods: tuple[str, ...]
-    given: Mapping[Policy, Entrant]
+    given: Mapping[RequiredPolicy, Entrant]
     """Policies that need no training."""
     captured: tuple[pathlib.Path, ...]
     quick: bool
@@ -51,12 +51,12 @@ class Request:
 class _Policies(NamedTuple):
     """Policies available for evaluation."""
 
-    entrants: dict[Policy, Entrant]
-    absent: dict[Policy, str]
+    entrants: dict[RequiredPolicy, Entrant]
+    absent: dict[RequiredPolicy, str]
     """Reasons for missing policies."""
 
 
-def to_train(request: Request) -> list[Policy]:
+def to_train(request: Request) -> list[RequiredPolicy]:
     """Returns the policies that the request would have to train."""
     if request.quick:
         return []
@@ -82,9 +82,9 @@ def reproduce(
       CongraspError: nothing could be evaluated, or the result cannot be written.
     """
     page()  # fails before anything else if a package is missing
-    shown: set[Policy] = set()
+    shown: set[RequiredPolicy] = set()
 
-    def show(policy: Policy, line: str) -> None:
+    def show(policy: RequiredPolicy, line: str) -> None:
         """Shows a bar for each training; its output is in its log."""
         if policy not in shown:
             shown.add(policy)
@@ -137,7 +137,7 @@ def _outcome(result: Result) -> str:
     return f"{rates} ({result.about['seconds']:.0f} s)"
 
 
-def _file(request: Request, policy: Policy) -> pathlib.Path | None:
+def _file(request: Request, policy: RequiredPolicy) -> pathlib.Path | None:
     """Returns a policy's file, if it exists."""
     if policy in request.given:
         return request.given[policy].file
@@ -146,12 +146,12 @@ def _file(request: Request, policy: Policy) -> pathlib.Path | None:
     return training.trained(request.out / RUNS, policy)
 
 
-def _policies(request: Request, failed: Mapping[Policy, str]) -> _Policies:
+def _policies(request: Request, failed: Mapping[RequiredPolicy, str]) -> _Policies:
     """Reads the available policies; methods without learning use the full system's hand and geometry."""
     found = _Policies({}, {})
     for policy in policies(request.hands, request.methods):
         learns = get_method(policy.method).learns
-        file = _file(request, policy if learns else Policy(policy.hand, "ours"))
+        file = _file(request, policy if learns else RequiredPolicy(policy.hand, "ours"))
         if policy in request.given:
             found.entrants[policy] = request.given[policy]
         elif file is not None:
@@ -161,7 +161,7 @@ def _policies(request: Request, failed: Mapping[Policy, str]) -> _Policies:
         else:
             found.absent[policy] = "not trained with --quick" if request.quick else "it was not trained"
     for method in set(BASELINES) - set(request.methods):
-        found.absent[Policy(request.hands[0], method)] = "not requested"
+        found.absent[RequiredPolicy(request.hands[0], method)] = "not requested"
     return found
 
 

@@ -5,29 +5,29 @@ import pathlib
 from collections.abc import Callable, Sequence
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.reproduce.plan import Policy
+from congrasp.services.reproduce.plan import RequiredPolicy
 from congrasp.services.train import unattended
 from congrasp.services.train.presets import FULL
 
 
-def trained(folder: pathlib.Path, policy: Policy) -> pathlib.Path | None:
+def trained(folder: pathlib.Path, policy: RequiredPolicy) -> pathlib.Path | None:
     """Policy file of a finished run in the folder of all runs; None if there is none."""
     return unattended.trained(folder / policy.name)
 
 
-def seconds(folder: pathlib.Path, policy: Policy) -> float | None:
+def seconds(folder: pathlib.Path, policy: RequiredPolicy) -> float | None:
     """Duration of its training in seconds; for a resumed one, that of the last session."""
     return unattended.seconds(folder / policy.name)
 
 
 def train_all(
     folder: pathlib.Path,
-    wanted: Sequence[Policy],
+    wanted: Sequence[RequiredPolicy],
     *,
     options: Sequence[str] = (),
     patience: float,
-    progress: Callable[[Policy, str], None] = lambda policy, line: None,
-) -> dict[Policy, str]:
+    progress: Callable[[RequiredPolicy, str], None] = lambda policy, line: None,
+) -> dict[RequiredPolicy, str]:
     """Trains policies, resuming from the last checkpoint if there is one.
 
     Args:
@@ -40,7 +40,7 @@ def train_all(
     Returns:
       Reasons for failed trainings; the others succeeded.
     """
-    failures: dict[Policy, str] = {}
+    failures: dict[RequiredPolicy, str] = {}
     for policy in wanted:
         told = functools.partial(progress, policy)
         try:
@@ -52,7 +52,7 @@ def train_all(
     return failures
 
 
-def chosen(policy: Policy) -> list[str]:
+def chosen(policy: RequiredPolicy) -> list[str]:
     """Options of `congrasp train` for the policy's run."""
     method = ["--method", policy.method] if policy.method != "ours" else []
     return ["--preset", FULL, "--hand", policy.hand, *method]

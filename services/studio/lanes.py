@@ -81,7 +81,7 @@ def for_page(episode: Message) -> Message:
         "contact_force",
         "table",
     )
-    keep += ("visual_vertices", "visual_faces", "surface_points", "surface_minus")
+    keep += ("visual_vertices", "visual_faces", "surface_points", "surface_avoid")
     arrays: dict[str, Any] = {name: episode.arrays[name] for name in keep}
     if "colour_values" in episode.arrays:
         own = Colours(episode.arrays["colour_points"], episode.arrays["colour_values"])
@@ -113,7 +113,7 @@ def _drawn(episode: Message) -> dict[str, np.ndarray]:
             quaternion = (wrist * _turn(quaternion)).as_quat(scalar_first=True)
             fields = {"position": position, "quaternion": quaternion}
         elif isinstance(marker, Paint):
-            fields = {"avoid": np.asarray(episode.arrays["surface_minus"])}
+            fields = {"avoid": np.asarray(episode.arrays["surface_avoid"])}
         else:
             fields = marker._asdict()
         found |= {f"{kind}/{name}/{field}": np.asarray(value, np.float32) for field, value in fields.items()}

@@ -199,7 +199,7 @@ class TrainingWindow:
                 "version": None if found is None else found["version"],
                 "rates": {} if found is None else found["rates"],
                 "queue": None if found is None else found["queue"],
-                "counters": {} if found is None else found["ledger"],
+                "counters": {} if found is None else found["counters"],
                 "warnings": [] if found is None else found["warnings"],
                 "curves": {name: self._curves[name].thinned(points) for name in wanted},
                 "names": self._labels_of_all(),

@@ -61,7 +61,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
             shapes.append(posed_hand(hand, arrays["pose/q"][v, m], position, wrist))
         return shapes
 
-    avoid = arrays["surface/minus"]
+    avoid = arrays["surface/avoid"]
     body = Shape(
         "mesh",
         (0, 0),

@@ -74,7 +74,7 @@ def _bodies(episode: Message, step: int, *, overlays: bool) -> list[Shape]:
 def _object(episode: Message, step: int, *, painted: bool = True) -> Shape:
     """The object at a step in its own colours, painted where its avoid region is a constraint."""
     arrays = episode.arrays
-    avoid = np.asarray(arrays["surface_minus"], bool)
+    avoid = np.asarray(arrays["surface_avoid"], bool)
     marked = painted and bool(avoid.any()) and any(isinstance(marker, Paint) for _, marker in markers(arrays))
     paint = None
     if "colour_values" in arrays:

@@ -92,8 +92,8 @@ class Affordance(Constraint):
         Option("avoid", "Part not to touch: a mesh or names of parts, likewise.", "part"),
     )
 
-    needs = ("surface_minus",)
-    invalid = ("An affordance needs surface points on both sides.", "Set some of 'surface_minus'.")
+    needs = ("surface_avoid",)
+    invalid = ("An affordance needs surface points on both sides.", "Set some of 'surface_avoid'.")
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
         """Nearest-point vectors and forces."""

@@ -122,7 +122,7 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
     messages = {
         "metrics": metrics(loss=1.0),
         "event": Message({}, {"time": 1.0, "level": "info", "text": "x"}),
-        "version": Message({}, {"version": 1, "epoch": "e", "schema": "s"}),
+        "version": Message({}, {"version": 1, "run_id": "e", "schema": "s"}),
         "episode": whole,
         "rollout": Message({"reward": np.zeros((2, 2), np.float32)}, {"actor": "a"}),
     }

@@ -140,7 +140,7 @@ def test_surface_points_are_coloured_by_region(entries: list[Entry]) -> None:
     points = np.stack([raw[:, offsets[a] : offsets[a] + 4].copy().view("<f4")[:, 0] for a in "xyz"], -1)
     np.testing.assert_array_equal(points, arrays["surface_points"])
     red, green = raw[:, offsets["red"]].astype(int), raw[:, offsets["green"]].astype(int)
-    np.testing.assert_array_equal(red > green, arrays["surface_minus"])
+    np.testing.assert_array_equal(red > green, arrays["surface_avoid"])
 
 
 def test_points_of_every_link_lie_on_its_surface_in_its_frame(entries: list[Entry]) -> None:

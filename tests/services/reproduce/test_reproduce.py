@@ -12,12 +12,12 @@ from congrasp.services.cli.main import load
 from congrasp.services.evaluate.lineup import read_entrant
 from congrasp.services.reproduce import evaluation, run
 from congrasp.services.reproduce.evaluation import Numbers, Result
-from congrasp.services.reproduce.plan import Policy
+from congrasp.services.reproduce.plan import RequiredPolicy
 from congrasp.services.train.command import untrained
 from tests.pages import Reader
 from tests.rows import row
 
-OURS = Policy("human", "ours")
+OURS = RequiredPolicy("human", "ours")
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, 
     numbers = Numbers(3, 3, 6, "native", 0, 1.0)
     account = run.reproduce(request, numbers, lambda text, total: lambda done: None)
     what = {one.name: text for one, text in account.policies}
-    assert asked[:2] == [Policy("allegro", "ours"), Policy("human", "graspxl")]
+    assert asked[:2] == [RequiredPolicy("allegro", "ours"), RequiredPolicy("human", "graspxl")]
     assert asked[2:6] == ["human-ours-single", "human-pd-single", "human-ours-composed", "human-ours-noise"]
     assert what["human-ours"].startswith("policy.safetensors, version 0") and what["human-pd"] == "needs none"
     assert what["allegro-ours"] == what["human-graspxl"] == "none: it failed"

@@ -210,7 +210,7 @@ def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
     # FORCE of 1.5 N is three quarters of the full contact colour's 2 N: 0.3 + 0.3 * 0.75 of it.
     np.testing.assert_allclose(thumb[0], np.array(FLESH) + 0.525 * np.subtract(TOUCHING, FLESH), atol=0.01)
     assert body.paint_colours is not None
-    minus = episode().arrays["surface_minus"]
+    minus = episode().arrays["surface_avoid"]
     np.testing.assert_allclose(body.paint_colours, np.where(minus[:, None], OBJECT_AVOID, OBJECT))
     assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint_points is None
 
