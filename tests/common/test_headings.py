@@ -149,7 +149,7 @@ def test_few_headings_are_repeated():
 
 
 def test_what_is_wider_than_the_hand_opens_has_no_heading():
-    with pytest.raises(TooWideError, match=r"^'ball_0' is too wide: 7\.\d cm .* which opens to 5\.0 cm"):
+    with pytest.raises(TooWideError, match=r"^'ball_0' is too wide: 7\.\d cm .* but the hand opens to 5\.0 cm"):
         sample_headings(generate(0, "ball"), np.random.default_rng(0), use_affordance=False, max_width=0.05)
 
 

@@ -40,7 +40,7 @@ def test_a_folder_gives_all_its_objects_whoever_asks(tmp_path):
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        (ObjectsConfig(count=0), "pool of 0 objects is empty"),
+        (ObjectsConfig(count=0), "pool is empty: objects.count is 0"),
         (ObjectsConfig(folder="/nonexistent"), "no folder /nonexistent"),
         (ObjectsConfig(count=1, families=("unicorn",)), "unicorn"),
     ],

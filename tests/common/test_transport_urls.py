@@ -102,7 +102,7 @@ def test_certificates_follow_from_the_role(certs):
         assert actor.query(KEYS.ticket("1.a"), Message(), timeout=5)
         with pytest.raises(TransportError):
             actor.query(KEYS.ticket("0.a"), Message(), timeout=5)
-    with pytest.raises(CongraspError, match="for the role actor, not observer"):
+    with pytest.raises(CongraspError, match="has the role actor, not observer"):
         urls.connect(url, "observer", certs=certs / "actor.1")
 
 

@@ -462,7 +462,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     assert {p.name for p in tmp_path.iterdir()} == {"logs", "mug.npz", *made}
     capsys.readouterr()
     for arguments, words in (
-        (["mug.npz", "logs", "--to", "glb"], "one motion, and 2 were named"),
+        (["mug.npz", "logs", "--to", "glb"], "one motion, but 2 were given"),
         (["mug.npz", "--to", "lerobot"], "exists already"),
         (["mug.npz", "--to", "usd", "--out", "x.glb"], "ends in .usda, and x.glb does not"),
         (["mug.npz", "--out", "logs"], "Use --out logs/grasp.glb"),

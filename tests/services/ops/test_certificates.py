@@ -91,7 +91,7 @@ def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
     other = issue(folder, "actor")
     assert find(folder, "actor") == Credentials(folder / "actor.0", "actor")
     assert find(other, "actor").identity.number == 1
-    with pytest.raises(CongraspError, match=r"for the role actor, not learner.*--role learner"):
+    with pytest.raises(CongraspError, match=r"has the role actor, not learner.*--role learner"):
         find(other, "learner")
     with pytest.raises(CongraspError, match="missing"):
         find(folder, "client")
@@ -104,7 +104,7 @@ def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
     with pytest.raises(CongraspError, match="is not a certificate"):
         find(other, "actor")
     (other / "tls.crt").write_bytes((folder / "ca.crt").read_bytes())
-    with pytest.raises(CongraspError, match="for the role ca"):
+    with pytest.raises(CongraspError, match="has the role ca"):
         find(other, "actor")
 
 

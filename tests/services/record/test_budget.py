@@ -160,7 +160,7 @@ def test_an_actor_cannot_send_its_episodes_far_ahead_of_time():
     long = Message(whole.arrays, {**whole.meta, "control_dt": 1.0})  # 12 s
     for _ in range(6):
         assert convert(KEYS.log("episode", "actor", "1.b"), long, 10**18)
-    with pytest.raises(CongraspError, match="still play for 72 s"):
+    with pytest.raises(CongraspError, match="still playing for 72 s"):
         convert(KEYS.log("episode", "actor", "1.b"), long, 10**18)
     assert convert(KEYS.log("episode", "actor", "0.a"), whole, 10**18)
 

@@ -65,7 +65,7 @@ def test_one_too_many_is_refused_at_once_and_the_others_are_answered(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=2)
     futures = [running(batcher, gate)]
     futures += [batcher.submit(i, 10.0) for i in (1, 2)]
-    with pytest.raises(OverloadedError, match="Overloaded: 2 queries wait"):
+    with pytest.raises(OverloadedError, match="Overloaded: 2 queries are queued"):
         batcher.submit(3, 10.0)
     gate.go.set()
     assert [future.result(10) for future in futures] == [0, 10, 20]
@@ -77,7 +77,7 @@ def test_peers_take_turns_and_one_that_asks_without_end_is_refused_alone(gate):
     futures = [running(batcher, gate)]
     futures += [batcher.submit(i, 10.0, peer="greedy") for i in (1, 2, 3)]
     for refuse in (lambda: batcher.submit(4, 10.0, peer="greedy"), lambda: batcher.check_room("greedy")):
-        with pytest.raises(OverloadedError, match="Overloaded: 3 of your queries wait"):
+        with pytest.raises(OverloadedError, match="Overloaded: 3 of your queries are queued"):
             refuse()
     batcher.check_room("modest")
     futures += [batcher.submit(i, 10.0, peer="modest") for i in (7, 8)]

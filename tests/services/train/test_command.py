@@ -139,7 +139,7 @@ def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, fr
     [
         ({"task": TaskConfig(hand="paw")}, "no hand 'paw'"),
         ({"objects": ObjectsConfig(families=("unicorn",))}, "unicorn"),
-        ({"objects": ObjectsConfig(count=0)}, "pool of 0 objects"),
+        ({"objects": ObjectsConfig(count=0)}, "pool is empty: objects.count is 0"),
         ({"environments": 0}, "empty"),
     ],
 )

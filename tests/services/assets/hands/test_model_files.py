@@ -143,7 +143,7 @@ def test_wrong_hand_files_are_one_line(claw, tmp_path):
     refused("parent 'palm' of|must precede", links=[links[0], links[2], links[1], *links[3:]])
     refused("more than once", links=[*links, links[-1]])
     refused("is not a joint", open_pose={"elbow": 1.0})
-    refused("outside of its limits in the closed pose", closed_pose={"left_root": 3.0})
+    refused("outside its limits in the closed pose", closed_pose={"left_root": 3.0})
     refused("no hand", links=3)
     refused("'wings'|wings", wings=2)
     refused("mass above zero", links=[{**links[0], "mass": 0.0}, *links[1:]])
