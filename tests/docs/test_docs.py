@@ -163,8 +163,7 @@ def example_lines():
 def test_the_examples_of_the_robots_page_take_their_options(line, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "examples")
     _, script, *words = shlex.split(line, comments=True)
-    arguments = runpy.run_path(str(ROOT / script))["Arguments"]
-    tyro.cli(arguments, args=words)
+    tyro.cli(importlib.import_module(pathlib.Path(script).stem).Arguments, args=words)
 
 
 def test_the_readme_is_read_in_five_minutes():
