@@ -26,6 +26,7 @@ from congrasp.common.task import metrics
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.observation import observe
 from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.teaching import observe_for_teacher
 from congrasp.common.task.types import Action, Array
 
 Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
@@ -87,7 +88,7 @@ class Rollout(NamedTuple):
     probed: Any
     """What the probe returned, with leading axis T; None without a probe."""
     teacher_observation: Array | None = None
-    """(T, B, S) what a policy sees that sees all, where a teacher is to say what it would do."""
+    """(T, B, S) what a teacher is asked with (`common.task.teaching`), where there is one."""
     privileged: Array | None = None
     """(T, B, P) privileged inputs of the critic (`common.task.privileged`), where they are recorded."""
     last_privileged: Array | None = None
@@ -100,7 +101,7 @@ class _Seen(NamedTuple):
     observation: Array
     """(B, D)."""
     teacher_observation: Array | None
-    """(B, S) of a policy that sees all, if that is recorded."""
+    """(B, S) for a teacher, if that is recorded."""
     privileged: Array | None
     """(B, P) of the critic, likewise."""
 
@@ -304,7 +305,10 @@ class RolloutWorker:
     def _look(self, state: EnvState, settings: Settings) -> _Seen:
         """Observations of the present control step."""
         observation = observe(self.env.seen(state)).astype(self._dtype)
-        everything = observe(self.env.privileged(state)).astype(self._dtype) if self._taught else None
+        everything = None
+        if self._taught:
+            given = self.env.privileged(state), self.env.seen(state), settings.control
+            everything = observe_for_teacher(*given).astype(self._dtype)
         masses = settings.masses
         inputs = None if masses is None else self.env.critic_inputs(state, masses).astype(self._dtype)
         return _Seen(observation, everything, inputs)

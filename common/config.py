@@ -109,6 +109,13 @@ class SensingConfig:
     """Standard deviation of a sample's turn about each axis, rad."""
     dropout: tuple[float, float] = (0.0, 0.0)
     """Probability that a sample never arrives."""
+    position_bias: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of each coordinate of an error that all samples of an episode share, m."""
+    rotation_bias: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of the turn about each axis that all samples of an episode share, rad."""
+    settle: float = 0.0
+    """The object's first pose, by which the wrist is guided, is the mean of all readings until one is this far from it,
+    m, or the table goes; 0: the first reading."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -61,9 +61,8 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     if control.finger_guidance:
         motors += _finger_guidance(scene, control.finger_guidance)
     q_target = joint_positions(hand, jnp.clip(motors, *motor_limits(hand)))
-    ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
-    limit = _position_limit(scene, control)
-    return Action(q_target, wrist_target(hand, control, state, limit, ahead, action[..., fingers:]))
+    lead = wrist_lead(hand, control, guided(scene, control), action[..., fingers:])
+    return Action(q_target, state.u + lead + carried_lead(hand, state))
 
 
 def _position_limit(scene: Scene, control: ControlConfig) -> Array:
@@ -78,24 +77,44 @@ def _position_limit(scene: Scene, control: ControlConfig) -> Array:
     return jnp.where(scene.state.table, slow + share * (fast - slow), control.guidance_position_limit)
 
 
-def wrist_target(
-    hand: Hand, control: ControlConfig, state: SceneState, limit: Array, ahead: Array, residual: Array
-) -> Array:
-    """u_tgt (B, 6), see `decode`.
+class Guided(NamedTuple):
+    """What the lead of a wrist's target follows from, beside the action."""
+
+    ahead: Array
+    """(..., 6) m and rad from the wrist to its guidance."""
+    limit: Array
+    """(...,) m, the farthest that the target is ahead of the wrist."""
+    velocity: Array
+    """(..., 6) of the wrist joints, m/s and rad/s."""
+    table: Array
+    """(...,) bool: the table is there."""
+
+    def bounded(self, control: ControlConfig) -> Array:
+        """(..., 6) the lead of the guidance alone, before the limits of acceleration."""
+        slides = _limit(self.ahead[..., :3], self.limit[..., None])
+        return jnp.concatenate([slides, _limit(self.ahead[..., 3:], control.guidance_rotation_limit)], -1)
+
+
+def guided(scene: Scene, control: ControlConfig) -> Guided:
+    """Guidance of the wrist in a scene."""
+    state = scene.state
+    ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
+    return Guided(ahead, _position_limit(scene, control), state.u_velocity, state.table)
+
+
+def wrist_lead(hand: Hand, control: ControlConfig, given: Guided, residual: Array) -> Array:
+    """u_tgt - u (..., 6) without what carries the load; see `decode`.
 
     Args:
       hand: its servos.
       control: limits and scales.
-      state: the present control step.
-      limit: (B,) m, the farthest that the target is ahead of the wrist.
-      ahead: (B, 6) m and rad from the wrist to its guidance.
-      residual: (B, 6) the wrist's part of the action.
+      given: the guidance.
+      residual: (..., 6) the wrist's part of the action.
     """
-    share = jnp.where(state.table, 1.0, control.hold_acceleration)
-    carried = jnp.where(state.table[..., None], 0.0, -state.wrist_load)
+    share = jnp.where(given.table, 1.0, control.hold_acceleration)
     leads = []
     for part, scale, farthest, hardest in (
-        (slice(0, 3), control.wrist_position_scale, limit[:, None], control.wrist_acceleration),
+        (slice(0, 3), control.wrist_position_scale, given.limit[..., None], control.wrist_acceleration),
         (
             slice(3, 6),
             control.wrist_rotation_scale,
@@ -105,9 +124,16 @@ def wrist_target(
     ):
         stiffness, damping = hand.wrist_servos[:, part.start]
         servo = _Servo(stiffness, damping, farthest, hardest)
-        lead = _lead(servo, ahead[..., part], scale * residual[..., part], state.u_velocity[..., part], share)
-        leads.append(lead + carried[..., part] / stiffness)
-    return state.u + jnp.concatenate(leads, -1)
+        leads.append(
+            _lead(servo, given.ahead[..., part], scale * residual[..., part], given.velocity[..., part], share)
+        )
+    return jnp.concatenate(leads, -1)
+
+
+def carried_lead(hand: Hand, state: SceneState) -> Array:
+    """(B, 6) by which the wrist's target leads so that its servos carry the load, once the table is gone."""
+    stiffness, _ = hand.wrist_servos
+    return jnp.where(state.table[..., None], 0.0, -state.wrist_load / stiffness)
 
 
 def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array, u_target: Array) -> Array:
@@ -151,23 +177,23 @@ class _Servo(NamedTuple):
     damping: Array | float
     """kv / m, 1/s."""
     farthest: Array | float
-    """Greatest lead (B, 1) of the target, m or rad."""
+    """Greatest lead (..., 1) of the target, m or rad."""
     hardest: float
     """Greatest acceleration, m/s^2 or rad/s^2; 0 for any."""
 
 
 def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: Array) -> Array:
-    """How far (B, 3) the target is ahead of three wrist joints.
+    """How far (..., 3) the target is ahead of three wrist joints.
 
     At a target that is damping v / stiffness ahead a joint goes on at its speed; one r from there accelerates it by
     stiffness r. By v stiffness / damping it comes to rest along its guidance, however small the share.
 
     Args:
       servo: of the joints.
-      ahead: (B, 3) how far the guidance is ahead.
-      residual: (B, 3) what the action adds.
-      velocity: (B, 3) of the joints.
-      share: (B,) of the greatest acceleration, for all but coming to rest.
+      ahead: (..., 3) how far the guidance is ahead.
+      residual: (..., 3) what the action adds.
+      velocity: (..., 3) of the joints.
+      share: (...,) of the greatest acceleration, for all but coming to rest.
     """
     rate, hardest = servo.stiffness / servo.damping, jnp.asarray(servo.hardest)
     steady = velocity / rate

@@ -55,7 +55,7 @@ PRIVILEGED: Schema = {
 }
 """What they record in addition for a critic with privileged inputs (`common.task.privileged`)."""
 TAUGHT: Schema = {"teacher_observation": ArraySpec(_OBSERVATION, ("T", "B", "S"))}
-"""What they record beside it where a teacher is to say what it would have done: what a policy sees that sees all."""
+"""What they record in addition where there is a teacher, to ask it with (`common.task.teaching`)."""
 RECORDABLE: Schema = {**RECORDED, **PRIVILEGED, **TAUGHT}
 """All of these."""
 

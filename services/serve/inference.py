@@ -73,7 +73,13 @@ class PolicyFunction:
         if PACKED in request.arrays:
             return Message({PACKED: answer.vectors}, meta)
         if request.meta.get("layout"):
-            meta |= {"layout": self.layout.digest, "states": STATES_LIMIT, **self.layout.description()}
+            settle = self.layout.task.sensing.settle
+            meta |= {
+                "layout": self.layout.digest,
+                "states": STATES_LIMIT,
+                "settle": settle,
+                **self.layout.description(),
+            }
         fingers = len(self.layout.hand.joints)
         parts = np.split(answer.vectors[0], [-fingers - 6, -6])
         return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
