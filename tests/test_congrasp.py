@@ -74,5 +74,5 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
     np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     congrasp.save_motion(str(tmp_path / "block.npz"), found.motion)
     assert congrasp.load_motion(str(tmp_path / "block.npz")).object == "block"
-    with pytest.raises(congrasp.UnknownConstraintError, match="does not know the constraint 'fingers'"):
+    with pytest.raises(congrasp.UnknownConstraintError, match="does not support the constraint 'fingers'"):
         congrasp.grasp(mesh, fingers="thumb index", attempts=4, policy=paper_policy)

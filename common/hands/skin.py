@@ -1,6 +1,6 @@
-"""A surface for every hand: flesh for human hands, for robots the meshes of their files or bevelled housings.
+"""Surface of any hand: flesh for human hands; the file's meshes or bevelled housings for robots.
 
-A surface is made once, with every joint at zero, and follows the links by linear blend skinning.
+A surface is computed once, with every joint at zero, and moved with the links by linear blend skinning.
 """
 
 import functools
@@ -16,11 +16,11 @@ from congrasp.common.hands.skeleton import Skeleton, skeleton_of
 from congrasp.common.hands.spec import Hand, Link, link_origin
 
 HUMAN_HANDS = ("human", "mano")
-"""Names of the hands that have flesh."""
+"""Names of hands with flesh."""
 _LARGEST = 0.5  # m
-_SECTIONS = 20  # of a housing
-_BEVEL = 0.45  # of a housing's ends, in radii
-_DRUM_RADIUS, _DRUM_LENGTH = 0.72, 1.04  # of a joint's drum, in radii of its link
+_SECTIONS = 20  # bevel of a housing
+_BEVEL = 0.45  # length of a housing's ends, in radii
+_DRUM_RADIUS, _DRUM_LENGTH = 0.72, 1.04  # radius of a joint's drum, in radii of its link
 
 
 class Skin(NamedTuple):
@@ -31,18 +31,18 @@ class Skin(NamedTuple):
     normals: np.ndarray
     """(V, 3) float32 unit."""
     faces: np.ndarray
-    """(F, 3) int32; they wind outwards."""
+    """(F, 3) int32, with outward normals."""
     weights: np.ndarray
-    """(V, L) float32, at most four of a point above zero; they sum to one."""
+    """(V, L) float32, at most four nonzero for each point; rows sum to one."""
     origins: np.ndarray
-    """(L, 3) of the links' frames, which are turned as the wrist's."""
+    """(L, 3) origins of the links' frames, whose axes are parallel to the wrist's."""
     flesh: bool
-    """Whether it is that of a human hand."""
+    """True for a human hand."""
     joint: np.ndarray
-    """(V,) bool: part of a robot's joint, which viewers draw darker."""
+    """(V,) bool: part of a robot's joint, drawn darker by viewers."""
 
     def influences(self) -> tuple[np.ndarray, np.ndarray]:
-        """The four links (V, 4) int that move each point most, and their weights (V, 4); link 0 where it is none."""
+        """Links (V, 4) int with the greatest weights of each point, and the weights (V, 4); link 0 if unused."""
         links = np.argsort(-self.weights, 1, kind="stable")[:, :4]
         if links.shape[1] < 4:
             links = np.pad(links, ((0, 0), (0, 4 - links.shape[1])))
@@ -51,7 +51,7 @@ class Skin(NamedTuple):
         return np.where(weights > 0, links, 0), weights
 
     def posed(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (V, 3) and unit normals (V, 3) with the links' frames at (L, 3), turned by matrices (L, 3, 3)."""
+        """Points (V, 3) and unit normals (V, 3) for link frames at (L, 3) with rotations (L, 3, 3)."""
         matrices = np.concatenate(
             [rotation, (position - np.einsum("lij,lj->li", rotation, self.origins))[..., None]], -1
         )
@@ -63,13 +63,13 @@ class Skin(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def skin_of(hand: Hand) -> Skin:
-    """The surface of a hand: its file's meshes where it is one of the user's own, looked for once a process."""
+    """Returns the surface of a hand, from its file's meshes if it is a custom one; they are loaded once per process."""
     meshes = own_meshes(hand)
     return skin_of_meshes(hand, meshes) if meshes else skin_on(skeleton_of(hand))
 
 
 def skin_on(skeleton: Skeleton) -> Skin:
-    """The surface of the hand with this skeleton."""
+    """Returns the surface of the hand with this skeleton."""
     human = skeleton.hand in HUMAN_HANDS and _anatomical(skeleton)
     if human:
         surface = flesh(skeleton)
@@ -88,7 +88,7 @@ def skin_on(skeleton: Skeleton) -> Skin:
 
 
 def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
-    """A surface of links' meshes, which follow one link each, and of the capsules of links that have none."""
+    """Returns a surface of the links' meshes, each rigid, and the capsules of links without a mesh."""
     parts = [
         trimesh.Trimesh(*meshes[link.name], process=False) if link.name in meshes else _rounded(link)
         for link in hand.links
@@ -96,7 +96,7 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
     counts = [len(part.vertices) for part in parts]
     starts = np.cumsum([0, *counts[:-1]])
     normals = np.concatenate([part.vertex_normals for part in parts]).astype(np.float32)
-    normals[~normals.any(1)] = 0.0, 0.0, 1.0  # points of no face, or whose faces lie back to back
+    normals[~normals.any(1)] = 0.0, 0.0, 1.0  # points without faces, or with faces back to back
     return Skin(
         points=np.concatenate([part.vertices for part in parts]).astype(np.float32),
         normals=normals,
@@ -109,7 +109,7 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
 
 
 def _rounded(link: Link) -> trimesh.Trimesh:
-    """A link's capsules, in the wrist frame at zero."""
+    """Returns a mesh of a link's capsules, in the wrist frame at zero."""
     parts = []
     for capsule in link.capsules:
         way = np.subtract(capsule.end, capsule.start)
@@ -123,7 +123,7 @@ def _rounded(link: Link) -> trimesh.Trimesh:
 
 
 def _anatomical(skeleton: Skeleton) -> bool:
-    """Whether there is a palm with a thumb and other fingers, each link with a capsule, of a hand's size."""
+    """True for a palm with a thumb and other fingers, with a capsule on each link, of a hand's size."""
     chains, with_capsule = skeleton.chains(), set(skeleton.capsule_link.tolist())
     return (
         len(chains) > 2
@@ -135,7 +135,7 @@ def _anatomical(skeleton: Skeleton) -> bool:
 
 
 def _housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
-    """A bevelled housing around every capsule, a drum at every joint, and (V,) bool what is a joint's."""
+    """Returns a bevelled housing around every capsule, a drum at every joint, and a mask (V,) of the joints' points."""
     parts, links, joints = [], [], []
     for (start, end), radius, link in zip(skeleton.capsules, skeleton.radii, skeleton.capsule_link, strict=True):
         parts.append(_bevelled(start, end, radius, radius))
@@ -157,7 +157,7 @@ def _housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
 
 
 def _bevelled(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -> tuple[np.ndarray, ...]:
-    """Points, normals and faces of a cylinder with bevelled ends that reaches beyond both points (3,)."""
+    """Points, normals and faces of a cylinder with bevelled ends that extends beyond both points (3,)."""
     length, bevel = float(np.linalg.norm(end - start)), _BEVEL * min(radius, reach)
     outline = [
         (0.0, -reach),
@@ -175,7 +175,7 @@ def _bevelled(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -
         turn = trimesh.geometry.align_vectors([0, 0, 1], (end - start) / length)[:3, :3]
     angles = 2 * np.pi * np.arange(_SECTIONS) / _SECTIONS
     around = np.stack([np.cos(angles), np.sin(angles)], -1)
-    for (r0, z0), (r1, z1) in itertools.pairwise(outline):  # each strip has points of its own: sharp edges
+    for (r0, z0), (r1, z1) in itertools.pairwise(outline):  # separate points for each strip give sharp edges
         out = np.array([z1 - z0, r0 - r1]) / np.hypot(z1 - z0, r0 - r1)
         first = _SECTIONS * len(points)
         for r, z in ((r0, z0), (r1, z1)):

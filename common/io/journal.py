@@ -1,7 +1,7 @@
-"""Append-only journals of JSON lines, by which what several processes did can be compared afterwards.
+"""Append-only journals of JSON lines, for comparing afterwards what several processes did.
 
-Every line is one write to the operating system, so that it survives the death of its process. It ends with the CRC-32
-of what comes before, as the field `crc32`. A line that was cut or changed is left out when reading, and counted.
+Every line is one write to the operating system, so it survives the death of its process. It ends with the CRC-32 of the
+preceding text as the field `crc32`. Readers skip lines that were cut or changed, and count them.
 """
 
 import json
@@ -15,23 +15,23 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import open_file
 
 AUDIT = "audit"
-"""Folder of a run directory where its journals are."""
+"""Folder of the journals in a run directory."""
 MAX_NUMBER = 1 << 53
-"""Integers from here on, which JSON readers do not keep exactly, are in no journal."""
+"""Journals hold no integers from here on, since JSON readers do not represent them exactly."""
 _CHECK = ', "crc32": "{:08x}"}}\n'
 _CHECK_BYTES = len(_CHECK.format(0))
 _MAX_LINE = 1 << 22
 
 
 class Journal:
-    """A journal that is being written; safe to use from several threads."""
+    """A journal opened for writing; thread-safe."""
 
     def __init__(self, path: pathlib.Path, warn: Callable[[str], None] = lambda text: None):
-        """Opens a journal, or goes on with one.
+        """Opens a journal, appending to an existing file.
 
         Args:
-          path: the file; its folder is made.
-          warn: called with one line when lines cannot be written; the process goes on without them.
+          path: the file; its folder is created if needed.
+          warn: called with one line when lines cannot be written; the process continues without them.
 
         Raises:
           CongraspError: the file cannot be opened.
@@ -47,7 +47,7 @@ class Journal:
         self._lost, self._refused = int(self._cut), False
 
     def write(self, **entry: Any) -> None:
-        """Adds a line; one that the disk refuses is counted in the next that it takes, as `lost`."""
+        """Appends a line; lines that the disk refuses are counted in the next written one, as `lost`."""
         with self._lock:
             lost = {"lost": self._lost} if self._lost else {}
             line = b"\n" * self._cut + _line({**entry, **lost})
@@ -57,7 +57,7 @@ class Journal:
             except OSError as error:
                 self._cut, reason = True, error.strerror or str(error)
             if reason and not self._refused:
-                self._warn(f"{self._path} could not be written ({reason}); what happens meanwhile is not in it.")
+                self._warn(f"{self._path} could not be written ({reason}). Events meanwhile are missing from it.")
             self._refused = bool(reason)
             self._lost = self._lost + 1 if reason else 0
 
@@ -68,16 +68,16 @@ class Journal:
 
 
 class JournalLines(NamedTuple):
-    """What a journal holds."""
+    """Content of a journal."""
 
     entries: list[dict[str, Any] | None]
-    """The intact lines in their order; None stands where damaged ones were."""
+    """Intact lines in order; None marks damaged ones."""
     lost: int
     """Lines that are missing because the disk was full, or that were cut at the end."""
     damaged: int
-    """Lines that are not what was written."""
+    """Lines that were changed after they were written."""
     unchecked: int
-    """Lines before the first with a checksum: older versions of congrasp wrote none."""
+    """Lines before the first checksum: older versions of congrasp wrote none."""
 
     @property
     def intact(self) -> list[dict[str, Any]]:
@@ -86,11 +86,11 @@ class JournalLines(NamedTuple):
 
 
 def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] = lambda entry: True) -> JournalLines:
-    """Reads a journal, whatever is in the file.
+    """Reads a journal of arbitrary content.
 
     Args:
       path: the file.
-      is_entry: whether a line is one of this kind of journal; others are damaged.
+      is_entry: predicate for valid lines of this kind of journal; others count as damaged.
 
     Raises:
       CongraspError: the file cannot be read.
@@ -111,7 +111,7 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
                     continue
                 checked |= check
                 unchecked += not check
-                # The disk took a part of the first line that it refused: `lost` counts that one, too.
+                # The disk took a part of the first line that it refused: `lost` counts that line as well.
                 refused = min(number(entry.pop("lost", 0)), MAX_NUMBER)
                 lost, damaged, run = lost + refused, damaged + max(0, run - bool(refused)), 0
                 entries.append(entry)
@@ -122,29 +122,29 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
 
 
 def number(value: Any) -> int:
-    """A value as it is if it is a count; 0 for everything else."""
+    """Returns the value if it is a count, else 0."""
     return value if type(value) is int and 0 <= value < MAX_NUMBER else 0
 
 
 def has_fields(entry: dict[str, Any], **types: type) -> bool:
-    """Whether an entry has these fields, of these types; integers only below `MAX_NUMBER`."""
+    """True if an entry has these fields with these types; integers only below `MAX_NUMBER`."""
     return all(is_value(entry.get(name), kind) for name, kind in types.items())
 
 
 def is_rows(value: Any, *types: type) -> bool:
-    """Whether a value is a list of rows whose columns have these types."""
+    """True if a value is a list of rows whose columns have these types."""
     return isinstance(value, list) and all(
         isinstance(row, list) and len(row) == len(types) and all(map(is_value, row, types)) for row in value
     )
 
 
 def is_value(value: Any, kind: type) -> bool:
-    """Whether a value of a JSON line is of a type; integers only below `MAX_NUMBER`."""
+    """True if a value of a JSON line has the type; integers only below `MAX_NUMBER`."""
     return type(value) is kind and not (isinstance(value, int) and abs(value) >= MAX_NUMBER)
 
 
 def _is_cut(path: pathlib.Path) -> bool:
-    """Whether a journal ends within a line: its writer was killed in it, or the disk took a part of it."""
+    """True if a journal ends within a line: its writer was killed, or the disk took only a part of it."""
     if not path.exists():
         return False
     with open_file(path) as file:
@@ -159,7 +159,7 @@ def _line(entry: dict[str, Any]) -> bytes:
 
 
 def _parse(line: bytes) -> tuple[dict[str, Any] | None, bool]:
-    """A line's entry, None if it is none or its checksum is another; and whether it has a checksum."""
+    """Returns a line's entry (None if it is invalid or its checksum differs) and whether it has a checksum."""
     try:
         entry = json.loads(line)
     except (ValueError, RecursionError):

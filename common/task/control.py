@@ -1,4 +1,4 @@
-"""From actions to joint targets: incremental fingers and feed-forward wrist guidance (paper, section Control Space)."""
+"""Decodes actions to joint targets: incremental fingers and guided wrist (paper, section Control Space)."""
 
 from typing import NamedTuple
 
@@ -33,7 +33,7 @@ jax.tree_util.register_dataclass(
 
 
 def guidance_pose(scene: Scene, control: ControlConfig) -> tuple[Array, Array]:
-    """World wrist pose T^g (B, 3), (B, 4) of the highest active wrist constraint."""
+    """World wrist pose T^g (B, 3), (B, 4) of the strongest active wrist constraint."""
     pose: tuple[Array, Array] | None = None
     for constraint in known(scene.task):
         if not constraint.guides:
@@ -44,16 +44,16 @@ def guidance_pose(scene: Scene, control: ControlConfig) -> tuple[Array, Array]:
         else:
             active = scene.goal.active[constraint.guides][:, None]
             pose = jnp.where(active, own[0], pose[0]), jnp.where(active, own[1], pose[1])
-    assert pose is not None, "the heading guides where nothing else does"
+    assert pose is not None, "the heading guides if nothing else does"
     return pose
 
 
 def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
-    """Joint targets of a residual action (B, M + 6), of the M finger motors and the wrist.
+    """Returns joint targets for a residual action (B, M + 6) of the M finger motors and the wrist.
 
-    m_tgt = clamp(m_tgt_prev + alpha_f a_f, limits) of the motors, which put joints at q_tgt; u_tgt = u_g + alpha_w a_w,
-    nearer to the wrist where it would else become faster or be accelerated harder than the limits allow (`_lead`). When
-    the table is gone, u_tgt also leads by what carries the load (`wrist_load`), around which the limits then hold.
+    Motors: m_tgt = clamp(m_tgt_prev + alpha_f a_f, limits), which gives q_tgt of the joints. Wrist: u_tgt = u_g +
+    alpha_w a_w, moved closer to the wrist if it would exceed the limits of speed or acceleration (`_lead`). After the
+    table is removed, u_tgt also compensates the load (`wrist_load`), and the limits apply relative to that.
     """
     hand, state = scene.hand, scene.state
     fingers = len(hand.motors)
@@ -66,10 +66,11 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
 
 
 def _position_limit(scene: Scene, control: ControlConfig) -> Array:
-    """(B,) m, the farthest that the wrist's target is ahead of it.
+    """Greatest distance (B,) of the wrist's target from the wrist, m.
 
-    `guidance_position_limit`; while the table is there it rises from `closing_position_limit` at `closing_distance`
-    from the object to `approach_position_limit` at twice that, so that the hand arrives slowly.
+    The limit is `guidance_position_limit`. While the table is present it is lower near the object, so that the hand
+    arrives slowly: it rises from `closing_position_limit` at `closing_distance` from the object to
+    `approach_position_limit` at twice that.
     """
     gap = jnp.min(jnp.linalg.norm(scene.features.nearest, axis=-1), -1)
     slow, fast = control.closing_position_limit, control.approach_position_limit
@@ -78,38 +79,38 @@ def _position_limit(scene: Scene, control: ControlConfig) -> Array:
 
 
 class Guided(NamedTuple):
-    """What the lead of a wrist's target follows from, beside the action."""
+    """Guidance and state of the wrist, from which its target follows together with the action."""
 
     ahead: Array
-    """(..., 6) m and rad from the wrist to its guidance."""
+    """(..., 6) displacement from the wrist to its guidance, m and rad."""
     limit: Array
-    """(...,) m, the farthest that the target is ahead of the wrist."""
+    """(...,) greatest distance of the target from the wrist, m."""
     velocity: Array
-    """(..., 6) of the wrist joints, m/s and rad/s."""
+    """(..., 6) speeds of the wrist joints, m/s and rad/s."""
     table: Array
-    """(...,) bool: the table is there."""
+    """(...,) bool: the table is present."""
 
     def bounded(self, control: ControlConfig) -> Array:
-        """(..., 6) the lead of the guidance alone, before the limits of acceleration."""
+        """Returns the lead (..., 6) of the guidance alone, before the limits of acceleration."""
         slides = _limit(self.ahead[..., :3], self.limit[..., None])
         return jnp.concatenate([slides, _limit(self.ahead[..., 3:], control.guidance_rotation_limit)], -1)
 
 
 def guided(scene: Scene, control: ControlConfig) -> Guided:
-    """Guidance of the wrist in a scene."""
+    """Returns the guidance of the wrist in a scene."""
     state = scene.state
     ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
     return Guided(ahead, _position_limit(scene, control), state.u_velocity, state.table)
 
 
 def wrist_lead(hand: Hand, control: ControlConfig, given: Guided, residual: Array) -> Array:
-    """u_tgt - u (..., 6) without what carries the load; see `decode`.
+    """Returns u_tgt - u (..., 6) without the part that carries the load, see `decode`.
 
     Args:
-      hand: its servos.
+      hand: the hand, for its servos.
       control: limits and scales.
-      given: the guidance.
-      residual: (..., 6) the wrist's part of the action.
+      given: guidance and state of the wrist.
+      residual: (..., 6) wrist part of the action.
     """
     share = jnp.where(given.table, 1.0, control.hold_acceleration)
     leads = []
@@ -137,16 +138,17 @@ def carried_lead(hand: Hand, state: SceneState) -> Array:
 
 
 def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array, u_target: Array) -> Array:
-    """Momentum z (B, 6) of the load observer after a control step, m/s and rad/s; zero when an episode begins.
+    """Updates the load observer's momentum z (B, 6) after a control step, m/s and rad/s; initially zero.
 
-    With w = v + damping u, the servos' law is dw/dt = stiffness (u_tgt - u) + d, where d is what everything else
-    gives the wrist. The observer integrates dz/dt = stiffness (u_tgt - u) + rate (w - z), so that rate (w - z) is d
-    behind a low-pass of time constant 1 / rate (De Luca and Mattone 2003, doi 10.1109/ROBOT.2003.1241662). In discrete
-    time the servos act on the mean of u over the step (trapezoidal rule), which changes w alone (`_generalised_speed`).
+    With w = v + damping u, the servos' law is dw/dt = stiffness (u_tgt - u) + d, where d is the acceleration of the
+    wrist by everything else. The observer integrates dz/dt = stiffness (u_tgt - u) + rate (w - z), so that rate (w - z)
+    is d after a low-pass filter of time constant 1 / rate (De Luca and Mattone 2003, doi 10.1109/ROBOT.2003.1241662).
+    In discrete time the servos act on the mean of u over the step (trapezoidal rule), which only changes w
+    (`_generalised_speed`).
 
     Args:
-      hand: its servos.
-      task: length of a control step, and the rate.
+      hand: the hand, for its servos.
+      task: the task, for the length of a control step and the rate.
       momentum: (B, 6) z before the step.
       u: (B, 6) wrist joints after the step.
       u_velocity: (B, 6).
@@ -159,41 +161,41 @@ def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_veloci
 
 
 def wrist_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array) -> Array:
-    """d (B, 6), m/s^2 and rad/s^2, that everything but its servos gives the wrist; see `track_load`."""
+    """Acceleration d (B, 6) of the wrist by everything but its servos, m/s^2 and rad/s^2; see `track_load`."""
     return task.control.load_rate * (_generalised_speed(hand, task, u, u_velocity) - momentum)
 
 
 def _generalised_speed(hand: Hand, task: TaskConfig, u: Array, u_velocity: Array) -> Array:
-    """w (B, 6) of `track_load`: with steps of dt, v + (damping - stiffness dt / 2) u."""
+    """Speed w (B, 6) of `track_load`: with steps of dt, v + (damping - stiffness dt / 2) u."""
     stiffness, damping = hand.wrist_servos
     return u_velocity + (damping - 0.5 * task.control_dt * stiffness) * u
 
 
 class _Servo(NamedTuple):
-    """Three wrist joints' servos: a = stiffness (target - u) - damping v."""
+    """Servos of three wrist joints: a = stiffness (target - u) - damping v."""
 
     stiffness: Array | float
     """kp / m, 1/s^2."""
     damping: Array | float
     """kv / m, 1/s."""
     farthest: Array | float
-    """Greatest lead (..., 1) of the target, m or rad."""
+    """Greatest lead (..., 1) of the target over the joint, m or rad."""
     hardest: float
-    """Greatest acceleration, m/s^2 or rad/s^2; 0 for any."""
+    """Greatest acceleration, m/s^2 or rad/s^2; 0 for no limit."""
 
 
 def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: Array) -> Array:
-    """How far (..., 3) the target is ahead of three wrist joints.
+    """Lead (..., 3) of the target over three wrist joints.
 
-    At a target that is damping v / stiffness ahead a joint goes on at its speed; one r from there accelerates it by
-    stiffness r. By v stiffness / damping it comes to rest along its guidance, however small the share.
+    A target that leads by damping v / stiffness keeps a joint's speed; one r from there accelerates it by stiffness r.
+    Braking along the guidance may use v stiffness / damping, however small the share is.
 
     Args:
-      servo: of the joints.
-      ahead: (..., 3) how far the guidance is ahead.
-      residual: (..., 3) what the action adds.
-      velocity: (..., 3) of the joints.
-      share: (...,) of the greatest acceleration, for all but coming to rest.
+      servo: servos of the joints.
+      ahead: (..., 3) displacement from the joints to the guidance.
+      residual: (..., 3) displacement added by the action.
+      velocity: (..., 3) speeds of the joints.
+      share: (...,) share of the greatest acceleration, except for braking.
     """
     rate, hardest = servo.stiffness / servo.damping, jnp.asarray(servo.hardest)
     steady = velocity / rate
@@ -204,13 +206,13 @@ def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: 
 
 
 def _finger_guidance(scene: Scene, rate: float) -> Array:
-    """(B, M) rad by which motors go on to the closed hand, at most `rate`, once half the approach is over."""
+    """(B, M) rad by which motors move towards the closed hand, at most `rate`, from the middle of the approach on."""
     begun = 2.0 * scene.state.time >= scene.task.approach_steps
     ahead = motor_positions(scene.hand, jnp.array(scene.hand.q_closed) - scene.state.q_target)
     return begun[:, None] * jnp.clip(ahead, -rate, rate)
 
 
 def _limit(vector: Array, length: Array | float) -> Array:
-    """Vectors (..., 3) shortened to at most `length`."""
+    """Vectors (..., 3) scaled down to a norm of at most `length`."""
     norm = jnp.sqrt(jnp.sum(vector**2, -1, keepdims=True) + 1e-12)
     return vector * jnp.minimum(1.0, length / norm)

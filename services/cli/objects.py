@@ -242,7 +242,7 @@ def _reach(obj: "GraspObject", headings: "Headings | None", *, region: bool = Fa
         return ["none"] * len(obj.rest_poses)
     texts = []
     avoid = obj.non_graspable_points if region else None
-    found = within_reach(headings, obj.points, obj.rest_poses, outline(HUMAN), avoid)
+    found = within_reach(headings, obj, obj.rest_poses, outline(HUMAN), avoid)
     for pose, cleared, reachable in zip(obj.rest_poses, *found, strict=True):
         texts.append(f"{reachable.mean():.0%} ({(reachable & above(cleared, pose)).mean():.0%} from above)")
     return texts

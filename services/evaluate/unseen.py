@@ -1,8 +1,8 @@
-"""The test on unseen geometry: the heading constraint over as many different objects as there is time for.
+"""Test on unseen geometry: the heading constraint over many different objects.
 
-Objects come in pools of equal size. While the episodes of one are simulated the next is made or imported, with its
-constraints; no program is compiled for it, and only these two are in memory. What stays of a pool is a few numbers an
-episode, which can be kept on disk, so that a stopped evaluation goes on with the pool that it had come to.
+Objects come in pools of equal size. While the episodes of one are simulated, the next is generated or imported with its
+constraints, without compilation; only these two are in memory. The result of a pool is a few numbers per episode, which
+can be stored on disk, so that a stopped evaluation resumes at its current pool.
 """
 
 import concurrent.futures
@@ -45,9 +45,9 @@ from congrasp.services.evaluate.scores import Row, Sample, joined, object_groups
 
 _ROW = "heading"
 _MOST = {True: 4096, False: 128}
-"""Objects of a pool, for engines on a device and for others; each has a compiled scene in the latter."""
+"""Objects of a pool, for engines on a device and for others, which compile a scene for each."""
 _MESHES = 512
-"""Objects of a pool of a folder, whose surfaces may be large."""
+"""Objects of a pool from a folder, whose surfaces may be large."""
 _log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
 
@@ -60,17 +60,17 @@ class Loaded(NamedTuple):
 
 
 class Pools(NamedTuple):
-    """Objects that are made pool by pool."""
+    """Objects that are loaded in pools."""
 
     source: str
-    """What they are, as far as results depend on it."""
+    """Description of the objects, for the identity of results."""
     size: int
     """Objects of a pool; the last pools may have one less."""
     make: list[Callable[[], Loaded]]
 
 
 def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
-    """At least `count` procedural objects of an exam, in pools of one size."""
+    """Returns at least `count` procedural objects of an evaluation set, in pools of one size."""
     number, size = _divided(count, _MOST[ENGINES[physics].on_device])
     seed = first_seed(exam, number * size)
     families = procedural.family_turns(number * size, seed, FAMILIES)
@@ -84,7 +84,7 @@ def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
 
 
 def folder_pools(path: pathlib.Path, physics: PhysicsName) -> Pools:
-    """The objects of a path; meshes are imported when their turn comes, and those that cannot be are left out."""
+    """Returns the objects of a path; meshes are imported when needed, and those that cannot be are skipped."""
     found = objects_at(path)
     number, size = _divided(len(found), min(_MOST[ENGINES[physics].on_device], _MESHES))
 
@@ -92,7 +92,7 @@ def folder_pools(path: pathlib.Path, physics: PhysicsName) -> Pools:
         left_out: list[str] = []
 
         def leave_out(one: ObjectAt, error: CongraspError) -> None:
-            _log.warning("%s is left out: %s", one.name, error)
+            _log.warning("%s is skipped: %s", one.name, error)
             left_out.append(one.name)
 
         return Loaded(load_each(part, on_error=leave_out), left_out)
@@ -115,22 +115,22 @@ def evaluate_objects(
     keep: pathlib.Path | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Row]:
-    """Rows of the heading constraint: all objects, then by size, mass and family.
+    """Evaluates rows of the heading constraint: all objects, then by size, mass and family.
 
     Args:
       bundle: the policy.
-      pools: the objects.
-      episodes: in all, at least; every object has the same number of them.
-      physics: engine; not `auto`.
-      batch: worlds that run side by side; 0 chooses by the engine.
+      pools: pools of objects.
+      episodes: least total number; every object has the same number.
+      physics: engine, except `auto`.
+      batch: number of parallel worlds; 0 uses the engine's default.
       threads: threads of the `native` engine.
       seed: seed of constraints and episodes.
       friction: sliding friction between hand and object.
-      keep: folder for results of pools, from which an evaluation with the same arguments goes on; None keeps none.
-      progress: is told how many episodes there are.
+      keep: folder for results of pools, from which an evaluation with the same arguments resumes; None stores none.
+      progress: called with the number of finished episodes.
 
     Raises:
-      CongraspError: no object is left that the hand can approach.
+      CongraspError: the hand can approach none of the objects.
     """
     hold, hand, number = two_seconds(bundle.task), get_hand(bundle.spec.hand), len(pools.make)
     task = protocol(bundle.task, hold, friction)
@@ -165,20 +165,20 @@ def evaluate_objects(
 
 
 class _Pool(NamedTuple):
-    """A pool that is ready to be simulated."""
+    """A pool that is ready for simulation."""
 
     number: int
     objects: list[GraspObject]
-    """In the hand's size; those from `real` on repeat others, so that all pools have one size."""
+    """Objects scaled for the hand; those from `real` on are repetitions that pad the pool."""
     bank: ConstraintBank | None
-    """None where no object is left."""
+    """None if no object remains."""
     field: DistanceField | None
     real: int
     left_out: list[str]
 
 
 class _Result(NamedTuple):
-    """What is kept of a pool: its episodes, and of each object its name, largest side (m), mass (kg) and family."""
+    """Result of a pool: its episodes, and name, largest side (m), mass (kg) and family of each object."""
 
     sample: Sample
     names: list[str]
@@ -194,19 +194,19 @@ class _Result(NamedTuple):
 
 
 def _nothing(left_out: list[str]) -> _Result:
-    """The result of a pool of which no object is left."""
+    """Returns the result of a pool without objects."""
     return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], np.zeros((0, 2)), [], left_out)
 
 
 def _divided(count: int, most: int) -> tuple[int, int]:
-    """Number of pools and their size, for so many objects, of which a pool has at most `most`."""
+    """Number and size of pools for `count` objects, at most `most` in each."""
     number = -(-count // most)
     return number, -(-count // number)
 
 
 @contextlib.contextmanager
 def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
-    """The same items, each made in a thread while the one before it is in use."""
+    """Yields the same items, each computed in a thread while the previous one is in use."""
     with concurrent.futures.ThreadPoolExecutor(1) as background:
 
         def taken() -> Iterator[_Item]:
@@ -221,7 +221,7 @@ def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
 def _prepared(
     hand: Hand, task: TaskConfig, pools: Pools, seed: int, wanted: Sequence[int], measured: bool
 ) -> Iterator[_Pool]:
-    """Pools with their constraints."""
+    """Yields pools with their constraints."""
     for number in wanted:
         loaded, left_out = pools.make[number]()
         objects = scale_objects(hand, task, loaded)
@@ -233,14 +233,14 @@ def _prepared(
 
 
 def _filled(objects: Sequence[GraspObject], size: int) -> list[GraspObject]:
-    """So many objects, the first ones again where there are fewer."""
+    """Pads objects to `size` by repeating the first ones."""
     return list(itertools.islice(itertools.cycle(objects), size))
 
 
 def _with_bank(
     hand: Hand, task: TaskConfig, objects: list[GraspObject], size: int, seed: int
 ) -> tuple[list[GraspObject], ConstraintBank | None]:
-    """Those objects that the hand can approach in some resting pose, and the bank of `size` of them (`_filled`)."""
+    """Returns the objects that the hand can approach in some resting pose, and a bank of `size` of them (`_filled`)."""
     while objects:
         filled = _filled(objects, size)
         try:
@@ -276,7 +276,7 @@ def _simulated(
     progress: Callable[[int], None],
     stressed: int,
 ) -> _Result:
-    """The episodes of a pool."""
+    """Simulates the episodes of a pool."""
     assert pool.bank is not None
     plan = plan_row(task, pool.bank, pool.objects, _ROW, each * len(pool.objects))
     conditions = batches(hand, task, pool.bank, plan, seed, running.batch)
@@ -288,16 +288,16 @@ def _simulated(
 
 
 def _without_forces(sample: Sample) -> Sample:
-    """Only the metrics: forces are read from the first pool."""
+    """Drops everything but the metrics: forces are read from the first pool."""
     return dataclasses.replace(sample, link_force=sample.link_force[:0], torque=sample.torque[:0])
 
 
 def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
-    """All objects, then groups of them."""
+    """Returns the rows of all objects, then of groups."""
     left_out = [name for result in results for name in result.left_out]
     results = [result for result in results if result.episodes]
     if not results:
-        raise CongraspError("None of the objects can be approached.", "Scale them to the hand, or name others.")
+        raise CongraspError("None of the objects can be approached.", "Scale them for the hand, or pass others.")
     firsts = np.cumsum([0, *(len(result.names) for result in results)])
     for result, first in zip(results, firsts, strict=False):
         result.sample.values["object_index"] = result.sample.values["object_index"] + first
@@ -317,12 +317,12 @@ def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
 
 
 def _file(folder: pathlib.Path, number: int) -> pathlib.Path:
-    """Where the result of a pool is kept."""
+    """Path of a pool's result."""
     return folder / f"pool-{number:05d}.safetensors"
 
 
 def _write(path: pathlib.Path, result: _Result, about: dict[str, Any]) -> None:
-    """Keeps a result beside what it depends on."""
+    """Writes a result and its identity."""
     arrays = {f"values/{name}": column for name, column in result.sample.values.items()}
     arrays |= {"link_force": result.sample.link_force, "torque": result.sample.torque, "traits": result.traits}
     lists = {"names": result.names, "families": result.families, "left_out": result.left_out}
@@ -330,7 +330,7 @@ def _write(path: pathlib.Path, result: _Result, about: dict[str, Any]) -> None:
 
 
 def _read(path: pathlib.Path, about: dict[str, Any]) -> _Result | None:
-    """A kept result of the same arguments, if there is one and it is whole."""
+    """Reads a result with the same arguments; returns None if it is missing or damaged."""
     try:
         message = decode(read_file(path, MAX_MESSAGE))
         if message.meta["about"] != json.dumps(about):

@@ -41,7 +41,7 @@ def headings(
             else "Leave out --heading and --at, or make the graspable part larger.",
         )
     options, weights = [], []
-    for r, (cleared, room) in enumerate(zip(*within_reach(found, obj.points, obj.rest_poses, own), strict=True)):
+    for r, (cleared, room) in enumerate(zip(*within_reach(found, obj, obj.rest_poses, own), strict=True)):
         if request.rest not in (None, r):
             continue
         if request.above:

@@ -1,4 +1,4 @@
-"""The policy in this process: what a server answers, without one."""
+"""Policy in this process: the answers of a server without a server."""
 
 import os
 import time
@@ -19,10 +19,10 @@ class LocalPolicy(EpisodePolicy):
     """The `Policy` of a bundle."""
 
     def __init__(self, bundle: PolicyBundle):
-        """Compiles `act`, so that no control step waits for it; `act_each` follows at its first call.
+        """Compiles `act`, so that no control step waits for it; `act_each` is compiled at its first call.
 
         Args:
-          bundle: the policy, which names the hand.
+          bundle: the policy, which determines the hand.
         """
         super().__init__()
         self._bundle = bundle
@@ -34,7 +34,7 @@ class LocalPolicy(EpisodePolicy):
         return self._function.metadata()
 
     def _query(self, query: Message) -> Message:
-        """The reply of a server with this bundle."""
+        """Returns the reply of a server with this bundle."""
         began = time.perf_counter()
         try:
             parsed = self._function.layout.parse(query)
@@ -48,7 +48,7 @@ class LocalPolicy(EpisodePolicy):
 
 
 def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:
-    """The policy of a file, or the pretrained one of a hand, in this process.
+    """Loads the policy of a file, or the pretrained one of a hand, in this process.
 
     Args:
       policy: a policy file (`policy.safetensors` in a run's folder), or the name of a hand.

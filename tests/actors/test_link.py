@@ -290,9 +290,9 @@ def test_learner_that_talks_nonsense_ends_the_link(ends):
     learner, link = Learner(hub), make()
     link.config(5)
     learner.reply = lambda **meta: Message(meta={"hello": 1})
-    with pytest.raises(CongraspError, match="cannot be understood"):
+    with pytest.raises(CongraspError, match="is not valid"):
         link.upload(rollout(), TICKET).result(5)
-    with pytest.raises(CongraspError, match="cannot be understood"):
+    with pytest.raises(CongraspError, match="is not valid"):
         link.acquire_ticket(1)
 
 

@@ -88,7 +88,7 @@ def test_bad_array_is_named_with_its_rule(arrays, match):
     ("meta", "match"),
     [
         ({"sequence": -1}, "counts"),
-        ({"version": 10**20}, "counts"),
+        ({"version": 10**20}, "too large for a count"),
         ({"sequence": "0"}, "'sequence' is '0', not int"),
         ({"sequence": True}, "'sequence' is True, not int"),
         ({"version": 1.0}, "'version' is 1.0, not int"),

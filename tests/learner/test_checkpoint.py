@@ -117,7 +117,9 @@ def test_a_checkpoint_of_a_version_with_another_optimiser_is_one_line(tmp_path):
     before = {**state._asdict(), "optimizer": adam[0], "learning_rate": jnp.float32(1e-3)}
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(before, {}, 1)
-    with pytest.raises(CongraspError, match=r"'optimizer/.*' is missing .*and the version of congrasp, that") as caught:
+    with pytest.raises(
+        CongraspError, match=r"'optimizer/.*' is missing .*configuration and version of congrasp"
+    ) as caught:
         checkpoints.load(state)
     assert "\n" not in str(caught.value)
 

@@ -301,7 +301,7 @@ def test_values_beyond_the_task_are_refused_with_the_range(bench):
         "action": (np.full((T, B, A), -3e38, np.float32), r"'action' holds -3e\+38"),
         "log_probability": (np.full((T, B), 100, np.float32), "'log_probability' holds 100"),
         "episode/success": (np.full(1, 1.5, np.float32), "'episode/success' holds 1.5"),
-        "episode/made_up": (np.ones(1, np.float32), "'episode/made_up', which is no metric"),
+        "episode/made_up": (np.ones(1, np.float32), "'episode/made_up', which is not a metric"),
     }
     for number, (name, (array, why)) in enumerate(beyond.items()):
         good = rollout(0, actor=f"{number}.x")
@@ -638,7 +638,7 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     resumed = bench(log=log(), on_event=lambda *event: said.append(event))
     resumed.hub.publish_weights(bundle(1), 1)
     assert sequences(resumed.hub.next_batch(2, 1)) == [0, 3]
-    assert ("error", "3 accepted rollouts are damaged on disk, and left out.") in said
+    assert ("error", "3 accepted rollouts are damaged on disk and were ignored.") in said
     kinds = sorted(path.suffix for path in folder.iterdir())
     assert kinds == [".aside", ".aside", ".aside", ".safetensors", ".safetensors", ".txt"]
     other = bench(log=log(), run_id="f")

@@ -73,7 +73,7 @@ def test_lost_duplicated_corrupted_and_unmatched(run_dir, capsys):
         {"version": 4, "used": [["a", "1", 77, 0, "c"]]}, {"end": [["a", "1", 5]]},
     )  # fmt: skip
     assert faults(run_dir) == {"lost": 1, "duplicated": 1, "corrupted": 1, "unmatched": 1, "waiting": 1}
-    assert "a/1/3: accepted, and never seen again" in audit(run_dir).faults
+    assert "a/1/3: accepted, but missing afterwards" in audit(run_dir).faults
     assert command(run_dir) == 1 and "a/1/3" in capsys.readouterr().out
 
 

@@ -99,10 +99,10 @@ def test_counters_that_do_not_add_up_are_named(endpoint):
     lost = copy.deepcopy(found)
     lost["ledger"]["accepted"] += 1
     (words,) = warnings(lost)
-    assert words == "The counters do not add up: accepted 2 is not consumed 0 + dropped 0 + queued 1."
+    assert words == "The counters are inconsistent: accepted 2 is not consumed 0 + dropped 0 + queued 1."
     lost["ledger"]["queued"] += 1
     (words,) = warnings(lost)
-    assert words == "2 rollouts are counted as queued; the queue holds 1."
+    assert words == "2 rollouts are counted as queued, but the queue holds 1."
 
 
 @pytest.mark.timeout(60)
@@ -133,7 +133,7 @@ def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_marku
     console.print(tables({**found, "roles": [named] * 150}))
     text = console.file.getvalue()
     assert "[red]" in text and "\x1b" not in text and "refused" in text and len(text) < 50_000
-    assert f"{50 + found['unlisted']} more process(es)" in text
+    assert f"{50 + found['unlisted']} more live process(es)" in text
 
 
 def ask_with_tokens(endpoint, count):

@@ -98,7 +98,7 @@ def test_what_is_no_motion_is_named(tmp_path):
     with pytest.raises(CongraspError, match="cannot be read: No such file"):
         load_motion(path)
     path.write_bytes(b"PK nothing")
-    with pytest.raises(CongraspError, match=r"not a grasp motion \(it is no NPZ file, or was cut\)"):
+    with pytest.raises(CongraspError, match=r"not a grasp motion \(it is not an NPZ file, or was cut\)"):
         load_motion(path)
     np.savez(path, a=np.zeros(3))
     with pytest.raises(CongraspError, match="not a grasp motion"):

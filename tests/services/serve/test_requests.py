@@ -145,7 +145,7 @@ def test_a_packed_query_is_the_vector_of_the_named_one():
         Message({"packed": vector[None], "q": np.zeros(20)}, meta),
         Message({"packed": vector[None]}, {"constraints": ["heading"]}),
     ):
-        with pytest.raises(CongraspError, match="does not follow the policy's layout"):
+        with pytest.raises(CongraspError, match="does not match the policy's layout"):
             LAYOUT.parse(wrong)
 
 

@@ -254,7 +254,7 @@ def test_a_busy_port_and_an_open_interface_are_refused_in_one_line(
     with pytest.raises(CongraspError, match="--port"):
         PageServer({}, {}, "127.0.0.1", page.port)
     for arguments, says in (
-        (["--host", "0.0.0.0"], "could be reached from other machines"),
+        (["--host", "0.0.0.0"], "would be reachable from other machines"),
         (["--policy", "a.safetensors", "--connect", "tcp/127.0.0.1:1"], "Give one of --policy and --connect"),
         (["--policy", "nowhere.safetensors"], "nowhere.safetensors"),
         (["--objects", "/nowhere"], "/nowhere"),

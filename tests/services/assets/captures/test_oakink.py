@@ -205,7 +205,7 @@ def test_a_file_that_would_run_something_is_not_unpickled(run_import, tmp_path):
     write(case, tmp_path, cameras=(0,), change=lambda frame, info: info | {"obj_anno": Hostile()})
     _, report = run_import("oakink", tmp_path, code=2)
     assert report.dropped[0]["rule"] == "unreadable"
-    assert "stands for no array" in report.dropped[0]["reason"]
+    assert "is not part of an array" in report.dropped[0]["reason"]
     assert not (tmp_path / "it ran").exists()
 
 
