@@ -1,4 +1,4 @@
-"""Where an object rests, by the mean of a tracker's readings; for NumPy and JAX, and without either."""
+"""Resting pose of an object: the mean of a tracker's readings; imports neither NumPy nor JAX."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ Array = Any
 def resting_mean(
     xp: Any, mean: Array, count: Array, reading: Array, table: Array, settle: float
 ) -> tuple[Array, Array]:
-    """The running mean of an object's readings while it rests: on the table, and no reading far from the mean.
+    """Adds a reading to the mean of an object's readings while it rests: on the table, with no reading far from the mean.
 
     Args:
       xp: numpy or jax.numpy.

@@ -1,8 +1,8 @@
-"""What a teacher is asked with, and its action in the terms of a student that sees another state.
+"""Inputs of a teacher, and its actions converted to those of a student that observes another state.
 
-A residual is relative to the guidance that its policy has. Where a student's guidance is another, because a tracker is
-off, the teacher's residual would put its wrist elsewhere. What the two share is the wrist's target: the student's label
-is (u_tgt - u_g) / alpha_w with the teacher's target u_tgt and the student's own guidance u_g.
+A residual is relative to the guidance of its policy. A student's guidance differs if its tracker has errors, so that the
+teacher's residual would move its wrist to another place. Both share the wrist's target: the student's label is
+(u_tgt - u_g) / alpha_w with the teacher's target u_tgt and the student's guidance u_g.
 """
 
 import jax.numpy as jnp
@@ -15,15 +15,15 @@ from congrasp.common.task.observation import observe
 from congrasp.common.task.types import Array
 
 EXTRA = 20
-"""Numbers beside the observation: the teacher's `Guided`, then the student's lead by its guidance alone."""
+"""Numbers after the observation: the teacher's `Guided`, then the lead of the student's guidance alone."""
 
 
 def observe_for_teacher(true: Scene, seen: Scene, control: ControlConfig) -> Array:
-    """(B, S) the full observation of the true state, then `EXTRA` numbers.
+    """Returns the full observation of the true state and `EXTRA` numbers (B, S).
 
     Args:
-      true: the scene as a policy sees it that sees all.
-      seen: the same control step as the student sees it.
+      true: the true scene.
+      seen: the scene of the same control step as the student observes it.
       control: limits and scales.
     """
     teacher = guided(true, control)
@@ -33,13 +33,13 @@ def observe_for_teacher(true: Scene, seen: Scene, control: ControlConfig) -> Arr
 
 
 def student_action(hand: Hand, control: ControlConfig, rows: Array, action: Array) -> Array:
-    """The action (..., M + 6) by which a student has the targets that a teacher's action gives.
+    """Returns the action (..., M + 6) that gives a student the targets of its teacher.
 
     Args:
-      hand: its servos.
+      hand: the hand, for its servos.
       control: limits and scales.
       rows: (..., S) of `observe_for_teacher`.
-      action: (..., M + 6) the teacher's.
+      action: (..., M + 6) action of the teacher.
     """
     ahead, limit, velocity, table, own = jnp.split(rows[..., -EXTRA:].astype(action.dtype), (6, 7, 13, 14), -1)
     teacher = Guided(ahead, limit[..., 0], velocity, table[..., 0] > 0.5)

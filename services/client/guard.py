@@ -1,4 +1,4 @@
-"""What stands between a policy and a robot: a command every tick, whatever the policy does or fails to do.
+"""A guard between a policy and a robot: one command every tick, whether or not the policy answers.
 
 The policy is asked in a thread of its own, so that no network holds the control loop up. Needs nothing but numpy.
 """
@@ -26,7 +26,7 @@ _LIFTED = 0.02  # m above its first height from which on an object counts as hel
 
 @dataclasses.dataclass
 class Counters:
-    """What has happened since the guard was made."""
+    """Events since the guard was created."""
 
     steps: int = 0
     """Commands."""
@@ -63,14 +63,14 @@ class Counters:
 
 
 class Command(NamedTuple):
-    """What the robot is to do until the next one; all of it within the limits."""
+    """Targets of the robot until the next command, all within the limits."""
 
     q_target: np.ndarray
     """(F,) finger joint targets, rad."""
     u_target: np.ndarray
     """(6,) wrist targets relative to the base: x, y, z in m, intrinsic x-y-z angles in rad."""
     q_torque: np.ndarray
-    """(F,) N.m: the same, for a robot that is told torques."""
+    """(F,) N.m: the same, for a robot with torque commands."""
     u_torque: np.ndarray
     """(6,) N and N.m, likewise."""
     mode: Mode
@@ -86,15 +86,15 @@ class Guard:
     An answer is fresh when the state that it was asked with is at most `stale` old. While there is none, the last
     targets are held; after `hold` seconds without one, the fallback is taken and kept until the next `reset`: `freeze`
     keeps the targets and their torques, `open` opens the fingers as fast as the limits allow and keeps the wrist.
-    `open` becomes `freeze` where the object may be held or something is not measured; `open()` opens in any case. The
-    policy goes on from the targets that were commanded, not from those that it wanted.
+    `open` becomes `freeze` if the object may be held or a measurement is missing; `open()` opens in any case. The policy
+    continues from the commanded targets, not from those that it requested.
 
-    An object may be held from the moment on at which it is 2 cm above its first height, or `table` of a state is
-    false, until the next `reset`.
+    An object may be held once it was 2 cm above its first height, or `table` of a state was false, until the next
+    `reset`.
 
     Attributes:
       counters: what has happened.
-      trouble: why the last query had no answer; empty while it has, also during a fallback, which goes on asking.
+      trouble: cause of the last query without an answer; empty while there are answers, also during a fallback.
     """
 
     def __init__(
@@ -160,8 +160,8 @@ class Guard:
 
         Args:
           request: see `Policy.reset`; the wrist's targets start from its `wrist`, where the hand must be, and those of
-            the fingers go on from the last command. The first episode's start from its `q`.
-          moved: somebody else has moved the fingers since the last command: they, too, start from `q`.
+            the fingers continue from the last command. The first episode's start from its `q`.
+          moved: the fingers have moved since the last command by other means: they, too, start from `q`.
 
         Raises:
           CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` no pose.
@@ -238,7 +238,7 @@ class Guard:
             self.counters.answers += 1
 
     def _mode(self, state: State) -> Mode:
-        """What the next command does."""
+        """Returns the mode of the next command."""
         height = as_numbers(state.get("object_position"), 3)[2]
         self._held |= not np.all(state.get("table", True)) or bool(height > self._height + _LIFTED)
         age = self._clock() - self._fresh

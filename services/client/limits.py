@@ -1,7 +1,7 @@
-"""Limits of what a robot is told, whatever comes in; needs nothing but numpy.
+"""Limits of commands to a robot for any input; needs NumPy only.
 
 Every comparison is written so that what is not a number fails it: a target that is NaN, infinite or of the wrong shape
-holds the joint where it was told to be last.
+holds the joint at its last target.
 """
 
 import dataclasses
@@ -135,7 +135,7 @@ def _levers(hand: "Hand") -> dict[str, float]:
 
 
 class Limited(NamedTuple):
-    """What a robot may be told."""
+    """Targets and torques within the limits."""
 
     target: np.ndarray
     """(J,) positions, within the limits of position and speed."""
@@ -143,7 +143,7 @@ class Limited(NamedTuple):
     """(J,) what the servos give at that target, within the limits; where a measurement is not finite, at the position
     that was measured last."""
     by: tuple[str, ...]
-    """What held a target back: of `not_finite`, `torque`, `acceleration`, `speed`, `position`, `table`."""
+    """Causes that held a target back: of `not_finite`, `torque`, `acceleration`, `speed`, `position`, `table`."""
 
 
 class Limiter:
@@ -163,9 +163,9 @@ class Limiter:
 
         Args:
           limits: the limits.
-          start: (J,) where the joints are told to be now.
+          start: (J,) current targets of the joints.
           period: seconds from one target to the next.
-          floor: what the palm stays above; a palm that starts below it goes no deeper.
+          floor: plane below the palm; a palm that starts below it moves no deeper.
 
         Raises:
           CongraspError: the start is not a finite number for each joint, or the period not positive.
@@ -181,7 +181,7 @@ class Limiter:
         """The target and torque that the limits allow.
 
         Args:
-          target: (J,) what is wanted.
+          target: (J,) requested targets.
           position: (J,) measured.
           velocity: (J,) measured.
           now: s; a clock that goes back stops the targets until it has caught up.
@@ -212,7 +212,7 @@ class Limiter:
         return Limited(self.target.copy(), np.where(np.isfinite(torque), torque, 0.0), by)
 
     def _allowed(self, way: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """The parts (J,) of a way that the limits of speed allow, and those of speed and acceleration."""
+        """Returns the displacements (J,) within the limits of speed, and within those of speed and acceleration."""
         limits = self._limits
         bounded = _bounded(way, limits.speed * elapsed)
         if not elapsed or not limits.acceleration.any():
@@ -227,7 +227,7 @@ class Limiter:
         return bounded, (self._speed + change) * elapsed
 
     def _above(self, target: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """The target; where the palm would be below the floor, the nearest one above it that turns no further."""
+        """Returns the target, or the nearest one without further rotation that keeps the palm above the floor."""
         if self._floor is None:
             return target
         limits, floor = self._limits, self._floor

@@ -82,7 +82,7 @@ class Policy(Protocol):
         ...
 
     def metadata(self) -> dict[str, Any]:
-        """What a control loop has to know of the policy.
+        """Returns hand, limits and timing of the policy.
 
         Returns:
           `hand`, its `joints` (F names in the order of `q`), `open_pose` (F,) rad; `limits`, the fields of
