@@ -8,7 +8,7 @@ Array = Any
 def resting_mean(
     xp: Any, mean: Array, count: Array, reading: Array, table: Array, settle: float
 ) -> tuple[Array, Array]:
-    """Adds a reading to the mean of an object's readings while it rests: on the table, with no reading far from the mean.
+    """Adds a reading to an object's mean pose while it rests on the table and no reading is far from the mean.
 
     Args:
       xp: numpy or jax.numpy.

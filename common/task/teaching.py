@@ -1,7 +1,7 @@
 """Inputs of a teacher, and its actions converted to those of a student that observes another state.
 
-A residual is relative to the guidance of its policy. A student's guidance differs if its tracker has errors, so that the
-teacher's residual would move its wrist to another place. Both share the wrist's target: the student's label is
+A residual is relative to the guidance of its policy. A student's guidance differs if its tracker has errors, so that
+the teacher's residual would move its wrist to another place. Both share the wrist's target: the student's label is
 (u_tgt - u_g) / alpha_w with the teacher's target u_tgt and the student's guidance u_g.
 """
 

@@ -77,7 +77,7 @@ class EpisodePolicy(Policy):
         self.close()
 
     def _resting(self, state: State) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Returns the object's resting pose with this reading, if the policy uses the mean, and the number of readings."""
+        """Returns the resting pose with this reading, if the policy uses the mean, and the number of readings."""
         episode, settle = self._begun(), self._packer.settle if self._packer else 0.0
         if not (settle and self._time and {"object_position", "object_quaternion"} <= state.keys()):
             return {}, self._rested

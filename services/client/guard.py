@@ -86,8 +86,8 @@ class Guard:
     An answer is fresh when the state that it was asked with is at most `stale` old. While there is none, the last
     targets are held; after `hold` seconds without one, the fallback is taken and kept until the next `reset`: `freeze`
     keeps the targets and their torques, `open` opens the fingers as fast as the limits allow and keeps the wrist.
-    `open` becomes `freeze` if the object may be held or a measurement is missing; `open()` opens in any case. The policy
-    continues from the commanded targets, not from those that it requested.
+    `open` becomes `freeze` if the object may be held or a measurement is missing; `open()` opens in any case. The
+    policy continues from the commanded targets, not from those that it requested.
 
     An object may be held once it was 2 cm above its first height, or `table` of a state was false, until the next
     `reset`.

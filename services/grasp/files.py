@@ -1,5 +1,6 @@
 """The files of a grasp: `congrasp grasp` writes them into an object's folder, the result last."""
 
+import functools
 import hashlib
 import json
 import pathlib
@@ -12,7 +13,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.arm.files import PICTURE as ARM_PICTURE
-from congrasp.services.arm.files import save_picture, save_trajectories
+from congrasp.services.arm.files import robot_camera, robot_shapes, save_picture, save_trajectories
 from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.grasper import Grasp
 from congrasp.services.record.channels import JsonChannels
@@ -73,8 +74,13 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, film: Film | None, picture
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if film:
         until = found.first("hold") + round(_HELD / float(episode.meta["control_dt"]))
-        seen_from = best_camera(episode, [*steps[:-1], min(until, last)], film.size[0] / film.size[1])
-        save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)
+        shown, aspect = [*steps[:-1], min(until, last)], film.size[0] / film.size[1]
+        if arm := found.arm:
+            camera = robot_camera(arm, episode, shown, aspect)
+            around = functools.partial(robot_shapes, arm, episode)
+            save_episode_video(folder / VIDEO, episode, film, camera, until=until, around=around)
+        else:
+            save_episode_video(folder / VIDEO, episode, film, best_camera(episode, shown, aspect), until=until)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 
 

@@ -31,6 +31,8 @@ from congrasp.services.viz.shapes import (
 )
 from congrasp.services.viz.sheets import contact_sheet, save_video
 
+Around = Callable[[int], Sequence[Shape]]
+"""Shapes around the grasp at a control step, such as the arm that carries the hand."""
 TOUCHING = (0.13, 0.74, 0.63)
 OBJECT_AVOID = (0.72, 0.23, 0.22)
 _TOUCH = 1e-3  # force from which a link touches, N
@@ -197,6 +199,7 @@ def render_episode_frames(
     camera: Camera | None = None,
     *,
     overlays: bool = True,
+    around: Around = lambda step: [],
 ) -> Iterator[np.ndarray]:
     """Pictures (height, width, 3) uint8 of control steps of an episode, all from one camera.
 
@@ -206,12 +209,13 @@ def render_episode_frames(
       size: width and height in pixels.
       camera: from where; the best of a circle around the scene otherwise.
       overlays: see `Film`.
+      around: further shapes at a control step.
     """
     steps = list(steps)
     seen_from = camera or best_camera(episode, steps, size[0] / size[1])
 
     def drawn(step: int) -> np.ndarray:
-        return render_scene(episode_shapes(episode, step, overlays=overlays), seen_from, size)
+        return render_scene([*episode_shapes(episode, step, overlays=overlays), *around(step)], seen_from, size)
 
     with ThreadPoolExecutor(cores()) as pool:
         yield from pool.map(drawn, steps)
@@ -318,6 +322,7 @@ def save_episode_video(
     progress: Callable[[float], None] = lambda share: None,
     *,
     until: int | None = None,
+    around: Around = lambda step: [],
 ) -> None:
     """An episode as MP4, in real time.
 
@@ -328,6 +333,7 @@ def save_episode_video(
       camera: see `render_episode_frames`.
       progress: told which share of the frames is drawn.
       until: its first control step that is not drawn; all are by default.
+      around: see `render_episode_frames`.
 
     Raises:
       CongraspError: the package for videos is absent, or the file cannot be written.
@@ -338,7 +344,7 @@ def save_episode_video(
 
     def frames() -> Iterator[np.ndarray]:
         """The frames, one after another."""
-        drawn = render_episode_frames(episode, steps, film.size, camera, overlays=film.overlays)
+        drawn = render_episode_frames(episode, steps, film.size, camera, overlays=film.overlays, around=around)
         for done, frame in enumerate(drawn, 1):
             yield frame
             progress(done / len(steps))
