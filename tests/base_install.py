@@ -37,13 +37,12 @@ def run_in_base_install(code: str) -> subprocess.CompletedProcess[str]:
 
 
 @contextlib.contextmanager
-def steady_server() -> Iterator[int]:
-    """Port of a server whose policy for Allegro wants every joint at zero."""
-    port, keys = free_port(), Keys("policy")
-    function = PolicyFunction(get_hand("allegro"), TaskConfig(hand="allegro"))
+def steady_server(hand: str = "allegro") -> Iterator[int]:
+    """Port of a server whose policy wants every joint at zero."""
+    port, keys, function = free_port(), Keys("policy"), PolicyFunction(get_hand(hand), TaskConfig(hand=hand))
 
     def act(key: str, query: Message) -> Message:
-        targets = np.zeros((1, 2 * 22), np.float32)  # and the action
+        targets = np.zeros((1, 2 * (len(get_hand(hand).joints) + 6)), np.float32)  # and the action
         return function.reply(query, Inference(targets, [[]]), {"version": 1, "total_ms": 0.0})
 
     with urls.listen(f"tcp/127.0.0.1:{port}", "server") as server:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from zenoh.handlers import RingChannel
 
 import congrasp
+from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural, store
 from congrasp.common.objects.pool import scale_objects
@@ -44,7 +45,7 @@ def example(name: str) -> Any:
 
 
 class Rig:
-    """A simulated Allegro hand whose joints, wrist and object are topics, and which follows the topics of commands.
+    """A simulated hand whose joints, wrist and object are topics, and which follows the topics of commands.
 
     Attributes:
       robot: the simulation (`examples/robot_loop.py`).
@@ -52,15 +53,15 @@ class Rig:
       commands: commands of the node so far.
     """
 
-    def __init__(self, folder: pathlib.Path):
+    def __init__(self, folder: pathlib.Path, robot: Any, task: TaskConfig):
         """Opens the topics.
 
         Args:
           folder: takes the object's file and the node's output.
+          robot: a `MujocoRobot` with the object of `SEED`.
+          task: its task.
         """
-        self._loop, self._folder = example("robot_loop"), folder
-        hand, task = get_hand("allegro"), bundles.load(policy_file(None, "allegro")).task
-        self.robot = self._loop.MujocoRobot(hand, task, SEED, congrasp.JointLimits.of_hand(hand, task.control))
+        self.robot, self._folder, self._hand, hand = robot, folder, task.hand, get_hand(task.hand)
         (obj,) = scale_objects(hand, task, [procedural.generate(SEED)])
         self._object = folder / f"object{store.SUFFIX}"
         store.save(obj, self._object)
@@ -89,7 +90,7 @@ class Rig:
         self._target, self._highest = (np.array(self.robot.request.q), np.zeros(6)), -np.inf
         heading = " ".join(f"{x:.6f}" for x in self.robot.request.constraints["heading"]["direction"])
         command = [sys.executable, str(EXAMPLES / "ros2_node.py"), str(self._object), "--zenoh", self._endpoint]
-        command += ["--connect", server, "--heading", heading, *options]
+        command += ["--connect", server, "--heading", heading, "--hand", self._hand, *options]
         with (self._folder / "node.txt").open("wb") as output:
             environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parent)}
             self._node = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
@@ -172,8 +173,11 @@ def bench_robot(seconds: float, kill_every: float, folder: pathlib.Path) -> bool
       kill_every: seconds from one kill to the next; half of them come while the object is held.
       folder: takes the node's output.
     """
-    with contextlib.closing(Rig(folder)) as rig:
-        server = rig._loop.Server(policy_file(None, "allegro"))
+    loop, policy = example("robot_loop"), policy_file(None, "allegro")
+    hand, task = get_hand("allegro"), bundles.load(policy).task
+    robot = loop.MujocoRobot(hand, task, SEED, congrasp.JointLimits.of_hand(hand, task.control))
+    with contextlib.closing(Rig(folder, robot, task)) as rig:
+        server = loop.Server(policy)
         counts = {"episodes": 0, "lifted": 0, "kills": 0, "dropped after a kill": 0, "dropped": 0}
         end, kill = time.monotonic() + seconds, time.monotonic() + kill_every
         try:
