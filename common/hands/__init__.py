@@ -9,6 +9,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.allegro import ALLEGRO
 from congrasp.common.hands.files import MAX_BYTES, hand_from_text, read_hand
 from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.left import left_hand, right_name
 from congrasp.common.hands.mano import own_mano_hand
 from congrasp.common.hands.sharpa import SHARPA
 from congrasp.common.hands.spec import Hand
@@ -58,7 +59,7 @@ def known_hand(reference: object) -> Hand:
       CongraspError: it is neither, or the text does not describe a hand.
     """
     name = check_reference(reference)
-    if name in HANDS:
+    if right_name(name)[0] in HANDS:
         return get_hand(name)
     if name.isidentifier():
         raise _unknown(reference)
@@ -77,12 +78,15 @@ def get_hand(reference: str) -> Hand:
     """Returns the hand of a reference, the same object for the same reference; see `known_hand` for untrusted input.
 
     Args:
-      reference: the name of a hand of the package or of one in `hands_folder`, the path of a hand file, or all of its
-        text (`Hand.reference`).
+      reference: the name of a hand of the package (`human:left` for its mirror image) or of one in `hands_folder`, the
+        path of a hand file, or all of its text (`Hand.reference`).
 
     Raises:
       CongraspError: there is no such hand; the message lists the available ones.
     """
+    right, left = right_name(reference)
+    if left and right in HANDS:
+        return left_hand(get_hand(right))
     if reference in HANDS:
         return HANDS[reference]()
     if reference.lstrip().startswith("{"):

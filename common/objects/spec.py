@@ -9,6 +9,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from congrasp.common import mirror
+
 PieceKind = Literal["box", "cylinder", "capsule", "ellipsoid", "mesh"]
 SURFACE_POINTS = 512
 COLOUR_POINTS = 32_768
@@ -95,6 +97,31 @@ class GraspObject:
     def non_graspable_points(self) -> np.ndarray:
         """(512,) bool: surface points of the avoid region."""
         return ~self.graspable[self.labels]
+
+    def mirrored(self) -> "GraspObject":
+        """The mirror image of the object, point by point and resting pose by resting pose (`common.mirror`)."""
+        sides = np.array([-1.0, 1.0, 1.0])
+
+        def piece(own: Piece) -> Piece:
+            """A mirrored piece; all kinds but meshes are symmetric in their own frames."""
+            (x, y, z), (a, b, c, d) = own.pos, own.quat
+            vertices = None if own.vertices is None else mirror.vector(own.vertices)
+            return dataclasses.replace(own, pos=(-x, y, z), quat=(a, b, -c, -d), vertices=vertices)
+
+        x, y, z = self.origin
+        rest = self.rest_poses
+        return dataclasses.replace(
+            self,
+            pieces=tuple(map(piece, self.pieces)),
+            inertia=self.inertia * np.outer(sides, sides),
+            points=mirror.vector(self.points),
+            normals=mirror.vector(self.normals),
+            rest_poses=np.concatenate([mirror.vector(rest[:, :3]), mirror.quaternion(rest[:, 3:])], -1),
+            visual_vertices=mirror.vector(self.visual_vertices),
+            visual_faces=self.visual_faces[:, ::-1],
+            origin=(-x, y, z),
+            colours=self.colours and self.colours._replace(points=mirror.vector(self.colours.points)),
+        )
 
     def scaled(self, factor: float, *, constant_mass: bool = False) -> "GraspObject":
         """Scales all lengths by `factor`, at the same density or, with `constant_mass`, the same mass."""

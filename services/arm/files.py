@@ -1,4 +1,4 @@
-"""The files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
+"""Files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
 
 import json
 import pathlib
@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.hands.geometry import geom_mesh
+from congrasp.services.viz.episode import episode_shapes
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.render import episode_shapes
 from congrasp.services.viz.scene import Camera, Shape
 from congrasp.services.viz.shapes import fit, shape_points
 from congrasp.services.viz.sheets import save_png
@@ -25,7 +25,7 @@ CSV, TRAJECTORY, PICTURE = "arm.csv", "arm_trajectory.json", "arm.png"
 _SIZE = (1280, 960)  # pixels
 _AHEAD = np.array([0.35, -1.0, 0.45])  # from the robot to the camera, in the frame of the base
 _GREY = (0.75, 0.76, 0.78)
-_EDGE, _UNDER = 0.45, 0.011  # table beyond arm and object, its middle below the grasp's own table, m
+_EDGE, _UNDER = 0.6, 0.001  # table beyond arm and object, and below the grasp's own table, m
 
 
 def save_trajectories(folder: pathlib.Path, motion: "ArmMotion") -> None:
@@ -74,12 +74,13 @@ def robot_shapes(motion: "ArmMotion", episode: Message, step: int) -> list[Shape
     ends = motion.world_base.position[:2], episode.arrays["object_position"][0][:2]
     radius = float(np.linalg.norm(ends[0] - ends[1])) / 2 + _EDGE
     middle = np.array([*np.mean(ends, axis=0), -_UNDER])
-    return [*_arm_shapes(motion, step), Shape("cylinder", (radius, 0.01), _GREY, middle, shine=0.0, shadow=False)]
+    table = Shape("table", (radius, 0.0), _GREY, middle, shine=0.0, shadow=False)
+    return [*_arm_shapes(motion, step), table]
 
 
 def _grasp_shapes(episode: Message, step: int) -> list[Shape]:
     """Returns hand and object without the table of the hand alone."""
-    return [shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "cylinder"]
+    return [shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "table"]
 
 
 def _arm_shapes(motion: "ArmMotion", step: int) -> list[Shape]:

@@ -1,4 +1,4 @@
-"""A guard between a policy and a robot: one command every tick, whether or not the policy answers.
+"""Guard between a policy and a robot: a command every tick, whatever the policy does.
 
 The policy is asked in a thread of its own, so that no network holds the control loop up. Needs nothing but numpy.
 """
@@ -26,7 +26,7 @@ _LIFTED = 0.02  # m above its first height from which on an object counts as hel
 
 @dataclasses.dataclass
 class Counters:
-    """Events since the guard was created."""
+    """Counters since the guard was created."""
 
     steps: int = 0
     """Commands."""
@@ -63,14 +63,14 @@ class Counters:
 
 
 class Command(NamedTuple):
-    """Targets of the robot until the next command, all within the limits."""
+    """Command for the robot until the next one, within all limits."""
 
     q_target: np.ndarray
     """(F,) finger joint targets, rad."""
     u_target: np.ndarray
     """(6,) wrist targets relative to the base: x, y, z in m, intrinsic x-y-z angles in rad."""
     q_torque: np.ndarray
-    """(F,) N.m: the same, for a robot with torque commands."""
+    """(F,) the same as torques, for a torque-controlled robot, N.m."""
     u_torque: np.ndarray
     """(6,) N and N.m, likewise."""
     mode: Mode
@@ -156,12 +156,13 @@ class Guard:
         self._asker = _Asker(policy)
 
     def reset(self, request: GraspRequest, *, moved: bool = False) -> None:
-        """Begins an episode; what is under way of the one before counts no more.
+        """Begins an episode; a pending query of the previous one is dropped.
 
         Args:
           request: see `Policy.reset`; the wrist's targets start from its `wrist`, where the hand must be, and those of
             the fingers continue from the last command. The first episode's start from its `q`.
-          moved: the fingers have moved since the last command by other means: they, too, start from `q`.
+          moved: True if the fingers were moved by other means since the last command: their targets also start from
+            `q`.
 
         Raises:
           CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` no pose.

@@ -135,7 +135,7 @@ def _levers(hand: "Hand") -> dict[str, float]:
 
 
 class Limited(NamedTuple):
-    """Targets and torques within the limits."""
+    """A command within the limits."""
 
     target: np.ndarray
     """(J,) positions, within the limits of position and speed."""
@@ -143,7 +143,7 @@ class Limited(NamedTuple):
     """(J,) what the servos give at that target, within the limits; where a measurement is not finite, at the position
     that was measured last."""
     by: tuple[str, ...]
-    """Causes that held a target back: of `not_finite`, `torque`, `acceleration`, `speed`, `position`, `table`."""
+    """Limits that were applied to a target: of `not_finite`, `torque`, `acceleration`, `speed`, `position`, `table`."""
 
 
 class Limiter:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors import stress as protocols
-from congrasp.actors.env import EnvState, metric_names
+from congrasp.actors.env import EnvState, View, metric_names
 from congrasp.actors.episode import episode_message
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
@@ -35,6 +35,8 @@ class Batch(NamedTuple):
     """B episodes simulated together."""
 
     sample: Sample
+    final: View
+    """Hand and object at the end of the hold."""
     message: Callable[[int], Message]
     """Recording of an episode, if traces are kept."""
 
@@ -121,6 +123,8 @@ class Episodes:
             if step < length:
                 traces.append(rollout.trace)
                 finished = finished_episodes(rollout, task)
+                assert worker.state is not None and worker.state.views is not None
+                final = worker.state.views.true
         samples = jax.tree.map(lambda *parts: np.concatenate(parts), *probed)
         values = {name: finished[f"episode/{name}"] for name in metric_names(task)}
         if self._measured:
@@ -134,7 +138,7 @@ class Episodes:
             )
             return self._message(begun, trace, {name: float(x[episode]) for name, x in values.items()}, episode)
 
-        return Batch(Sample({**values, **self._facts(conditions)}, force, torque), message)
+        return Batch(Sample({**values, **self._facts(conditions)}, force, torque), final, message)
 
     def take_grasps(self) -> Grasps:
         """Returns the grasps of the last batch that may become references."""

@@ -25,10 +25,11 @@ from congrasp.services.evaluate.heading_rules import HeadingRules
 from congrasp.services.evaluate.noise import LEVELS
 from congrasp.services.evaluate.paper import CAPTURED_SETS
 from congrasp.services.evaluate.plan import from_references
+from congrasp.services.evaluate.pools import folder_pools, procedural_pools
 from congrasp.services.evaluate.protocol import NOMINAL_FRICTION, two_seconds
 from congrasp.services.evaluate.references import reference_policy
 from congrasp.services.evaluate.scores import TABLES, Row, known_rows
-from congrasp.services.evaluate.unseen import evaluate_objects, folder_pools, procedural_pools
+from congrasp.services.evaluate.unseen import evaluate_objects
 
 MANY = 50_000
 """Most procedural objects of the table `objects` by default."""

@@ -6,11 +6,13 @@ from typing import Any
 
 from congrasp.common.errors import CongraspError, error_of
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.left import right_name
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.episode import EpisodePolicy
+from congrasp.services.client.left import LeftPolicy
 from congrasp.services.client.policy import Policy
 from congrasp.services.serve.inference import BATCH_SIZES, PolicyFunction
 
@@ -51,9 +53,11 @@ def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:
     """Loads the policy of a file, or the pretrained one of a hand, in this process.
 
     Args:
-      policy: a policy file (`policy.safetensors` in a run's folder), or the name of a hand.
+      policy: a policy file (`policy.safetensors` in a run's folder), or the name of a hand (`human:left` for the left).
 
     Raises:
       CongraspError: there is no such file or hand, or the file is damaged.
     """
-    return LocalPolicy(bundles.load(named_policy(policy)))
+    right, left = right_name(str(policy))
+    found = LocalPolicy(bundles.load(named_policy(right)))
+    return LeftPolicy(found) if left else found
