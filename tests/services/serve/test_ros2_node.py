@@ -125,7 +125,7 @@ def node_of(example, bus, lift=0.0, **given):
     """A node with a steady policy, and the object that it grasps."""
     policy, obj = SteadyPolicy(), procedural.generate(7)
     limits = congrasp.JointLimits.of_hand(HAND)
-    arguments = example.Arguments("capsule:7", **given)
+    arguments = example.Arguments("capsule:7", robot_age=3.0, **given)  # on a machine with other work
     plan = example.Plan("world", 3, lift, 0.02, arguments.dry_run)
     request = congrasp.GraspRequest(surface=obj.points)
     with congrasp.Guard(policy, limits, HAND.q_open, period=0.05, wait=0.04, stale=0.2, hold=0.6) as guard:
@@ -319,7 +319,7 @@ def test_poses_come_through_frames_and_offsets_and_go_back_the_same_way(example)
         place = bus.sent["wrist_command"].pose.position
         expected = np.array([1.0, 0.5, 0.4]) + quarter.apply(u[:3]) - turned.apply([0.0, 0.0, 0.1])
         np.testing.assert_allclose([place.x, place.y, place.z], expected, atol=1e-9)
-        moving.transforms[0].header = header("base", age=1.0)
+        moving.transforms[0].header = header("base", age=9.0)
         node.step()
         assert "tf from its frame 'camera'" in node._sensors.missing()
 
