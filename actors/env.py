@@ -353,7 +353,8 @@ class GraspEnv:
         if state.tracker is None or state.readings is None:
             return state
         position, quaternion = physics_state.object_position, physics_state.object_quaternion
-        tracker = sensing.track(state.tracker, state.time, position, quaternion)
+        table, settle = self.table_present(state), self.task.sensing.settle
+        tracker = sensing.track(state.tracker, state.time, position, quaternion, table, settle)
         shown = physics_state._replace(object_position=tracker.shown[:, :3], object_quaternion=tracker.shown[:, 3:])
         shown = protocols.carried(shown, state.reset_state.base_quaternion, state.frame)
         newest = Readings(

@@ -26,6 +26,7 @@ from congrasp.common.task import metrics
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.observation import observe
 from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.teaching import observe_for_teacher
 from congrasp.common.task.types import Action, Array
 
 ActFunction = Callable[[Any, Array, Array], tuple[Array, Array]]
@@ -87,7 +88,7 @@ class Rollout(NamedTuple):
     probed: Any
     """Result of the probe, with leading axis T; None without a probe."""
     teacher_observation: Array | None = None
-    """(T, B, S) full observation, for a teacher that labels the rollout."""
+    """(T, B, S) input of the teacher that labels the rollout (`common.task.teaching`)."""
     privileged: Array | None = None
     """(T, B, P) privileged inputs of the critic (`common.task.privileged`), if recorded."""
     last_privileged: Array | None = None
@@ -100,7 +101,7 @@ class _Seen(NamedTuple):
     observation: Array
     """(B, D)."""
     teacher_observation: Array | None
-    """(B, S) full observation, if recorded."""
+    """(B, S) input of a teacher, if recorded."""
     privileged: Array | None
     """(B, P) privileged inputs of the critic, if recorded."""
 
@@ -305,7 +306,10 @@ class RolloutWorker:
     def _look(self, state: EnvState, settings: Settings) -> _Seen:
         """Returns the observations of the current control step."""
         observation = observe(self.env.seen(state)).astype(self._dtype)
-        everything = observe(self.env.privileged(state)).astype(self._dtype) if self._taught else None
+        everything = None
+        if self._taught:
+            given = self.env.privileged(state), self.env.seen(state), settings.control
+            everything = observe_for_teacher(*given).astype(self._dtype)
         masses = settings.masses
         inputs = None if masses is None else self.env.critic_inputs(state, masses).astype(self._dtype)
         return _Seen(observation, everything, inputs)

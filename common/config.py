@@ -109,6 +109,13 @@ class SensingConfig:
     """Standard deviation of a sample's rotation about each axis, rad."""
     dropout: tuple[float, float] = (0.0, 0.0)
     """Probability that a sample is lost."""
+    position_bias: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of each coordinate of a constant error of all samples of an episode, m."""
+    rotation_bias: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of a constant rotation of all samples of an episode about each axis, rad."""
+    settle: float = 0.0
+    """The wrist is guided by the mean of the object's poses until one is this far from it, m, or the table is removed;
+    0: by the first pose."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,8 +30,7 @@ from congrasp.common.objects.pool import scale_objects
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.transport.ports import local_url
-from congrasp.services.ops.logs import announced
-from congrasp.services.serve.load import example_episode, wait_until_ready
+from congrasp.services.serve.load import example_episode
 
 BUFFER = 0.01
 """rad before the ends of the finger joints at which the robot's stops begin, which are springs in MuJoCo."""
@@ -54,7 +53,7 @@ class Arguments:
     object_seed: int = 1_000_000
     """Seed of the procedural object and of the heading."""
     fallback: Literal["freeze", "open"] = "open"
-    """What the hand does when half a second went by without a fresh answer."""
+    """What a hand that holds nothing does when half a second went by without a fresh answer."""
 
 
 class MujocoRobot:
@@ -75,6 +74,8 @@ class MujocoRobot:
             index = self.model.joint(joint.name).id
             self.model.jnt_margin[index] = BUFFER
             self.model.jnt_solref[index] = 2.0 * self.model.opt.timestep, 1.0  # as stiff as the time step allows
+        strongest = np.roll(limits.torque, 6)  # in MuJoCo the wrist's servos come first
+        self.model.actuator_forcerange[:] = np.stack([-strongest, strongest], 1)
         self.data = mujoco.MjData(self.model)
         self._where = addresses(self.model, hand)
         self._table = True
@@ -159,7 +160,7 @@ class Grasps:
 
     def __init__(self, robot: MujocoRobot, guard: congrasp.Guard, task: TaskConfig):
         self._robot, self._guard, self._task = robot, guard, task
-        self.outcomes = {"held": 0, "lost": 0, "given up": 0}
+        self.outcomes = {"held": 0, "lost": 0, "given up": 0, "given up and dropped": 0}
         self._begin()
 
     def step(self) -> None:
@@ -169,13 +170,16 @@ class Grasps:
         self._followed += command.mode == "follow"
         if command.mode in ("freeze", "open"):
             if not self._guard.trouble:
-                self._end("given up")
+                self._end("given up" if self._up() else "given up and dropped")
         elif self._followed == self._task.approach_steps and self._height is None:
             self._height = self._robot.height
             self._robot.remove_table()
         elif self._height is not None and self._followed >= self._task.approach_steps + HOLD_STEPS:
-            held = self._robot.height > self._height - self._task.drop_height
-            self._end("held" if held else "lost")
+            self._end("held" if self._up() else "lost")
+
+    def _up(self) -> bool:
+        """Whether the object is where it was when the table was taken away, or that is still there."""
+        return self._height is None or self._robot.height > self._height - self._task.drop_height
 
     def _begin(self) -> None:
         self._followed, self._height = 0, None
@@ -194,17 +198,13 @@ def run(arguments: Arguments) -> dict[str, object]:
     hand = get_hand(task.hand)
     if len(hand.motors) != len(hand.joints):
         raise congrasp.CongraspError(f"Joints of the hand '{hand.name}' are coupled.", "This loop is for other hands.")
-    limits = congrasp.JointLimits.of_hand(hand)
+    limits = congrasp.JointLimits.of_hand(hand, task.control)
     robot = MujocoRobot(hand, task, arguments.object_seed, limits)
     server, kills = Server(policy), 0
     try:
         client = congrasp.PolicyClient(server.url, hand=hand.name, timeout=0.2, wait=180.0)
-        with announced("Waiting for the policy server, which compiles"):
-            wait_until_ready(client)
         period = task.control_dt
-        with congrasp.Guard(
-            client, limits, hand.q_open, period=period, wait=0.6 * period, fallback=arguments.fallback
-        ) as guard:
+        with congrasp.Guard(client, period=period, wait=0.6 * period, fallback=arguments.fallback) as guard:
             grasps = Grasps(robot, guard, task)
             ticker = congrasp.Ticker(1.0 / period)
             begin = ticker.wait()

@@ -1,48 +1,67 @@
 """A ROS 2 node between a policy server and a robot; without ROS 2 the same messages go over Zenoh.
 
     congrasp serve --hand allegro
-    python examples/ros2_node.py mug:7 --hand allegro                                 # where there is rclpy
+    python examples/ros2_node.py mug:7 --hand allegro --dry-run                       # where there is rclpy
     python examples/ros2_node.py mug:7 --hand allegro --zenoh tcp/127.0.0.1:7447      # zenoh-bridge-ros2dds, or a robot
 
 | topic | type | what |
 |---|---|---|
 | in: `joint_states` | sensor_msgs/JointState | the finger joints, by name, any order |
-| in: `wrist_pose` | geometry_msgs/PoseStamped | the hand's palm in the world: z up, the table's top at z = 0 |
-| in: `object_pose` | geometry_msgs/PoseStamped | the frame of the object's file in the world |
+| in: `wrist_pose` | geometry_msgs/PoseStamped | what carries the hand; its palm without `--mount` |
+| in: `object_pose` | geometry_msgs/PoseStamped | the frame of the object's file |
+| in: `tf`, `tf_static` | tf2_msgs/TFMessage | the frames of these poses in `--world`: z up, the table at z = 0 |
 | out: `joint_command` | sensor_msgs/JointState | finger targets (`position`) and torques (`effort`) |
-| out: `wrist_command` | geometry_msgs/PoseStamped | where the palm should be |
+| out: `wrist_command` | geometry_msgs/PoseStamped | where what carries the hand should be, in `--world` |
 
-The episode begins where the hand is when all three have come: before the object, open. Commands keep to the limits of
-`congrasp.JointLimits`; while a topic is silent, or the policy, the hand holds and then opens, and stays open until the
-node is started again. It is for hands with a motor for each joint. Over Zenoh the messages are CDR as in ROS 2, under
-the topics' names, as zenoh-bridge-ros2dds has them.
+The episode begins where the hand is when all have come: before the object, open. Commands keep to the limits that the
+server names. While a topic is silent, or the policy, the hand holds; then it freezes, or opens if nothing was lifted,
+until the node is started again. It is for hands with a motor for each joint.
 """
 
 import contextlib
 import dataclasses
-import importlib
 import pathlib
 import sys
 import time
-from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from ros2_bus import INPUTS, JOINTS, POSE, Bus, RosBus, ZenohBus
 from scipy.spatial.transform import Rotation
 
 import congrasp
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.spec import Hand
-from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.objects.named import find_object
+from congrasp.services.cli.grasp import Constraints
+from congrasp.services.grasp.parse import read_request
 
-JOINTS, POSE = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
-INPUTS = {"joint_states": JOINTS, "wrist_pose": POSE, "object_pose": POSE}
-OUTPUTS = {"joint_command": JOINTS, "wrist_command": POSE}
-Pose = tuple[np.ndarray, Rotation]
-SILENT = 0.1
-"""Seconds after which what a topic said last does not count any more."""
+WAITING = 2.0
+"""Seconds after which the node says what it waits for."""
+LIFT_SPEED = 0.1
+"""m/s, the mean."""
+TRACKER_AGE = 0.5
+"""Seconds that a student's object may be old: it learnt with 10 Hz, 100 ms, and samples that are lost."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """A frame in another one: position (3,), m, and rotation."""
+
+    position: np.ndarray
+    rotation: Rotation
+
+    def __matmul__(self, other: "Pose") -> "Pose":
+        """A pose in this frame, in the other one."""
+        return Pose(self.position + self.rotation.apply(other.position), self.rotation * other.rotation)
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position and quaternion (4,), (w, x, y, z)."""
+        return self.position, self.rotation.as_quat(scalar_first=True)
+
+    def inverse(self) -> "Pose":
+        """The other frame in this one."""
+        return Pose(-self.rotation.inv().apply(self.position), self.rotation.inv())
 
 
 @dataclasses.dataclass
@@ -53,248 +72,293 @@ class Arguments:
     """A mesh, an object file, or FAMILY:SEED."""
     hand: str = "allegro"
     """Name of the hand."""
-    heading: tuple[float, float, float] = (0.0, 0.0, -1.0)
-    """The way in which the hand comes, in the object frame."""
+    constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Constraints)
+    """What the grasp must keep to; the hand comes along the object's -z axis where nothing guides it."""
     connect: str = "tcp/127.0.0.1:7457"
     """The policy server's endpoint."""
     certs: pathlib.Path | None = None
     """Folder of a client's certificate, for a server that asks for one."""
     zenoh: str = ""
     """Endpoint of a Zenoh router, bridge or robot; ROS 2 otherwise."""
-    approach: float = 0.5
-    """Seconds of fresh answers after which the object is no longer taken to stand on the table."""
-    rate: float = 100.0
-    """Hz."""
+    joint_map: tuple[str, ...] = ()
+    """HAND=ROBOT pairs: the robot's names of joints that it calls otherwise."""
+    world: str = "world"
+    """Name of the world frame."""
+    mount: str = "0 0 0 0 0 0"
+    """X Y Z ROLL PITCH YAW of the palm in the frame of `wrist_pose`: metres, degrees."""
+    hand_eye: str = "0 0 0 0 0 0"
+    """X Y Z ROLL PITCH YAW by which the camera is off, in its own frame: metres, degrees."""
+    approach: float = 0.0
+    """Seconds of fresh answers, at full speed, until the object may leave the table; 0: as in training."""
+    lift: float = 0.0
+    """Metres by which the hand then rises."""
+    slow: float = 1.0
+    """Share of the speed: of the policy's steps and of the limits; 0.25 to begin with."""
+    dry_run: bool = False
+    """Publish nothing; print once a second what would be commanded."""
+    stale: float = 0.05
+    """Seconds that the state of an answer may be old; more over slow networks."""
+    hold: float = 0.5
+    """Seconds without an answer after which the hand freezes or opens."""
+    robot_age: float = 0.1
+    """Seconds after which joints and wrist count as not measured, from their arrival and by their stamps."""
+    object_age: float = 0.0
+    """The same of the object; 0: that of the robot, or 0.5 for a student (10 Hz, 100 ms, lost samples)."""
 
 
-class Bus(Protocol):
-    """Topics of typed messages."""
+class Sensors:
+    """What the topics say, in the world frame; None or NaN for what is not there, or too old."""
 
-    def make(self, kind: str, **fields: Any) -> Any:
-        """A message of a type such as `geometry_msgs/msg/Point`; numbers of an array come as a list."""
-        ...
+    def __init__(self, arguments: Arguments, joints: list[str], origin: np.ndarray, object_age: float):
+        """Args: names and offsets; the hand's joints; (3,) the object frame's origin in its file, m; s."""
+        renamed = joints_of(arguments.joint_map, joints)
+        self.names = [renamed.get(joint, joint) for joint in joints]
+        """The robot's names of the joints, in the hand's order."""
+        self.mount, self._hand_eye = offset_of(arguments.mount), offset_of(arguments.hand_eye)
+        self._centre = Pose(-np.asarray(origin), Rotation.identity())
+        self._world, self._ages = arguments.world, dict.fromkeys(INPUTS, arguments.robot_age)
+        self._ages["object_pose"] = object_age
+        self._joints: dict[str, tuple[float, float, float]] = {}
+        self._poses: dict[str, tuple[Any, float]] = {}
+        self._frames: dict[str, tuple[str, Pose, float]] = {}
 
-    def latest(self) -> dict[str, tuple[Any, float]]:
-        """The newest message of every input that has come, and the time of `time.monotonic` when it came."""
-        ...
+    def take(self, received: list[tuple[str, Any]]) -> None:
+        """Takes messages in."""
+        for topic, message in received:
+            if topic == "joint_states":
+                velocity = (
+                    message.velocity if len(message.velocity) == len(message.name) else [np.nan] * len(message.name)
+                )
+                rows = zip(message.name, message.position, velocity, strict=False)
+                self._joints |= {name: (q, v, stamped(message.header)) for name, q, v in rows}
+            elif INPUTS[topic] == POSE:
+                self._poses[topic] = message, stamped(message.header)
+            else:
+                for part in message.transforms:
+                    pose = read_pose(part.transform.translation, part.transform.rotation)
+                    when = np.inf if topic == "tf_static" else stamped(part.header)
+                    if pose is not None:
+                        self._frames[part.child_frame_id] = part.header.frame_id, pose, when
 
-    def publish(self, topic: str, message: Any) -> None:
-        """Sends a message."""
-        ...
+    def joints(self) -> np.ndarray:
+        """(2, F) angles and velocities, rad and rad/s."""
+        earliest = time.monotonic() - self._ages["joint_states"]
+        rows = (self._joints.get(name, (np.nan, np.nan, -np.inf)) for name in self.names)
+        return np.array([(q, v) if when >= earliest else (np.nan, np.nan) for q, v, when in rows]).T
 
-    def close(self) -> None:
-        """Ends the subscriptions."""
-        ...
+    def palm(self) -> Pose | None:
+        """The palm in the world."""
+        pose = self._pose("wrist_pose", Pose(np.zeros(3), Rotation.identity()))
+        return pose and pose @ self.mount
 
+    def object(self) -> Pose | None:
+        """The object in the world."""
+        pose = self._pose("object_pose", self._hand_eye)
+        return pose and pose @ self._centre
 
-class RosBus:
-    """Topics of ROS 2 through rclpy."""
+    def missing(self) -> str:
+        """What is not there, in words; empty when all is."""
+        lacking = []
+        if absent := [name for name, q in zip(self.names, self.joints()[0], strict=True) if not np.isfinite(q)]:
+            others = ", ".join(sorted(set(self._joints) - set(absent))) or "none"
+            lacking.append(f"the joints {', '.join(absent)} in joint_states (there: {others}; see --joint-map)")
+        for topic, found in (("wrist_pose", self.palm()), ("object_pose", self.object())):
+            message, when = self._poses.get(topic, (None, 0.0))
+            if message is None:
+                lacking.append(topic)
+            elif time.monotonic() - when > self._ages[topic]:
+                lacking.append(f"{topic} (the last one is {time.monotonic() - when:.1f} s old by its stamp)")
+            elif found is None:
+                lacking.append(f"{topic}: a pose, and tf from its frame '{message.header.frame_id}' to '{self._world}'")
+        return "; ".join(lacking)
 
-    def __init__(self) -> None:
-        self._rclpy, qos = importlib.import_module("rclpy"), importlib.import_module("rclpy.qos")
-        self._rclpy.init()
-        self._node = self._rclpy.create_node("congrasp")
-        self._latest: dict[str, tuple[Any, float]] = {}
-        newest = qos.QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)  # takes reliable ones, too
-        for topic, kind in INPUTS.items():
-            self._node.create_subscription(self._type(kind), topic, self._keep(topic), newest)
-        self._publishers = {t: self._node.create_publisher(self._type(k), t, 1) for t, k in OUTPUTS.items()}
+    def _pose(self, topic: str, offset: Pose) -> Pose | None:
+        """A topic's pose in the world, by way of an offset of the frame that it is in."""
+        message, when = self._poses.get(topic, (None, -np.inf))
+        if time.monotonic() - when > self._ages[topic]:
+            return None
+        frame, pose = self._frame(message.header.frame_id), read_pose(message.pose.position, message.pose.orientation)
+        return frame @ offset @ pose if frame and pose else None
 
-    def make(self, kind: str, **fields: Any) -> Any:
-        """See `Bus.make`."""
-        return self._type(kind)(**fields)
-
-    def latest(self) -> dict[str, tuple[Any, float]]:
-        """See `Bus.latest`."""
-        for _ in INPUTS:
-            self._rclpy.spin_once(self._node, timeout_sec=0.0)
-        return self._latest
-
-    def publish(self, topic: str, message: Any) -> None:
-        """See `Bus.publish`."""
-        self._publishers[topic].publish(message)
-
-    def close(self) -> None:
-        """See `Bus.close`."""
-        self._node.destroy_node()
-        self._rclpy.try_shutdown()
-
-    def _type(self, kind: str) -> Any:
-        """The class of a message."""
-        package, folder, name = kind.split("/")
-        return getattr(importlib.import_module(f"{package}.{folder}"), name)
-
-    def _keep(self, topic: str) -> Callable[[Any], None]:
-        """Takes a topic's messages."""
-
-        def keep(message: Any) -> None:
-            self._latest[topic] = message, time.monotonic()
-
-        return keep
-
-
-class ZenohBus:
-    """The same topics over Zenoh, as CDR, which rosbags writes and reads."""
-
-    def __init__(self, endpoint: str):
-        import zenoh
-        from rosbags.typesys import Stores, get_typestore
-        from zenoh.handlers import RingChannel
-
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", f'["{endpoint}"]')
-        config.insert_json5("scouting/multicast/enabled", "false")
-        self._session = zenoh.open(config)
-        self._subscribers = {t: self._session.declare_subscriber(t, RingChannel(1)) for t in INPUTS}
-        self._latest: dict[str, tuple[Any, float]] = {}
-
-    def make(self, kind: str, **fields: Any) -> Any:
-        """See `Bus.make`."""
-        arrays = {name: np.array(x) for name, x in fields.items() if isinstance(x, list) and name != "name"}
-        return self._store.types[kind](**{**fields, **arrays})
-
-    def latest(self) -> dict[str, tuple[Any, float]]:
-        """See `Bus.latest`; a message that is none of its topic's type does not count."""
-        for topic, subscriber in self._subscribers.items():
-            if (sample := subscriber.try_recv()) is not None:
-                try:
-                    message = self._store.deserialize_cdr(sample.payload.to_bytes(), INPUTS[topic])
-                except Exception as error:
-                    print(f"{topic}: not a {INPUTS[topic]} ({type(error).__name__})", file=sys.stderr)
-                    continue
-                self._latest[topic] = message, time.monotonic()
-        return self._latest
-
-    def publish(self, topic: str, message: Any) -> None:
-        """See `Bus.publish`."""
-        self._session.put(topic, bytes(self._store.serialize_cdr(message, OUTPUTS[topic])))
-
-    def close(self) -> None:
-        """See `Bus.close`."""
-        self._session.close()
+    def _frame(self, name: str) -> Pose | None:
+        """A frame in the world; None if no chain of fresh transforms leads there."""
+        pose = Pose(np.zeros(3), Rotation.identity())
+        for _ in range(len(self._frames) + 1):
+            if name in ("", self._world):
+                return pose
+            name, own, when = self._frames.get(name, (name, pose, -np.inf))
+            if time.monotonic() - when > self._ages["tf"]:
+                return None
+            pose = own @ pose
+        return None
 
 
 class PolicyNode:
     """Commands of a guarded policy for what the topics say."""
 
-    def __init__(
-        self, bus: Bus, guard: congrasp.Guard, hand: Hand, obj: GraspObject, heading: np.ndarray, approach_steps: int
-    ):
-        self._bus, self._guard, self._approach_steps = bus, guard, approach_steps
-        self._names = [joint.name for joint in hand.joints]
-        self._object, self._heading = obj, heading / np.linalg.norm(heading)
-        self._base: tuple[np.ndarray, Rotation] | None = None
+    def __init__(self, bus: Bus, guard: congrasp.Guard, sensors: Sensors, request: congrasp.GraspRequest, plan: "Plan"):
+        """Args: the request lacks where all is."""
+        self._bus, self._guard, self._sensors, self._request, self._plan = bus, guard, sensors, request, plan
+        self._base: Pose | None = None
         self._followed = 0
 
     def step(self) -> congrasp.Command | None:
         """Reads the topics and commands; None until the episode has begun."""
-        joints, palm, thing = self._read()
-        if self._base is None and joints is not None and palm is not None and thing is not None:
-            self._begin(joints, palm, thing)
+        sensors = self._sensors
+        sensors.take(self._bus.receive())
+        (q, velocity), palm, thing = sensors.joints(), sensors.palm(), sensors.object()
         if self._base is None:
-            return None
-        command = self._guard.step(self._state(joints, palm, thing))
+            if palm is None or thing is None or not np.isfinite(q).all():
+                return None
+            self._base = palm
+            self._guard.reset(dataclasses.replace(self._request, q=q, wrist=palm.arrays(), object_pose=thing.arrays()))
+        state = {"q": q, "table": np.asarray(self._followed < self._plan.approach_steps)}
+        if np.isfinite(velocity).all():
+            state["q_velocity"] = velocity
+        down = Pose(-self._plan.rise(self._followed), Rotation.identity())  # the policy rises with the hand
+        if palm is not None:
+            seen = self._base.inverse() @ down @ palm
+            state["u"] = np.append(seen.position, seen.rotation.as_euler("XYZ"))
+        if thing is not None:
+            state["object_position"], state["object_quaternion"] = (down @ thing).arrays()
+        command = self._guard.step(state)
+        if not self._plan.dry_run:
+            self._publish(command, down)
         self._followed += command.mode == "follow"
-        self._publish(command)
         return command
 
-    def _read(self) -> tuple[Any | None, Pose | None, Pose | None]:
-        """Joints, palm and object as the topics say; None for one that is silent or says no pose."""
-        now = time.monotonic()
-        heard = {topic: message for topic, (message, came) in self._bus.latest().items() if now - came <= SILENT}
-        palm, file = (pose_of(heard[topic]) if topic in heard else None for topic in ("wrist_pose", "object_pose"))
-        thing = file and (file[0] - file[1].apply(self._object.origin), file[1])  # its frame is about its centre
-        return heard.get("joint_states"), palm, thing
-
-    def _begin(self, joints: Any, palm: Pose, thing: Pose) -> None:
-        """Begins an episode where hand and object are, unless a joint is missing."""
-        q = self._by_name(joints.name, joints.position)
-        if not np.isfinite(q).all():
-            return
-        request = congrasp.GraspRequest(
-            {"heading": {"position": np.zeros(3), "direction": self._heading}},
-            surface=self._object.points,
-            q=q,
-            wrist=(palm[0], palm[1].as_quat(scalar_first=True)),
-            object_pose=(thing[0], thing[1].as_quat(scalar_first=True)),
-        )
-        self._guard.reset(request)
-        self._base = palm
-
-    def _state(self, joints: Any | None, palm: Pose | None, thing: Pose | None) -> dict[str, np.ndarray]:
-        """What `Policy.act` takes, as far as it is known."""
-        assert self._base is not None
-        state = {"table": np.asarray(self._followed < self._approach_steps)}
-        if joints is not None:
-            state["q"] = self._by_name(joints.name, joints.position)
-            if len(joints.velocity) == len(joints.name):
-                state["q_velocity"] = self._by_name(joints.name, joints.velocity)
-        if palm is not None:
-            back = self._base[1].inv()
-            state["u"] = np.append(back.apply(palm[0] - self._base[0]), (back * palm[1]).as_euler("XYZ"))
-        if thing is not None:
-            state |= {"object_position": thing[0], "object_quaternion": thing[1].as_quat(scalar_first=True)}
-        return state
-
-    def _by_name(self, names: Any, values: Any) -> np.ndarray:
-        """(F,) values in the hand's order; NaN for a joint that is not named."""
-        given = dict(zip(names, values, strict=False))
-        return np.array([given.get(name, np.nan) for name in self._names])
-
-    def _publish(self, command: congrasp.Command) -> None:
+    def _publish(self, command: congrasp.Command, down: Pose) -> None:
         """Sends the targets."""
         assert self._base is not None
-        make, (base, base_turn) = self._bus.make, self._base
-        stamp = time.time_ns()
+        make, stamp = self._bus.make, time.time_ns()
         now = make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
-        header = make("std_msgs/msg/Header", stamp=now, frame_id="world")
+        header = make("std_msgs/msg/Header", stamp=now, frame_id=self._plan.world)
         position, effort = command.q_target.tolist(), command.q_torque.tolist()
-        joints = make(JOINTS, header=header, name=self._names, position=position, velocity=[], effort=effort)
-        place = base + base_turn.apply(command.u_target[:3])
-        turn = (base_turn * Rotation.from_euler("XYZ", command.u_target[3:])).as_quat()
+        joints = make(JOINTS, header=header, name=self._sensors.names, position=position, velocity=[], effort=effort)
+        palm = self._base @ Pose(command.u_target[:3], Rotation.from_euler("XYZ", command.u_target[3:]))
+        carrier = down.inverse() @ palm @ self._sensors.mount.inverse()
+        place, turn = carrier.position.tolist(), carrier.rotation.as_quat().tolist()
         pose = make(
             "geometry_msgs/msg/Pose",
-            position=make("geometry_msgs/msg/Point", **dict(zip("xyz", place.tolist(), strict=True))),
-            orientation=make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn.tolist(), strict=True))),
+            position=make("geometry_msgs/msg/Point", **dict(zip("xyz", place, strict=True))),
+            orientation=make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True))),
         )
         self._bus.publish("joint_command", joints)
         self._bus.publish("wrist_command", make(POSE, header=header, pose=pose))
 
 
-def pose_of(message: Any) -> Pose | None:
-    """Position and rotation of a PoseStamped; None if it is none."""
-    place, turn = message.pose.position, message.pose.orientation
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """The course of the episode."""
+
+    world: str
+    """Frame of the commands."""
+    approach_steps: int
+    """Control steps with fresh answers until the object may leave the table."""
+    lift: float
+    """m by which the hand then rises."""
+    step: float
+    """m of the way up in a control step, the mean."""
+    dry_run: bool
+
+    def rise(self, followed: int) -> np.ndarray:
+        """(3,) m by which the hand has risen after so many control steps: a smooth step."""
+        share = np.clip((followed - self.approach_steps) * self.step / self.lift, 0.0, 1.0) if self.lift else 0.0
+        return np.array([0.0, 0.0, self.lift * share**2 * (3.0 - 2.0 * share)])
+
+
+def stamped(header: Any) -> float:
+    """When a message was stamped, by `time.monotonic`; now without a stamp, or with one that is yet to come."""
+    stamp = header.stamp.sec + 1e-9 * header.stamp.nanosec
+    return time.monotonic() - (max(time.time() - stamp, 0.0) if stamp else 0.0)
+
+
+def read_pose(place: Any, turn: Any) -> Pose | None:
+    """The pose of a message's vector and quaternion; None if it is none."""
     position, quaternion = np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w])
     if not (np.isfinite(position).all() and 0.5 < np.linalg.norm(quaternion) < 2.0):
         return None
-    return position, Rotation.from_quat(quaternion)
+    return Pose(position, Rotation.from_quat(quaternion))
+
+
+def offset_of(text: str) -> Pose:
+    """The pose of X Y Z ROLL PITCH YAW, metres and degrees."""
+    try:
+        x, y, z, *angles = map(float, text.split())
+        return Pose(np.array([x, y, z]), Rotation.from_euler("xyz", angles, degrees=True))
+    except ValueError:
+        raise congrasp.CongraspError(f"'{text}' is no offset.", "Write X Y Z ROLL PITCH YAW: 0 0 0.1 0 0 90.") from None
+
+
+def joints_of(pairs: tuple[str, ...], joints: list[str]) -> dict[str, str]:
+    """The robot's names of the hand's joints, from HAND=ROBOT."""
+    renamed = {hand: robot for hand, _, robot in (pair.partition("=") for pair in pairs)}
+    for hand, robot in renamed.items():
+        if hand not in joints or not robot:
+            raise congrasp.CongraspError(
+                f"--joint-map has '{hand}={robot}'.", f"Write HAND=ROBOT; the hand's are {', '.join(joints)}."
+            )
+    return renamed
+
+
+def slowed(limits: congrasp.JointLimits, share: float) -> congrasp.JointLimits:
+    """Limits of a hand that does everything at a share of the speed."""
+    return dataclasses.replace(limits, speed=limits.speed * share, acceleration=limits.acceleration * share**2)
+
+
+def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient) -> None:
+    """Commands until it is interrupted, and prints what changes."""
+    described, slow = client.metadata(), arguments.slow
+    if described["limits"] is None:
+        raise congrasp.CongraspError(f"Joints of the hand '{arguments.hand}' share motors.", "This node is for others.")
+    obj, period = find_object(arguments.object), described["period"] / slow
+    hand, waypoints = get_hand(arguments.hand), described["trajectory_points"]
+    request = read_request(obj, hand, waypoints, **dataclasses.asdict(arguments.constraint))
+    heading = {"position": np.zeros(3), "direction": np.array([0.0, 0.0, -1.0]), **request.constraints["heading"]}
+    constraints = {**request.constraints, "heading": heading}
+    request = dataclasses.replace(request, constraints=constraints, surface=obj.points)
+    object_age = arguments.object_age or (TRACKER_AGE if described["observation"] == "tracked" else arguments.robot_age)
+    sensors = Sensors(arguments, described["joints"], obj.origin, object_age)
+    steps = round(arguments.approach / described["period"]) or described["approach_steps"]
+    plan = Plan(arguments.world, steps, arguments.lift, LIFT_SPEED * described["period"], arguments.dry_run)
+    limits = slowed(congrasp.JointLimits(**described["limits"]), slow)
+    times = {"period": period, "wait": 0.6 * period, "stale": arguments.stale / slow, "hold": arguments.hold / slow}
+    with congrasp.Guard(client, limits, np.array(described["open_pose"]), fallback="open", **times) as guard:
+        node, ticker, printed = PolicyNode(bus, guard, sensors, request, plan), congrasp.Ticker(1.0 / period), ""
+        begin = last = ticker.wait()
+        try:
+            while True:
+                now, command = ticker.wait(), node.step()
+                waiting = "wait" if now > begin + WAITING else ""
+                mode = waiting if command is None else command.mode
+                if mode != printed or (mode in ("wait", "follow") and arguments.dry_run and now > last + 1.0):
+                    print(report(command, guard, sensors), flush=True)
+                    printed, last = mode, now
+        except KeyboardInterrupt:
+            print(f"{guard.counters}, {ticker.missed} deadlines missed")
+
+
+def report(command: congrasp.Command | None, guard: congrasp.Guard, sensors: Sensors) -> str:
+    """What the node does, in a line."""
+    missing = sensors.missing()
+    if command is None:
+        return f"Waiting for {missing}."
+    if command.mode != "follow":
+        return f"{command.mode}: {guard.trouble or missing}"
+    way, turn = np.linalg.norm(command.u_target.reshape(2, 3), axis=1)
+    return f"follow: the wrist is to be {100 * way:.1f} cm and {np.degrees(turn):.0f} degrees from where it began"
 
 
 def main() -> int:
     """Runs the node until it is interrupted."""
     arguments = tyro.cli(Arguments, description=__doc__)
-    hand, ticker = get_hand(arguments.hand), congrasp.Ticker(arguments.rate)
-    obj, heading, period = find_object(arguments.object), np.array(arguments.heading), 1.0 / arguments.rate
-    if not np.linalg.norm(heading) > 0.0:
-        raise congrasp.CongraspError("--heading is no direction.", "Give one, such as 0 0 -1.")
-    limits, steps = congrasp.JointLimits.of_hand(hand), round(arguments.approach * arguments.rate)
-    client = congrasp.PolicyClient(arguments.connect, hand=hand.name, timeout=0.2, certs=arguments.certs)
+    if not 0.0 < arguments.slow <= 1.0 or not 0.0 <= arguments.lift <= 0.3:
+        raise congrasp.CongraspError("--slow is above 0 and at most 1, --lift from 0 to 0.3 m.")
     with (
-        congrasp.Guard(client, limits, hand.q_open, period=period, wait=0.6 * period, fallback="open") as guard,
         contextlib.closing(ZenohBus(arguments.zenoh) if arguments.zenoh else RosBus()) as bus,
+        congrasp.PolicyClient(arguments.connect, hand=arguments.hand, timeout=0.2, certs=arguments.certs) as client,
     ):
-        node, mode = PolicyNode(bus, guard, hand, obj, heading, steps), ""
-        try:
-            while True:
-                ticker.wait()
-                command = node.step()
-                if command is not None and command.mode != mode:
-                    mode = command.mode
-                    print(f"{mode} {guard.trouble}".rstrip(), flush=True)
-        except KeyboardInterrupt:
-            print(f"{guard.counters}, {ticker.missed} deadlines missed")
+        run(arguments, bus, client)
     return 0
 
 

@@ -9,6 +9,7 @@ from jax.sharding import PartitionSpec
 
 from congrasp.common.config import RunConfig
 from congrasp.common.policy.bundle import PolicySpec, full_layout
+from congrasp.common.task.teaching import EXTRA
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import TAUGHT, WORLDS, RolloutForm, Schema
 from congrasp.learner.distributed.collectives import AXIS
@@ -22,7 +23,7 @@ def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> Rollout
         observation=sum(size for _, size in spec.layout),
         action=spec.action_size,
         half=config.half_observations,
-        teacher=0 if TAUGHT.keys().isdisjoint(schema) else sum(size for _, size in full_layout(config.task)),
+        teacher=0 if TAUGHT.keys().isdisjoint(schema) else sum(size for _, size in full_layout(config.task)) + EXTRA,
         privileged=spec.privileged_size,
         arrays=schema,
     )

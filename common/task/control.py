@@ -61,9 +61,8 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
     if control.finger_guidance:
         motors += _finger_guidance(scene, control.finger_guidance)
     q_target = joint_positions(hand, jnp.clip(motors, *motor_limits(hand)))
-    ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
-    limit = _position_limit(scene, control)
-    return Action(q_target, wrist_target(hand, control, state, limit, ahead, action[..., fingers:]))
+    lead = wrist_lead(hand, control, guided(scene, control), action[..., fingers:])
+    return Action(q_target, state.u + lead + carried_lead(hand, state))
 
 
 def _position_limit(scene: Scene, control: ControlConfig) -> Array:
@@ -79,24 +78,44 @@ def _position_limit(scene: Scene, control: ControlConfig) -> Array:
     return jnp.where(scene.state.table, slow + share * (fast - slow), control.guidance_position_limit)
 
 
-def wrist_target(
-    hand: Hand, control: ControlConfig, state: SceneState, limit: Array, ahead: Array, residual: Array
-) -> Array:
-    """Wrist targets u_tgt (B, 6), see `decode`.
+class Guided(NamedTuple):
+    """Guidance and state of the wrist, from which its target follows together with the action."""
+
+    ahead: Array
+    """(..., 6) displacement from the wrist to its guidance, m and rad."""
+    limit: Array
+    """(...,) greatest distance of the target from the wrist, m."""
+    velocity: Array
+    """(..., 6) speeds of the wrist joints, m/s and rad/s."""
+    table: Array
+    """(...,) bool: the table is present."""
+
+    def bounded(self, control: ControlConfig) -> Array:
+        """Returns the lead (..., 6) of the guidance alone, before the limits of acceleration."""
+        slides = _limit(self.ahead[..., :3], self.limit[..., None])
+        return jnp.concatenate([slides, _limit(self.ahead[..., 3:], control.guidance_rotation_limit)], -1)
+
+
+def guided(scene: Scene, control: ControlConfig) -> Guided:
+    """Returns the guidance of the wrist in a scene."""
+    state = scene.state
+    ahead = wrist_to_joints(state, *guidance_pose(scene, control)) - state.u
+    return Guided(ahead, _position_limit(scene, control), state.u_velocity, state.table)
+
+
+def wrist_lead(hand: Hand, control: ControlConfig, given: Guided, residual: Array) -> Array:
+    """Returns u_tgt - u (..., 6) without the part that carries the load, see `decode`.
 
     Args:
       hand: the hand, for its servos.
       control: limits and scales.
-      state: state at the current control step.
-      limit: (B,) greatest distance of the target from the wrist, m.
-      ahead: (B, 6) displacement from the wrist to its guidance, m and rad.
-      residual: (B, 6) wrist part of the action.
+      given: guidance and state of the wrist.
+      residual: (..., 6) wrist part of the action.
     """
-    share = jnp.where(state.table, 1.0, control.hold_acceleration)
-    carried = jnp.where(state.table[..., None], 0.0, -state.wrist_load)
+    share = jnp.where(given.table, 1.0, control.hold_acceleration)
     leads = []
     for part, scale, farthest, hardest in (
-        (slice(0, 3), control.wrist_position_scale, limit[:, None], control.wrist_acceleration),
+        (slice(0, 3), control.wrist_position_scale, given.limit[..., None], control.wrist_acceleration),
         (
             slice(3, 6),
             control.wrist_rotation_scale,
@@ -106,9 +125,16 @@ def wrist_target(
     ):
         stiffness, damping = hand.wrist_servos[:, part.start]
         servo = _Servo(stiffness, damping, farthest, hardest)
-        lead = _lead(servo, ahead[..., part], scale * residual[..., part], state.u_velocity[..., part], share)
-        leads.append(lead + carried[..., part] / stiffness)
-    return state.u + jnp.concatenate(leads, -1)
+        leads.append(
+            _lead(servo, given.ahead[..., part], scale * residual[..., part], given.velocity[..., part], share)
+        )
+    return jnp.concatenate(leads, -1)
+
+
+def carried_lead(hand: Hand, state: SceneState) -> Array:
+    """(B, 6) by which the wrist's target leads so that its servos carry the load, once the table is gone."""
+    stiffness, _ = hand.wrist_servos
+    return jnp.where(state.table[..., None], 0.0, -state.wrist_load / stiffness)
 
 
 def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array, u_target: Array) -> Array:
@@ -153,23 +179,23 @@ class _Servo(NamedTuple):
     damping: Array | float
     """kv / m, 1/s."""
     farthest: Array | float
-    """Greatest lead (B, 1) of the target over the joint, m or rad."""
+    """Greatest lead (..., 1) of the target over the joint, m or rad."""
     hardest: float
     """Greatest acceleration, m/s^2 or rad/s^2; 0 for no limit."""
 
 
 def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: Array) -> Array:
-    """Lead (B, 3) of the target over three wrist joints.
+    """Lead (..., 3) of the target over three wrist joints.
 
     A target that leads by damping v / stiffness keeps a joint's speed; one r from there accelerates it by stiffness r.
     Braking along the guidance may use v stiffness / damping, however small the share is.
 
     Args:
       servo: servos of the joints.
-      ahead: (B, 3) displacement from the joints to the guidance.
-      residual: (B, 3) displacement added by the action.
-      velocity: (B, 3) speeds of the joints.
-      share: (B,) share of the greatest acceleration, except for braking.
+      ahead: (..., 3) displacement from the joints to the guidance.
+      residual: (..., 3) displacement added by the action.
+      velocity: (..., 3) speeds of the joints.
+      share: (...,) share of the greatest acceleration, except for braking.
     """
     rate, hardest = servo.stiffness / servo.damping, jnp.asarray(servo.hardest)
     steady = velocity / rate

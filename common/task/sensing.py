@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from congrasp.common import rotations
 from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.task.resting import resting_mean
 from congrasp.common.task.types import Array, SceneState
 
 
@@ -34,6 +35,10 @@ class Sensors(NamedTuple):
     """(B,) rad, standard deviation of the rotation about each axis of the world frame."""
     dropout: Array
     """(B,) probability that a sample is lost."""
+    position_bias: Array
+    """(B, 3) m, constant error of the samples, world frame."""
+    rotation_bias: Array
+    """(B, 3) rad, rotation vector of a constant error of the samples, world frame."""
 
 
 class Tracker(NamedTuple):
@@ -43,7 +48,9 @@ class Tracker(NamedTuple):
     poses: Array
     """(B, K, 7) true positions and quaternions of the object in the last K control steps, newest first."""
     first: Array
-    """(B, 7) pose shown at the start of the episode."""
+    """(B, 7) resting pose of the object: the pose shown at the start of the episode, or the mean since then."""
+    rested: Array
+    """(B,) number of readings in that mean; 0 once the object has moved."""
     shown: Array
     """(B, 7) pose shown now."""
 
@@ -79,6 +86,11 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
     def drawn(number: int, limits: tuple[float, float]) -> Array:
         return jax.random.uniform(keys[number], (batch,), minval=limits[0], maxval=limits[1])
 
+    def bias(number: int, limits: tuple[float, float]) -> Array:
+        size, direction = jax.random.split(jax.random.fold_in(key, number))
+        deviation = jax.random.uniform(size, (batch, 1), minval=limits[0], maxval=limits[1])
+        return deviation * jax.random.normal(direction, (batch, 3))
+
     return Sensors(
         key=jax.random.key_data(jax.random.split(keys[0], batch)),
         period=jnp.maximum(drawn(1, config.period) / control_dt, 1.0),
@@ -87,6 +99,8 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
         position_noise=drawn(4, config.position_noise),
         rotation_noise=drawn(5, config.rotation_noise),
         dropout=drawn(6, config.dropout),
+        position_bias=bias(7, config.position_bias),
+        rotation_bias=bias(8, config.rotation_bias),
     )
 
 
@@ -99,10 +113,13 @@ def begin(sensors: Sensors, steps: int, position: Array, quaternion: Array) -> T
     """Returns trackers of objects that have rested at poses (B, 3), (B, 4), with `steps` (K) samples in transit."""
     pose = jnp.concatenate([position, quaternion], -1)
     shown = _sampled(sensors, jnp.zeros(pose.shape[0], jnp.int32), pose)[0]
-    return Tracker(sensors, jnp.broadcast_to(pose[:, None], (len(pose), steps, 7)), shown, shown)
+    rested = jnp.ones(len(pose), jnp.int32)
+    return Tracker(sensors, jnp.broadcast_to(pose[:, None], (len(pose), steps, 7)), shown, rested, shown)
 
 
-def track(tracker: Tracker, time: Array, position: Array, quaternion: Array) -> Tracker:
+def track(
+    tracker: Tracker, time: Array, position: Array, quaternion: Array, table: Array | bool = True, settle: float = 0.0
+) -> Tracker:
     """Advances the trackers by one control step.
 
     A sample is taken in control step n where floor(n / period + phase) rises, and is shown from step n + delay on.
@@ -112,6 +129,8 @@ def track(tracker: Tracker, time: Array, position: Array, quaternion: Array) -> 
       time: (B,) int control steps since the start of the episodes, including this one.
       position: (B, 3) true position of the object after this step.
       quaternion: (B, 4) true orientation of the object.
+      table: (B,) bool: the table is present.
+      settle: see `SensingConfig`.
     """
     sensors = tracker.sensors
     pose = jnp.concatenate([position, quaternion], -1)
@@ -121,7 +140,11 @@ def track(tracker: Tracker, time: Array, position: Array, quaternion: Array) -> 
     arrived = jnp.take_along_axis(poses, sensors.delay[:, None, None], 1)[:, 0]
     sample, lost = _sampled(sensors, time, arrived)
     fresh = (periods[1] > periods[0]) & ~lost
-    return tracker._replace(poses=poses, shown=jnp.where(fresh[:, None], sample, tracker.shown))
+    shown = jnp.where(fresh[:, None], sample, tracker.shown)
+    if settle:
+        first, rested = resting_mean(jnp, tracker.first, tracker.rested, shown, jnp.asarray(table), settle)
+        tracker = tracker._replace(first=first, rested=rested)
+    return tracker._replace(poses=poses, shown=shown)
 
 
 def _sampled(sensors: Sensors, time: Array, pose: Array) -> tuple[Array, Array]:
@@ -132,8 +155,9 @@ def _sampled(sensors: Sensors, time: Array, pose: Array) -> tuple[Array, Array]:
         return jax.random.normal(errors, (6,)), jax.random.uniform(loss)
 
     errors, luck = jax.vmap(noise)(sensors.key, time)
-    position = pose[:, :3] + sensors.position_noise[:, None] * errors[:, :3]
-    turn = rotations.from_rotation_vector(sensors.rotation_noise[:, None] * errors[:, 3:])
+    position = pose[:, :3] + sensors.position_bias + sensors.position_noise[:, None] * errors[:, :3]
+    noise_turn = rotations.from_rotation_vector(sensors.rotation_noise[:, None] * errors[:, 3:])
+    turn = rotations.multiply(noise_turn, rotations.from_rotation_vector(sensors.rotation_bias))
     return jnp.concatenate([position, rotations.multiply(turn, pose[:, 3:])], -1), luck < sensors.dropout
 
 

@@ -55,7 +55,7 @@ PRIVILEGED: Schema = {
 }
 """Additional arrays for a critic with privileged inputs (`common.task.privileged`)."""
 TAUGHT: Schema = {"teacher_observation": ArraySpec(_OBSERVATION, ("T", "B", "S"))}
-"""Additional arrays for a teacher that labels the rollout: the full observation."""
+"""Additional arrays for a teacher that labels the rollout (`common.task.teaching`)."""
 RECORDABLE: Schema = {**RECORDED, **PRIVILEGED, **TAUGHT}
 """All recordable arrays."""
 

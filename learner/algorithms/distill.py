@@ -2,8 +2,9 @@
 
 The student acts, and the teacher, which observes the full state, labels each state with its action (DAgger:
 Ross et al. 2011, arXiv 1011.0686, without its mixture of the two and without keeping old states). The student's mean is
-regressed on the teacher's, in units of the teacher's standard deviation: up to a constant the KL divergence from the
-student to the teacher, whose standard deviation the student keeps. The critic learns nothing.
+regressed on the action that gives the teacher's targets (`common.task.teaching`), in units of the teacher's standard
+deviation: up to a constant the KL divergence from the student to the teacher, whose standard deviation the student
+keeps. The critic learns nothing.
 """
 
 import functools
@@ -16,14 +17,17 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from congrasp.common.config import DistillConfig, RunConfig, TaskConfig
+from congrasp.common.config import ControlConfig, DistillConfig, RunConfig, TaskConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, PolicySpec, full_layout
 from congrasp.common.policy.network import Layout, Params
 from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.task.teaching import EXTRA, student_action
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import RECORDABLE, Schema
 from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
@@ -37,6 +41,8 @@ _LAST_RATE = 0.02
 _CHECKED = {"imitation_kl": "rollouts", "actor_grad_norm": "optimisation"}
 """Metrics that must be finite, and their names in errors."""
 
+Body = tuple[Hand, ControlConfig]
+"""The hand, and how its actions become targets."""
 Learnt = tuple[Params, Any, Array]
 """The actor's parameters, the optimiser's state and the random key."""
 
@@ -70,6 +76,7 @@ class Distillation:
         _check(teacher, spec, config.task)
         self._spec, self._config, self._updates = spec, config.distill, config.updates
         self._layouts = (spec.layout, teacher.spec.layout)
+        self._body = get_hand(config.task.hand), config.task.control
         self._teacher = teacher.inference_parameters
 
     def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
@@ -120,7 +127,7 @@ class Distillation:
         given = _Given(normalizer.observation_affine(frozen, self._spec.layout), self._teacher, jnp.float32(rate))
         learnt, given = shard(((state.params["actor"], state.optimizer, state.key), given), mesh)
         learnt, metrics = unreplicate(
-            _optimise(learnt, arrays, given, layouts=self._layouts, config=config, mesh=mesh), mesh
+            _optimise(learnt, arrays, given, layouts=self._layouts, body=self._body, config=config, mesh=mesh), mesh
         )
         metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
         for name, source in _CHECKED.items():
@@ -183,18 +190,19 @@ def _moments(observation: Array, *, mesh: Mesh | None) -> Statistics:
     return shard_map(mesh, program, _SPECS["observation"])(observation)
 
 
-@functools.partial(jax.jit, static_argnames=("layouts", "config", "mesh"))
+@functools.partial(jax.jit, static_argnames=("layouts", "body", "config", "mesh"))
 def _optimise(
     learnt: Learnt,
     batch: dict[str, Array],
     given: _Given,
     *,
     layouts: tuple[Layout, Layout],
+    body: Body,
     config: DistillConfig,
     mesh: Mesh | None,
 ) -> tuple[Learnt, dict[str, Array]]:
     """Epochs over the batch for a student and a teacher of these layouts; what was learnt, and metrics."""
-    program = functools.partial(_program, collectives=Collectives(mesh), layouts=layouts, config=config)
+    program = functools.partial(_program, collectives=Collectives(mesh), layouts=layouts, body=body, config=config)
     return shard_map(mesh, program, (REPLICATED, _SPECS, REPLICATED))(learnt, batch, given)
 
 
@@ -205,12 +213,15 @@ def _program(
     *,
     collectives: Collectives,
     layouts: tuple[Layout, Layout],
+    body: Body,
     config: DistillConfig,
 ) -> tuple[Learnt, dict[str, Array]]:
     """Body of `_optimise` for one rank: shuffled minibatches, each sample at most once an epoch."""
     actor, optimizer, key = learnt
     transform = _transform(config.max_grad_norm)
-    labels = bundles.mean_action(layouts[1], given.teacher, batch["teacher_observation"])
+    rows = batch["teacher_observation"]
+    labels = bundles.mean_action(layouts[1], given.teacher, rows[..., :-EXTRA])
+    labels = student_action(*body, rows, labels)
     labels = labels.reshape(-1, labels.shape[-1])
     observation = batch["observation"].reshape(len(labels), -1)
     size = len(labels) // config.minibatches

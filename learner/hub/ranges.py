@@ -26,6 +26,7 @@ from congrasp.common.task.observation import observe
 from congrasp.common.task.privileged import Parameters
 from congrasp.common.task.reward import reward_terms
 from congrasp.common.task.sensing import Readings, draw_sensors
+from congrasp.common.task.teaching import observe_for_teacher
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.learner.hub.admission import Ranges
 
@@ -77,13 +78,13 @@ def _evaluate(
     readings: Readings,
     parameters: Parameters,
 ) -> tuple[Any, Any, Any, Any]:
-    """Evaluates observations (B, D), (B, S) of the full state and (B, P) of the critic, and unweighted reward terms."""
+    """Evaluates observations (B, D), (B, S) of a teacher and (B, P) of the critic, and unweighted reward terms."""
     full = dataclasses.replace(task, observation="full")
     scene = scene_of(hand, full, state, surface, goal)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
     terms = reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
     own = scene._replace(task=task, readings=readings)
-    return observe(own), observe(scene), privileged.observe(own, parameters), terms
+    return observe(own), observe_for_teacher(scene, own, task.control), privileged.observe(own, parameters), terms
 
 
 def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, Readings, Parameters]:

@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -13,7 +14,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.assets.hands.geometry import geom_mesh
 from congrasp.services.viz.episode import episode_shapes
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.scene import Shape
+from congrasp.services.viz.scene import Camera, Shape
 from congrasp.services.viz.shapes import fit, shape_points
 from congrasp.services.viz.sheets import save_png
 
@@ -24,6 +25,7 @@ CSV, TRAJECTORY, PICTURE = "arm.csv", "arm_trajectory.json", "arm.png"
 _SIZE = (1280, 960)  # pixels
 _AHEAD = np.array([0.35, -1.0, 0.45])  # from the robot to the camera, in the frame of the base
 _GREY = (0.75, 0.76, 0.78)
+_EDGE, _UNDER = 0.6, 0.001  # table beyond arm and object, and below the grasp's own table, m
 
 
 def save_trajectories(folder: pathlib.Path, motion: "ArmMotion") -> None:
@@ -56,19 +58,33 @@ def save_trajectories(folder: pathlib.Path, motion: "ArmMotion") -> None:
 
 def save_picture(path: pathlib.Path, motion: "ArmMotion", episode: Message, step: int) -> None:
     """Draws the whole robot with object and table at a control step of its episode, as PNG."""
-    base = motion.world_base
-    arm = _arm_shapes(motion, step)
-    scene = [shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "table"]
-    points = np.concatenate([shape_points(shape) for shape in (*arm, *scene)])
-    low, high = points.min(0), points.max(0)
-    middle, radius = (low + high) / 2, float(np.linalg.norm(high[:2] - low[:2])) / 2 + 0.1
-    table = Shape("table", (1.6 * radius, 0.0), _GREY, np.array([*middle[:2], 0.0]), shine=0.0, shadow=False)
-    camera = fit(points, base.rotation.apply(_AHEAD), _SIZE[0] / _SIZE[1])
-    save_png(path, render_scene([*arm, *scene, table], camera, _SIZE))
+    shapes = [*robot_shapes(motion, episode, step), *_grasp_shapes(episode, step)]
+    save_png(path, render_scene(shapes, robot_camera(motion, episode, [step], _SIZE[0] / _SIZE[1]), _SIZE))
+
+
+def robot_camera(motion: "ArmMotion", episode: Message, steps: Sequence[int], aspect: float) -> Camera:
+    """Returns a camera that shows the whole robot and the object in all of the control steps."""
+    shapes = [shape for step in steps for shape in (*_arm_shapes(motion, step), *_grasp_shapes(episode, step))]
+    points = np.concatenate([shape_points(shape) for shape in shapes])
+    return fit(points, motion.world_base.rotation.apply(_AHEAD), aspect)
+
+
+def robot_shapes(motion: "ArmMotion", episode: Message, step: int) -> list[Shape]:
+    """Returns the arm at a control step of its episode and the table on which arm and object stand."""
+    ends = motion.world_base.position[:2], episode.arrays["object_position"][0][:2]
+    radius = float(np.linalg.norm(ends[0] - ends[1])) / 2 + _EDGE
+    middle = np.array([*np.mean(ends, axis=0), -_UNDER])
+    table = Shape("table", (radius, 0.0), _GREY, middle, shine=0.0, shadow=False)
+    return [*_arm_shapes(motion, step), table]
+
+
+def _grasp_shapes(episode: Message, step: int) -> list[Shape]:
+    """Returns hand and object without the table of the hand alone."""
+    return [shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "table"]
 
 
 def _arm_shapes(motion: "ArmMotion", step: int) -> list[Shape]:
-    """Visual shapes of the arm's file at a control step, in the world frame."""
+    """Returns the visual shapes of the arm at a control step, world frame."""
     robot, scene, base = motion.robot, motion.scene, motion.world_base
     data = mujoco.MjData(robot.model)
     q = robot.model.qpos0.copy()

@@ -9,11 +9,13 @@ import numpy as np
 
 from congrasp.common.errors import LayoutError, RefusedError
 from congrasp.common.request import GraspRequest
+from congrasp.common.task.resting import resting_mean
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy import Answer, Policy, State
 
 _REQUIRED = ("surface", "q", "wrist", "object_pose")
 _MEASURED = ("q", "u", "object_position", "object_quaternion")
+_FIRST = ("object_position_initial", "object_quaternion_initial")
 _READ = (*_MEASURED, "q_target", "u_target")
 _LONGEST = 64  # control steps that a policy may look back
 
@@ -26,6 +28,7 @@ class EpisodePolicy(Policy):
         self._constraints: list[str] = []
         self._time = 0
         self._packer: _Packer | None = None
+        self._rested = np.asarray(1)  # readings in the mean of the object's pose; 0 once it has moved
         self._past: list[Mapping[str, np.ndarray]] = []  # readings of the control steps before this one, newest first
 
     def _query(self, query: Message) -> Message:
@@ -40,15 +43,17 @@ class EpisodePolicy(Policy):
         """See `Policy.reset`."""
         self._episode, self._packer = _episode_fields(request), None
         self._constraints, self._time, self._past = list(request.constraints), 0, []
+        self._rested = np.asarray(1)
 
     def act(self, state: State) -> Answer:
         """See `Policy.act`."""
-        (answer,) = self._ask(self._begun(), [state])
+        rest, rested = self._resting(state)
+        (answer,) = self._ask({**self._begun(), **rest}, [state])
         known = {**self._begun(), **state}
         reading = {name: _numbers(name, known[name]) for name in _READ}
         self._past = [reading, *self._past[: _LONGEST - 1]]
-        self._begun().update(q_target=answer.q_target, u_target=answer.u_target)
-        self._time += 1
+        self._begun().update(rest, q_target=answer.q_target, u_target=answer.u_target)
+        self._time, self._rested = self._time + 1, rested
         return answer
 
     def act_each(self, states: Sequence[State]) -> list[Answer]:
@@ -70,6 +75,19 @@ class EpisodePolicy(Policy):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def _resting(self, state: State) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Returns the resting pose with this reading, if the policy uses the mean, and the number of readings."""
+        episode, settle = self._begun(), self._packer.settle if self._packer else 0.0
+        if not (settle and self._time and {"object_position", "object_quaternion"} <= state.keys()):
+            return {}, self._rested
+        mean = np.concatenate([episode[name] for name in _FIRST])
+        reading = np.concatenate([_numbers(name, state[name]) for name in _MEASURED[2:]], axis=None)
+        if reading.shape != mean.shape or not np.isfinite(reading).all():
+            return {}, self._rested  # the query is refused
+        table = np.all(state.get("table", True))
+        mean, rested = resting_mean(np, mean, self._rested, reading, table, settle)
+        return dict(zip(_FIRST, np.split(mean.astype(np.float32), [3]), strict=True)), rested
 
     def _begun(self) -> dict[str, np.ndarray]:
         """The fields of the episode."""
@@ -110,7 +128,7 @@ class EpisodePolicy(Policy):
             self._packer = _Packer(reply.meta, episode, len(reply.arrays["q_target"]))
             if len(states) == 1 and not (self._past and self._packer.looks_back):
                 return reply, [[reply.arrays[name]] for name in ("action", "q_target", "u_target")]
-        now |= {name: episode[name] for name in ("q_target", "u_target")}
+        now |= {name: episode[name] for name in ("q_target", "u_target", *_FIRST)}
         reply = self._query(self._packer.pack([{**now, **state} for state in states], self._past, meta))
         return reply, self._packer.unpack(reply)
 
@@ -120,12 +138,13 @@ class _Packer:
 
     Attributes:
       most: states that the policy takes in one query.
+      settle: m, see `SensingConfig`; 0 where the object's first pose is that of the request.
       looks_back: whether it sees control steps before the present one.
     """
 
     def __init__(self, layout: Mapping[str, Any], episode: Mapping[str, np.ndarray], fingers: int):
         self._digest, self._fields, self._fingers = layout["layout"], layout["fields"], fingers
-        self.most = int(layout.get("states", 1))
+        self.most, self.settle = int(layout.get("states", 1)), float(layout.get("settle", 0.0))
         self._past = {name: self._fields[f"past_{name}"][1] for name in _READ if f"past_{name}" in self._fields}
         self.looks_back = bool(self._past)
         self._episode = np.zeros(layout["size"], np.float32)

@@ -4,6 +4,7 @@ The policy is asked in a thread of its own, so that no network holds the control
 """
 
 import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -13,12 +14,14 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
+from congrasp.services.client.floor import Floor
 from congrasp.services.client.limits import JointLimits, Limiter, as_numbers
 from congrasp.services.client.policy import Answer, Policy, State
 
 Fallback = Literal["freeze", "open"]
 Mode = Literal["follow", "hold", "freeze", "open"]
 _END = 2.0  # seconds that the asking thread has to end
+_LIFTED = 0.02  # m above its first height from which on an object counts as held
 
 
 @dataclasses.dataclass
@@ -49,10 +52,14 @@ class Counters:
     """Commands with a measurement or target that was not finite or misshapen."""
     torque: int = 0
     """Commands that the limits of torque drew back."""
+    acceleration: int = 0
+    """Commands that the limits of acceleration held back."""
     speed: int = 0
     """Commands that the limits of speed held back."""
     position: int = 0
     """Commands that the limits of position held back."""
+    table: int = 0
+    """Commands that kept the palm above the table."""
 
 
 class Command(NamedTuple):
@@ -78,44 +85,53 @@ class Guard:
 
     An answer is fresh when the state that it was asked with is at most `stale` old. While there is none, the last
     targets are held; after `hold` seconds without one, the fallback is taken and kept until the next `reset`: `freeze`
-    keeps the targets, `open` opens the fingers as fast as the limits allow and keeps the wrist. The policy continues
-    from the commanded targets, not from its own.
+    keeps the targets and their torques, `open` opens the fingers as fast as the limits allow and keeps the wrist.
+    `open` becomes `freeze` if the object may be held or a measurement is missing; `open()` opens in any case. The
+    policy continues from the commanded targets, not from those that it requested.
+
+    An object may be held once it was 2 cm above its first height, or `table` of a state was false, until the next
+    `reset`.
 
     Attributes:
       counters: what has happened.
-      trouble: reason why the last query had no answer; empty otherwise, also during a fallback, which keeps sending
-        queries.
+      trouble: cause of the last query without an answer; empty while there are answers, also during a fallback.
     """
 
     def __init__(
         self,
         policy: Policy,
-        limits: JointLimits,
-        open_pose: np.ndarray,
+        limits: JointLimits | None = None,
+        open_pose: np.ndarray | None = None,
         *,
         period: float = 0.01,
         wait: float = 0.006,
         stale: float = 0.05,
         hold: float = 0.5,
         fallback: Fallback = "freeze",
+        table: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 0.0),
         clock: Callable[[], float] = time.monotonic,
     ):
         """Starts the thread that asks the policy; nothing else may ask it from now on.
 
         Args:
           policy: the policy.
-          limits: of the F finger joints, each of which has a motor, then the six wrist joints (`JointLimits.of_hand`).
-          open_pose: (F,) rad: what `open` opens to.
+          limits: of the F finger joints, each of which has a motor, then the six wrist joints; by default those of the
+            policy's `metadata`.
+          open_pose: (F,) rad: what `open` opens to; likewise.
           period: seconds between two steps.
           wait: seconds of it that a step waits for its answer; the answer may also come in one of the next.
           stale: seconds.
           hold: seconds.
           fallback: what follows.
+          table: a, b, c, d in the world frame: the palm stays where a x + b y + c z >= d; (a, b, c) of length 1.
           clock: seconds, as `time.monotonic`.
 
         Raises:
           CongraspError: the limits and the open pose do not belong together, or a time is not positive.
+          TransportError: the policy's metadata is needed, and there is no response.
         """
+        if limits is None or open_pose is None:
+            limits, open_pose = _described(policy, limits, open_pose)
         fingers = len(limits.lower) - 6
         if fingers < 1 or not np.isfinite(as_numbers(open_pose, fingers)).all():
             raise CongraspError(
@@ -130,11 +146,13 @@ class Guard:
         self._limits, self._open = limits, as_numbers(open_pose, fingers)
         self._period, self._wait, self._stale, self._hold = period, wait, stale, hold
         self._fallback, self._clock, self._fingers = fallback, clock, fingers
+        self._table = np.array(table, float)
         self._needed = {"q": fingers, "u": 6, "object_position": 3, "object_quaternion": 4}
         self._limiter: Limiter | None = None
         self._wanted, self._fresh = np.zeros(fingers + 6), clock()
         self._answer: Answer | None = None
-        self._latched = False
+        self._latched: Fallback | None = None
+        self._height, self._held = math.nan, False
         self._asker = _Asker(policy)
 
     def reset(self, request: GraspRequest, *, moved: bool = False) -> None:
@@ -147,15 +165,21 @@ class Guard:
             `q`.
 
         Raises:
-          CongraspError: its `q` is not a finite angle for each finger joint.
+          CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` no pose.
         """
         start = np.append(as_numbers(request.q, self._fingers), np.zeros(6))
         if self._limiter is not None and not moved and np.isfinite(start).all():
             start[: self._fingers] = self._limiter.target[: self._fingers]
-        self._limiter = Limiter(self._limits, start, period=self._period)
+        floor = Floor(self._table, request.wrist, self._limits.palm) if request.wrist is not None else None
+        self._limiter = Limiter(self._limits, start, period=self._period, floor=floor)
         self._wanted, self._fresh = self._limiter.target, self._clock()
-        self._answer, self._latched = None, False
+        self._answer, self._latched, self._held = None, None, False
+        self._height = as_numbers(request.object_pose and request.object_pose[0], 3)[2]
         self._asker.begin(request)
+
+    def open(self) -> None:
+        """Opens the fingers from the next step on, until `reset`, whatever they hold."""
+        self._latched = "open"
 
     def step(self, state: State) -> Command:
         """The next command; returns after `wait` seconds at most, and raises nothing for what is wrong with a state.
@@ -172,7 +196,7 @@ class Guard:
         targets = dict(zip(("q_target", "u_target"), np.split(self._limiter.target, [self._fingers]), strict=True))
         lacking = {name: np.full(size, np.nan) for name, size in self._needed.items() if name not in state}
         self._take(self._asker.exchange({**state, **lacking, **targets}, now, self._wait))
-        mode = self._mode()
+        mode = self._mode(state)
         if mode == "open":
             self._wanted = np.append(self._open, self._limiter.target[self._fingers :])
         elif mode != "follow":
@@ -214,12 +238,16 @@ class Guard:
             self._wanted, self._answer, self._fresh, self.trouble = wanted, answer, asked, ""
             self.counters.answers += 1
 
-    def _mode(self) -> Mode:
-        """Mode of the next command."""
+    def _mode(self, state: State) -> Mode:
+        """Returns the mode of the next command."""
+        height = as_numbers(state.get("object_position"), 3)[2]
+        self._held |= not np.all(state.get("table", True)) or bool(height > self._height + _LIFTED)
         age = self._clock() - self._fresh
-        if self._latched or not 0.0 <= age <= self._hold:
-            self._latched = True
-            return self._fallback
+        if self._latched is None and not 0.0 <= age <= self._hold:
+            measured = np.isfinite(np.append((self._height, height), self._measured(state))).all()
+            self._latched = self._fallback if measured and not self._held else "freeze"
+        if self._latched is not None:
+            return self._latched
         return "follow" if self._answer is not None and age <= self._stale else "hold"
 
     def _measured(self, state: State) -> tuple[np.ndarray, np.ndarray]:
@@ -228,6 +256,20 @@ class Guard:
         position = [as_numbers(state.get(name), size) for name, size in sizes.items()]
         velocity = [as_numbers(state.get(f"{name}_velocity", np.zeros(size)), size) for name, size in sizes.items()]
         return np.concatenate(position), np.concatenate(velocity)
+
+
+def _described(
+    policy: Policy, limits: JointLimits | None, open_pose: np.ndarray | None
+) -> tuple[JointLimits, np.ndarray]:
+    """Limits and open pose, from the policy's metadata what is not given."""
+    described = policy.metadata()
+    if limits is None and described["limits"] is None:
+        raise CongraspError(
+            f"Joints of the hand '{described['hand']}' share motors.",
+            "Make limits of its joints by hand (JointLimits).",
+        )
+    pose = described["open_pose"] if open_pose is None else open_pose
+    return limits or JointLimits(**described["limits"]), np.asarray(pose, float)
 
 
 _Outcome = tuple[Answer | TransportError, float]

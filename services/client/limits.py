@@ -1,7 +1,7 @@
-"""Limits of a robot's commands, for any input; needs nothing but numpy.
+"""Limits of commands to a robot for any input; needs NumPy only.
 
 Every comparison is written so that what is not a number fails it: a target that is NaN, infinite or of the wrong shape
-holds the joint where it was told to be last.
+holds the joint at its last target.
 """
 
 import dataclasses
@@ -13,35 +13,53 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 
 if TYPE_CHECKING:
+    from congrasp.common.config import ControlConfig
     from congrasp.common.hands.spec import Hand
+    from congrasp.services.client.floor import Floor
+
+_EQUAL = 1e-12
+"""m or rad by which targets count as the same: norms are subject to rounding."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Limits and servo gains of J joints; SI units, N and m for slides, N.m and rad for hinges."""
+    """Limits and servo gains of F finger joints, then the wrist's three slides and three hinges: J = F + 6.
+
+    SI units: N and m for slides, N.m and rad for hinges and fingers. Speed, acceleration and torque of the slides are
+    limited by the norm of the three, to the least of their numbers; likewise the hinges'.
+    """
 
     lower: np.ndarray
     """(J,) least target."""
     upper: np.ndarray
     """(J,) greatest target."""
     speed: np.ndarray
-    """(J,) at which a target moves at most."""
+    """(J,) greatest speed of a target."""
     torque: np.ndarray
     """(J,) greatest torque."""
     kp: np.ndarray
     """(J,) of the servo: torque = kp (target - position) - kv velocity."""
     kv: np.ndarray
     """(J,)."""
+    acceleration: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    """(J,) greatest acceleration of a target; 0: any, the default of all joints."""
+    palm: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((1, 4)))
+    """(K, 4) m: centres in the wrist frame and radii of spheres that must stay above the table (`Guard`)."""
 
     def __post_init__(self) -> None:
+        if not np.size(self.acceleration):
+            object.__setattr__(self, "acceleration", np.zeros(np.shape(self.lower)))
         for field in dataclasses.fields(self):
             value = np.array(getattr(self, field.name), float)
-            if value.ndim != 1 or value.shape != np.shape(self.lower) or not np.isfinite(value).all():
-                raise CongraspError(f"The limits' '{field.name}' must be one finite number for each joint.")
-            if field.name not in ("lower", "upper") and not (value >= 0.0).all():
+            fits = value.shape[1:] == (4,) if field.name == "palm" else value.shape == np.shape(self.lower)
+            if not fits or not np.isfinite(value).all():
+                raise CongraspError(f"The limits' '{field.name}' must be finite numbers of the documented shape.")
+            if field.name not in ("lower", "upper", "palm") and not (value >= 0.0).all():
                 raise CongraspError(f"The limits' '{field.name}' must not be negative.")
             value.flags.writeable = False
             object.__setattr__(self, field.name, value)
+        if self.lower.ndim != 1 or len(self.lower) < 6:
+            raise CongraspError("The limits are of the finger joints and the six joints of the wrist.")
         if not (self.lower <= self.upper).all() or not (self.kp > 0.0).all():
             raise CongraspError("The limits have a lower bound above the upper one, or a kp that is not positive.")
 
@@ -49,6 +67,7 @@ class JointLimits:
     def of_hand(
         cls,
         hand: "Hand",
+        control: "ControlConfig | None" = None,
         *,
         finger_speed: float = 8.0,
         wrist_speed: float = 1.5,
@@ -56,33 +75,63 @@ class JointLimits:
         reach: float = 0.4,
         turn: float = 2.5,
         margin: float = 0.03,
+        grip: float = math.inf,
     ) -> Self:
-        """Limits of the fingers' motors, then of the six wrist joints, with the gains and torques of the hand's model.
+        """Limits of the fingers' motors, then of the six wrist joints, with gains and torques of the hand's model.
 
-        Most hands have a motor for each finger joint; see `common.hands.motors` for others.
+        The wrist's targets have the task's limits of acceleration (`ControlConfig`), and its force and torque are those
+        that give the hand's inertia as much. Most hands have a motor for each finger joint; see `common.hands.motors`
+        for others.
 
         Args:
           hand: the hand (`common.hands.get_hand`).
+          control: the control that the policy learnt with; the default one if absent.
           finger_speed: rad/s.
-          wrist_speed: m/s along each axis of the wrist.
-          wrist_angular_speed: rad/s about each.
+          wrist_speed: m/s.
+          wrist_angular_speed: rad/s.
           reach: m that the wrist may be from where it was at the episode's begin, along each axis.
           turn: rad, likewise.
           margin: rad that finger targets keep from the ends of their joints; narrow joints stay in their middle.
+          grip: N that a straight finger presses with at its tip; a bent one presses harder, as its lever is shorter.
         """
+        from congrasp.common.config import ControlConfig
         from congrasp.common.hands.motors import motor_limits
 
-        wrist, motors = hand.wrist, hand.motors
+        wrist, motors, control = hand.wrist, hand.motors, control or ControlConfig()
+        allowed = np.array([control.wrist_acceleration, control.wrist_angular_acceleration])
+        strongest = np.where(allowed > 0.0, allowed * hand.wrist_inertia, np.inf)
+        force = np.minimum(strongest, [wrist.slide_limit, wrist.hinge_limit])
+        levers = _levers(hand)
+        fingers = [min(m.torque_limit, grip * max(levers.get(name, 0.0) for name in m.joints)) for m in motors]
         lower, upper = motor_limits(hand)
         middle = (lower + upper) / 2
+        palm = [(*end, c.radius) for c in hand.links[0].capsules for end in (c.start, c.end)]
         return cls(
             lower=np.append(np.minimum(lower + margin, middle), np.repeat([-reach, -turn], 3)),
             upper=np.append(np.maximum(upper - margin, middle), np.repeat([reach, turn], 3)),
             speed=np.append(np.full(len(motors), finger_speed), np.repeat([wrist_speed, wrist_angular_speed], 3)),
-            torque=np.append([m.torque_limit for m in motors], np.repeat([wrist.slide_limit, wrist.hinge_limit], 3)),
+            torque=np.append(fingers, np.repeat(force, 3)),
             kp=np.append([m.kp for m in motors], np.repeat([wrist.slide_kp, wrist.hinge_kp], 3)),
             kv=np.append([m.kv for m in motors], np.repeat([wrist.slide_kv, wrist.hinge_kv], 3)),
+            acceleration=np.append(np.zeros(len(motors)), np.repeat(allowed, 3)),
+            palm=np.array(palm).reshape(-1, 4),
         )
+
+    def as_lists(self) -> dict[str, Any]:
+        """The fields as lists, for JSON; `JointLimits(**fields)` is the inverse."""
+        return {field.name: getattr(self, field.name).tolist() for field in dataclasses.fields(self)}
+
+
+def _levers(hand: "Hand") -> dict[str, float]:
+    """Distances, m, from joints by name to the farthest fingertip that they move, with every joint at zero."""
+    links, found = {link.name: link for link in hand.links}, dict[str, float]()
+    for tip in (link for link in hand.links if link.tip is not None):
+        link = tip
+        while link.joints:
+            for joint in link.joints:
+                found[joint.name] = max(found.get(joint.name, 0.0), math.dist(joint.anchor, tip.tip or ()))
+            link = links[link.parent]
+    return found
 
 
 class Limited(NamedTuple):
@@ -91,9 +140,10 @@ class Limited(NamedTuple):
     target: np.ndarray
     """(J,) positions, within the limits of position and speed."""
     torque: np.ndarray
-    """(J,) what the servos give at that target, within the limits; 0 where the measurement is not finite."""
+    """(J,) what the servos give at that target, within the limits; where a measurement is not finite, at the position
+    that was measured last."""
     by: tuple[str, ...]
-    """Limits that were applied to a target: of `not_finite`, `torque`, `speed`, `position`."""
+    """Limits that were applied to a target: of `not_finite`, `torque`, `acceleration`, `speed`, `position`, `table`."""
 
 
 class Limiter:
@@ -101,19 +151,21 @@ class Limiter:
 
     A target moves no faster than the limits allow, never leaves them, and is drawn back to where the servo's torque is
     within its limit as far as that does not make it too fast. So a joint that something holds is not wound up, and
-    a measurement that jumps moves a target no faster than any other.
+    a measurement that jumps moves a target no faster than any other. Limits of acceleration give way to those of
+    position and to the table, where a target stops at once.
 
     Attributes:
       target: (J,) the last one.
     """
 
-    def __init__(self, limits: JointLimits, start: np.ndarray, *, period: float = 0.01):
+    def __init__(self, limits: JointLimits, start: np.ndarray, *, period: float = 0.01, floor: "Floor | None" = None):
         """Starts from a position that is brought within the limits.
 
         Args:
           limits: the limits.
-          start: (J,) where the joints are told to be now.
+          start: (J,) current targets of the joints.
           period: seconds from one target to the next.
+          floor: plane below the palm; a palm that starts below it moves no deeper.
 
         Raises:
           CongraspError: the start is not a finite number for each joint, or the period not positive.
@@ -121,38 +173,71 @@ class Limiter:
         first = as_numbers(start, len(limits.lower))
         if not np.isfinite(first).all() or not 0.0 < period < math.inf:
             raise CongraspError("A limiter starts from one finite number for each joint, and has a positive period.")
-        self._limits, self._period, self._latest = limits, period, -math.inf
+        self._limits, self._period, self._floor, self._latest = limits, period, floor, -math.inf
         self.target = np.clip(first, limits.lower, limits.upper)
+        self._position, self._speed = self.target, np.zeros(len(first))
 
     def limit(self, target: Any, position: Any, velocity: Any, now: float) -> Limited:
         """The target and torque that the limits allow.
 
         Args:
-          target: (J,) what is wanted.
+          target: (J,) requested targets.
           position: (J,) measured.
           velocity: (J,) measured.
           now: s; a clock that goes back stops the targets until it has caught up.
         """
-        limits, last = self._limits, self.target
-        size = len(last)
-        given, q, v = (as_numbers(value, size) for value in (target, position, velocity))
-        wanted = np.where(np.isfinite(given), given, last)
+        limits, last, elapsed = self._limits, self.target, self._elapsed(now)
+        given, q, v = (as_numbers(value, len(last)) for value in (target, position, velocity))
+        known, measured = np.isfinite(given), np.isfinite(q) & np.isfinite(v)
+        wanted = np.where(known, given, last)
         with np.errstate(all="ignore"):
-            steady, reach = q + v * (limits.kv / limits.kp), limits.torque / limits.kp
-            within = np.clip(wanted, steady - reach, steady + reach)
-            within = np.where(np.isfinite(within), within, last)
-            step = limits.speed * self._elapsed(now)
-            slower = np.clip(within, last - step, last + step)
-            self.target = np.clip(slower, limits.lower, limits.upper)
-            torque = np.clip(limits.kp * (self.target - q) - limits.kv * v, -limits.torque, limits.torque)
+            self._position, v = np.where(measured, q, self._position), np.where(measured, v, 0.0)
+            steady = self._position + v * (limits.kv / limits.kp)
+            within = steady + _bounded(wanted - steady, limits.torque / limits.kp)
+            within = np.where(measured & np.isfinite(within), within, last)
+            way, soft = self._allowed(within - last, elapsed)
+            inside = np.clip(last + soft, limits.lower, limits.upper)
+            self.target = self._above(inside, last)
+            self._speed = (self.target - last) / elapsed if elapsed else np.zeros(len(last))
+            torque = _bounded(limits.kp * (self.target - self._position) - limits.kv * v, limits.torque)
         changed = {
-            "not_finite": not (np.isfinite(given) & np.isfinite(q) & np.isfinite(v)).all(),
-            "torque": (within != wanted).any(),
-            "speed": (slower != within).any(),
-            "position": (self.target != slower).any(),
+            "not_finite": not (known & measured).all(),
+            "torque": not np.allclose(within, wanted, rtol=0.0, atol=_EQUAL),
+            "acceleration": not np.allclose(soft, way, rtol=0.0, atol=_EQUAL),
+            "speed": not np.allclose(last + way, within, rtol=0.0, atol=_EQUAL),
+            "position": not np.allclose(inside, last + soft, rtol=0.0, atol=_EQUAL),
+            "table": not np.array_equal(self.target, inside),
         }
         by = tuple(name for name, did in changed.items() if did)
         return Limited(self.target.copy(), np.where(np.isfinite(torque), torque, 0.0), by)
+
+    def _allowed(self, way: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the displacements (J,) within the limits of speed, and within those of speed and acceleration."""
+        limits = self._limits
+        bounded = _bounded(way, limits.speed * elapsed)
+        if not elapsed or not limits.acceleration.any():
+            return bounded, bounded
+        free, gain = limits.acceleration == 0.0, limits.acceleration * elapsed  # m/s and rad/s in one step
+        distance = np.append(np.abs(way[:-6]), np.repeat(np.linalg.norm(way[-6:].reshape(2, 3), axis=1), 3))
+        # From v, v - gain, v - 2 gain, … a target comes to rest where the way ends, after this many steps.
+        steps = np.maximum(np.ceil((np.sqrt(1 + 8 * distance / (gain * elapsed)) - 1) / 2), 1)
+        braking = distance / (steps * elapsed) + (steps - 1) * gain / 2
+        speed = _bounded(way, np.where(free, limits.speed, np.minimum(limits.speed, braking)) * elapsed) / elapsed
+        change = _bounded(speed - self._speed, np.where(free, np.inf, gain))
+        return bounded, (self._speed + change) * elapsed
+
+    def _above(self, target: np.ndarray, last: np.ndarray) -> np.ndarray:
+        """Returns the target, or the nearest one without further rotation that keeps the palm above the floor."""
+        if self._floor is None:
+            return target
+        limits, floor = self._limits, self._floor
+        least = min(floor.clearance(last[-6:]), 0.0)
+        if floor.clearance(target[-6:]) >= least:
+            return target
+        raised = np.append(target[:-3], last[-3:])
+        raised[-6:-3] += floor.normal * max(least - floor.clearance(raised[-6:]), 0.0)
+        inside = (raised >= limits.lower).all() and (raised <= limits.upper).all()
+        return raised if inside else np.append(target[:-6], last[-6:])
 
     def _elapsed(self, now: float) -> float:
         """Seconds since the last target, at most a period, so that no pause is caught up; 0 if time did not pass."""
@@ -161,6 +246,16 @@ class Limiter:
         spent = now - self._latest
         self._latest = max(self._latest, now)
         return min(max(spent, 0.0), self._period)
+
+
+def _bounded(values: np.ndarray, most: np.ndarray) -> np.ndarray:
+    """(J,) values of at most a size: each finger's by itself, the wrist's slides and hinges by their norms."""
+    bounded = np.clip(values, -most, most)
+    for three in (slice(-6, -3), slice(-3, None)):
+        length, longest = np.linalg.norm(values[three]), most[three].min()
+        if not length <= longest:
+            bounded[three] = np.clip(values[three] * (longest / length), -longest, longest)  # rounding
+    return bounded
 
 
 def as_numbers(value: Any, size: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Interface of policies for control loops, local or remote; needs nothing but numpy."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -78,6 +78,20 @@ class Policy(Protocol):
 
         Raises:
           TransportError: see `act`; if one state is bad, none gets an answer.
+        """
+        ...
+
+    def metadata(self) -> dict[str, Any]:
+        """Returns hand, limits and timing of the policy.
+
+        Returns:
+          `hand`, its `joints` (F names in the order of `q`), `open_pose` (F,) rad; `limits`, the fields of
+          `JointLimits`, or None for a hand whose joints share motors; `period`, seconds of a control step;
+          `approach_steps`, control steps before the table is taken away in training; `observation` (`full` or
+          `tracked`), `constraints`, `surface_points`, `trajectory_points`.
+
+        Raises:
+          TransportError: there is no response from the server.
         """
         ...
 

@@ -2,11 +2,16 @@
 
 import os
 import secrets
+import time
+from typing import Any
 
+from congrasp.common.errors import RefusedError, TransportError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.episode import EpisodePolicy
+
+_AGAIN = 0.2  # seconds until a server that does not answer is asked again
 
 
 class PolicyClient(EpisodePolicy):
@@ -37,12 +42,30 @@ class PolicyClient(EpisodePolicy):
         """
         super().__init__()
         self._transport = urls.connect(connect, "client", certs=certs, wait=wait)
-        self._keys, self._hand, self._timeout = Keys(run), hand, timeout
+        self._keys, self._hand, self._timeout, self._wait = Keys(run), hand, timeout, wait
         self._act_key = self._keys.act_for(urls.name_on_wire(secrets.token_hex(4), certs, "client"))
 
     def health(self) -> dict[str, object]:
         """Readiness, version, hand and queue of the server."""
         return dict(self._transport.query(self._keys.health, Message({}, {}), timeout=self._timeout).meta)
+
+    def metadata(self) -> dict[str, Any]:
+        """See `Policy.metadata`; waits for a server that is being started."""
+        deadline = time.monotonic() + self._wait
+        while True:
+            try:
+                query = Message({}, {"metadata": True})
+                found = dict(self._transport.query(self._keys.health, query, timeout=self._timeout).meta)
+                break
+            except TransportError as error:
+                if isinstance(error, RefusedError) or time.monotonic() > deadline:
+                    raise
+                time.sleep(_AGAIN)
+        if "limits" not in found:
+            raise RefusedError("The server does not describe its policy.", "Update congrasp where it runs.")
+        if found["hand"] != self._hand:
+            raise RefusedError(f"The policy is for the hand {ascii(found['hand'])[:60]}, not '{self._hand}'.")
+        return found
 
     def close(self) -> None:
         """Disconnects."""

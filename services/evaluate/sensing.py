@@ -57,7 +57,8 @@ LEVELS = (
 
 def sensing_task(task: TaskConfig) -> TaskConfig:
     """Returns the task in which a policy observes trackers, with room for the longest delay."""
-    return dataclasses.replace(task, sensing=SensingConfig(delay=(0.0, max(level.delay for level in LEVELS))))
+    delay = 0.0, max(level.delay for level in LEVELS)
+    return dataclasses.replace(task, sensing=SensingConfig(delay=delay, settle=task.sensing.settle))
 
 
 def at_level(conditions: InitialConditions, level: Level, control_dt: float) -> InitialConditions:

@@ -54,7 +54,7 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
         "action_std": np.exp(np.asarray(bundle.params["actor"]["log_std"])).tolist(),
         "joints": joints,
         "joint_limits": [[joint.lower, joint.upper] for joint in hand.joints],
-        "robot_limits": robot_limits(hand),
+        "robot_limits": JointLimits.of_hand(hand, bundle.task.control).as_lists(),
         "open_pose": hand.q_open.tolist(),
         "motors": motors(hand),
         "wrist_joints": list(WRIST_JOINTS),
@@ -87,16 +87,6 @@ def observation_fields(bundle: PolicyBundle) -> list[dict[str, Any]]:
         for block, _ in bundle.spec.layout
         for field in described[block]
     ]
-
-
-def robot_limits(hand: Hand) -> dict[str, list[float]]:
-    """Limits of targets and torques, and the servos' gains, in the order of the action: `JointLimits` by field.
-
-    Fingers in rad, rad/s, N.m, N.m/rad and N.m.s/rad; the wrist's slides in m, m/s, N, N/m and N.s/m, its hinges as
-    the fingers.
-    """
-    limits = JointLimits.of_hand(hand)
-    return {field.name: getattr(limits, field.name).tolist() for field in dataclasses.fields(limits)}
 
 
 def wrist_servos(hand: Hand) -> dict[str, dict[str, Any]]:

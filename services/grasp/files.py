@@ -1,5 +1,6 @@
 """The files of a grasp: `congrasp grasp` writes them into an object's folder, the result last."""
 
+import functools
 import hashlib
 import json
 import pathlib
@@ -12,7 +13,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.arm.files import PICTURE as ARM_PICTURE
-from congrasp.services.arm.files import save_picture, save_trajectories
+from congrasp.services.arm.files import robot_camera, robot_shapes, save_picture, save_trajectories
 from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.grasper import Grasp
 from congrasp.services.record.channels import JsonChannels
@@ -83,9 +84,14 @@ def save_grasp(
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if film:
         until = min(found.first("hold") + round(_HELD / float(episode.meta["control_dt"])), last)
-        filmed = [*range(0, until, _FRAMED), until]
-        seen_from = camera_of(episode, filmed, film.size[0] / film.size[1], view or views(episode, steps)[0])
-        save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)
+        filmed, aspect = [*range(0, until, _FRAMED), until], film.size[0] / film.size[1]
+        if arm := found.arm:
+            camera = robot_camera(arm, episode, [*steps[:-1], until], aspect)
+            around = functools.partial(robot_shapes, arm, episode)
+            save_episode_video(folder / VIDEO, episode, film, camera, until=until, around=around)
+        else:
+            seen_from = camera_of(episode, filmed, aspect, view or views(episode, steps)[0])
+            save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 
 

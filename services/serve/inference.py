@@ -18,6 +18,7 @@ from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import seen_by
 from congrasp.common.task.types import SceneState, Surface
 from congrasp.common.wire.codec import Message
+from congrasp.services.client.limits import JointLimits
 from congrasp.services.serve.requests import PACKED, STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)
@@ -72,10 +73,33 @@ class PolicyFunction:
         if PACKED in request.arrays:
             return Message({PACKED: answer.vectors}, meta)
         if request.meta.get("layout"):
-            meta |= {"layout": self.layout.digest, "states": STATES_LIMIT, **self.layout.description()}
+            settle = self.layout.task.sensing.settle
+            meta |= {
+                "layout": self.layout.digest,
+                "states": STATES_LIMIT,
+                "settle": settle,
+                **self.layout.description(),
+            }
         fingers = len(self.layout.hand.joints)
         parts = np.split(answer.vectors[0], [-fingers - 6, -6])
         return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
+
+    def metadata(self) -> dict[str, Any]:
+        """See `Policy.metadata`, as JSON."""
+        hand, task = self.layout.hand, self.layout.task
+        alone = len(hand.motors) == len(hand.joints)
+        return {
+            "hand": hand.name,
+            "joints": [joint.name for joint in hand.joints],
+            "open_pose": hand.q_open.tolist(),
+            "limits": JointLimits.of_hand(hand, task.control).as_lists() if alone else None,
+            "period": task.control_dt,
+            "approach_steps": task.approach_steps,
+            "observation": task.observation,
+            "constraints": [constraint.name for constraint in self.layout.known],
+            "surface_points": task.surface_points,
+            "trajectory_points": task.trajectory_points,
+        }
 
     def _infer(self, weights: InferenceParameters, vectors: jax.Array) -> jax.Array:
         """For states (B, S): answers (A + F + 6), flags redirected and aligned, and checks (C), concatenated to (B,

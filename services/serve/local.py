@@ -2,6 +2,7 @@
 
 import os
 import time
+from typing import Any
 
 from congrasp.common.errors import CongraspError, error_of
 from congrasp.common.hands import get_hand
@@ -29,6 +30,10 @@ class LocalPolicy(EpisodePolicy):
         self._bundle = bundle
         self._function = PolicyFunction(get_hand(bundle.spec.hand), bundle.task)
         self._function.warm_up(bundle.inference_parameters, BATCH_SIZES[:1])
+
+    def metadata(self) -> dict[str, Any]:
+        """See `Policy.metadata`."""
+        return self._function.metadata()
 
     def _query(self, query: Message) -> Message:
         """Returns the reply of a server with this bundle."""

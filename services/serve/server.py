@@ -95,7 +95,7 @@ class PolicyServer:
             share=SHARE,
             parts=Parts(TURN, _cut, self._join),
         )
-        transport.serve(keys.health, lambda key, request: Message({}, self.health()))
+        transport.serve(keys.health, self._describe)
         transport.serve(
             below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._turn_away
         )  # one may infer while the other receives
@@ -116,6 +116,10 @@ class PolicyServer:
             "answered": self._answered,
             "trouble": self._trouble,
         }
+
+    def _describe(self, key: str, request: Message) -> Message:
+        """The health, or what a control loop has to know where a query asks for that."""
+        return Message({}, self._function.metadata() if request.meta.get("metadata") else self.health())
 
     def close(self) -> None:
         """Refuses queued queries, and stops following."""

@@ -13,10 +13,12 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.record.goals import active_blocks, grasp_span, phases_of
 from congrasp.services.viz.episode import episode_shapes
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.scene import Camera
+from congrasp.services.viz.scene import Camera, Shape
 from congrasp.services.viz.sheets import contact_sheet, save_video
 from congrasp.services.viz.views import View, camera_of, views
 
+Around = Callable[[int], Sequence[Shape]]
+"""Shapes around the grasp at a control step, such as the arm that carries the hand."""
 _GAP = 3  # between two views of a picture, pixels
 
 
@@ -53,6 +55,7 @@ def render_episode_frames(
     camera: Camera | None = None,
     *,
     overlays: bool = True,
+    around: Around = lambda step: [],
 ) -> Iterator[np.ndarray]:
     """Pictures (height, width, 3) uint8 of control steps of an episode, all from one camera.
 
@@ -62,12 +65,13 @@ def render_episode_frames(
       size: width and height in pixels.
       camera: from where; from the best view otherwise.
       overlays: see `Film`.
+      around: further shapes at a control step.
     """
     steps = list(steps)
     seen_from = camera or camera_of(episode, steps, size[0] / size[1])
 
     def drawn(step: int) -> np.ndarray:
-        return render_scene(episode_shapes(episode, step, overlays=overlays), seen_from, size)
+        return render_scene([*episode_shapes(episode, step, overlays=overlays), *around(step)], seen_from, size)
 
     with ThreadPoolExecutor(cores()) as pool:
         yield from pool.map(drawn, steps)
@@ -174,6 +178,7 @@ def save_episode_video(
     progress: Callable[[float], None] = lambda share: None,
     *,
     until: int | None = None,
+    around: Around = lambda step: [],
 ) -> None:
     """An episode as MP4, in real time.
 
@@ -184,6 +189,7 @@ def save_episode_video(
       camera: see `render_episode_frames`.
       progress: told which share of the frames is drawn.
       until: its first control step that is not drawn; all are by default.
+      around: see `render_episode_frames`.
 
     Raises:
       CongraspError: the package for videos is absent, or the file cannot be written.
@@ -194,7 +200,7 @@ def save_episode_video(
 
     def frames() -> Iterator[np.ndarray]:
         """The frames, one after another."""
-        drawn = render_episode_frames(episode, steps, film.size, camera, overlays=film.overlays)
+        drawn = render_episode_frames(episode, steps, film.size, camera, overlays=film.overlays, around=around)
         for done, frame in enumerate(drawn, 1):
             yield frame
             progress(done / len(steps))

@@ -10,7 +10,7 @@ from congrasp.actors.physics.scene import TABLE_AWAY, scene_spec
 from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.mjcf import WRIST_JOINTS
-from congrasp.common.task.control import track_load, wrist_load, wrist_target
+from congrasp.common.task.control import Guided, carried_lead, track_load, wrist_lead, wrist_load
 from tests.scenes import scene
 
 
@@ -33,7 +33,8 @@ def test_a_load_of_one_and_a_half_kilograms_sinks_less_than_five_millimetres(nam
         load = wrist_load(hand, task, momentum, u, v)
         state = scene(0, batch=1)[0]._replace(u=u, u_velocity=v, wrist_load=load, table=jnp.zeros(1, bool))
         far = jnp.full(1, task.control.guidance_position_limit)
-        return wrist_target(hand, task.control, state, far, -u, jnp.zeros((1, 6)))
+        given = Guided(-u, far, v, state.table)
+        return u + wrist_lead(hand, task.control, given, jnp.zeros((1, 6))) + carried_lead(hand, state)
 
     after = jax.jit(lambda momentum, u, v, target: track_load(hand, task, momentum, u, v, target))
     sunk, speed = [], []

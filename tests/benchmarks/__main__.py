@@ -84,6 +84,24 @@ def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int 
     return 0
 
 
+def robot(seconds: float = 600.0, kill_every: float = 30.0, out: pathlib.Path = pathlib.Path("robot")) -> int:
+    """The ROS 2 node over Zenoh against a simulated hand that lifts an object, while the policy server is killed.
+
+    Args:
+      seconds: How long.
+      kill_every: Seconds from one kill to the next.
+      out: Folder for the node's output.
+
+    Examples:
+      python -m tests.benchmarks robot
+      python -m tests.benchmarks robot --seconds 60 --kill-every 20
+    """
+    from tests.benchmarks.robot import bench_robot
+
+    out.mkdir(parents=True, exist_ok=True)
+    return int(not bench_robot(seconds, kill_every, out))
+
+
 def shutdown(repeats: int = 100, within: float = 45.0, seed: int = 0) -> int:
     """Whether a run with a learner and two actors ends within 5 s of a signal, and leaves no process behind.
 
@@ -263,6 +281,7 @@ COMMANDS = {
     "pieces": pieces,
     "gallery": gallery,
     "measures": measures,
+    "robot": robot,
     "shutdown": shutdown,
     "security": security,
     "transport": transport,

@@ -22,12 +22,14 @@ FULL = dataclasses.replace(TASK, observation="full")
 STEPS = 40
 
 
-def sensors(**given):
+def sensors(position_bias=(0.0, 0.0, 0.0), rotation_bias=(0.0, 0.0, 0.0), **given):
     """One tracker that shows each pose at once, without errors, but for what is given."""
+    bias = {"position_bias": position_bias, "rotation_bias": rotation_bias}
     fields = {"period": 1.0, "phase": 0.0, "delay": 0, "position_noise": 0.0, "rotation_noise": 0.0, "dropout": 0.0}
     types = {"delay": np.int32}
     arrays = {name: np.full(1, value, types.get(name, np.float32)) for name, value in {**fields, **given}.items()}
-    return Sensors(key=np.array([[3, 7]], np.uint32), **arrays)
+    biases = {name: np.array([bias[name]], np.float32) for name in ("position_bias", "rotation_bias")}
+    return Sensors(key=np.array([[3, 7]], np.uint32), **arrays, **biases)
 
 
 def truth(step):
@@ -95,6 +97,46 @@ def test_errors_have_their_size_in_every_axis_and_are_those_of_a_seed():
     assert not np.array_equal(found[0], found[1])
     again = shown(sensors(position_noise=0.005, rotation_noise=0.05), still, 1)
     np.testing.assert_array_equal(found, again)
+
+
+def test_an_offset_is_that_of_every_sample():
+    """The object lies turned by 0.1 rad about z; half a turn about x more takes its z axis down."""
+    still = np.broadcast_to(np.append([0.1, 0.2, 0.3], PATH[5, 3:]), (20, 7)).astype(np.float32)
+    found = np.asarray(shown(sensors(position_bias=(0.01, 0.0, -0.02), rotation_bias=(np.pi, 0.0, 0.0)), still, 1))
+    np.testing.assert_allclose(found[:, :3], np.tile([0.11, 0.2, 0.28], (20, 1)), atol=1e-6)
+    np.testing.assert_array_equal(found, np.broadcast_to(found[0], found.shape))
+    down = rotations.rotate(jnp.asarray(found[0, 3:]), jnp.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(down, [0.0, 0.0, -1.0], atol=1e-5)
+    config = SensingConfig(position_bias=(0.004, 0.004), rotation_bias=(0.03, 0.03))
+    drawn = jax.device_get(sensing.draw_sensors(config, 0.01, jax.random.key(0), 4000))
+    np.testing.assert_allclose(drawn.position_bias.std(0), 0.004, rtol=0.05)
+    np.testing.assert_allclose(drawn.rotation_bias.std(0), 0.03, rtol=0.05)
+
+
+def test_where_an_object_rests_is_the_mean_of_its_readings_until_it_moves():
+    """Readings at 0, 12, -6 and 2 mm; then one 5 cm away, after which 0 counts no more; a quaternion's sign is none."""
+    at = [0.0, 0.012, -0.006, 0.002, 0.05, 0.0]
+    tilt = [0.0, 0.02, -0.02, 0.0, 0.0, 0.0]
+    rows = [[x, 0.0, 0.1, np.cos(a), np.sin(a), 0.0, 0.0] for x, a in zip(at, tilt, strict=True)]
+    rows = np.array(rows, np.float32) * np.where(np.arange(6) % 2, -1.0, 1.0)[:, None] ** np.array(
+        [[0, 0, 0, 1, 1, 1, 1]]
+    )
+    rows = rows.astype(np.float32)
+
+    def means(table, settle):
+        tracker, found = sensing.begin(sensors(), 1, rows[:1, :3], rows[:1, 3:]), []
+        for step, row in enumerate(rows[1:], 1):
+            there = jnp.array([step < table])
+            tracker = sensing.track(tracker, jnp.array([step]), row[None, :3], row[None, 3:], there, settle)
+            found.append(np.asarray(tracker.first[0]))
+        return np.array(found)
+
+    found = means(9, 0.04)
+    np.testing.assert_allclose(found[:, 0], [0.006, 0.002, 0.002, 0.002, 0.002], atol=1e-6)
+    np.testing.assert_allclose(found[:, 4], [np.sin(0.01), 0.0, 0.0, 0.0, 0.0], atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(found[:, 3:], axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(means(2, 0.04)[:, 0], [0.006] * 5, atol=1e-6)  # the table is gone
+    np.testing.assert_array_equal(means(9, 0.0), np.broadcast_to(rows[0], (5, 7)))
 
 
 def test_trackers_are_drawn_from_their_ranges():

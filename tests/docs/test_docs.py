@@ -14,11 +14,13 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+import tyro
 
 from congrasp.actors.env import episode_fields
 from congrasp.common.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.cli import main, parser
+from tests.base_install import run_in_base_install, steady_server
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "deploy" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -139,3 +141,26 @@ def test_the_commands_of_the_tutorials_run(tmp_path, monkeypatch):
         assert (tmp_path / "grasps" / "mug" / name).stat().st_size > 1000
     for name in ("mug.glb", "mug.png"):
         assert (tmp_path / name).stat().st_size > 1000
+
+
+def test_the_loop_of_the_robots_page_runs_as_printed_with_numpy_and_zenoh_alone():
+    """Against a policy that wants every joint at zero; only the port is another."""
+    code = "\n".join(blocks(ROOT / "docs" / "robots.md", "python"))
+    with steady_server() as port:
+        done = run_in_base_install(code.replace("127.0.0.1:7457", f"127.0.0.1:{port}"))
+    assert done.returncode == 0, done.stderr
+    counted = dict(re.findall(r"(\w+)=(\d+)", done.stdout))
+    assert done.stdout.startswith("open Counters(") and counted["steps"] == "251"
+    assert int(counted["follow"]) >= 200 and int(counted["fallback"]) == 1
+
+
+def example_lines():
+    text = "".join(blocks(ROOT / "docs" / "robots.md", "sh")).replace("\\\n", " ")
+    return [line for line in text.splitlines() if line.startswith("python examples/")]
+
+
+@pytest.mark.parametrize("line", example_lines())
+def test_the_examples_of_the_robots_page_take_their_options(line, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    _, script, *words = shlex.split(line, comments=True)
+    tyro.cli(importlib.import_module(pathlib.Path(script).stem).Arguments, args=words)

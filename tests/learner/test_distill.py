@@ -13,8 +13,10 @@ import pytest
 
 from congrasp.common.config import DistillConfig, NetworkConfig, RunConfig, TaskConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, PolicySpec, mean_action, policy_spec
+from congrasp.common.task.teaching import EXTRA, student_action
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate, random_policy
 from congrasp.services.train.student import TRACKERS
@@ -54,7 +56,9 @@ def batch(run, seed, worlds=WORLDS):
         for task in (run.task, dataclasses.replace(run.task, observation="full"))
     )
     seen = rng.normal(size=(STEPS, worlds, max(own, whole))).astype(np.float32)
-    return {"observation": seen[..., :own].astype(np.float16), "teacher_observation": seen[..., :whole]}
+    given = rng.normal(0.0, 0.01, (STEPS, worlds, EXTRA)).astype(np.float32)
+    taught = np.concatenate([seen[..., :whole], given], -1)
+    return {"observation": seen[..., :own].astype(np.float16), "teacher_observation": taught}
 
 
 def algorithm(run):
@@ -70,7 +74,8 @@ def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher)
         jnp.zeros_like, state.params["actor"]["network"]["output"]
     )
     bundle = bundles.load(teacher)
-    labels = np.asarray(mean_action(bundle.spec.layout, bundle.inference_parameters, rows["teacher_observation"]))
+    wanted = mean_action(bundle.spec.layout, bundle.inference_parameters, rows["teacher_observation"][..., :-EXTRA])
+    labels = np.asarray(student_action(get_hand("allegro"), TASK.control, rows["teacher_observation"], wanted))
     deviation = np.where(np.arange(labels.shape[-1]) == 0, 0.5, 0.1)
     after, metrics = student.update(state, rows)
     np.testing.assert_allclose(metrics["imitation_kl"], 0.5 * ((labels / deviation) ** 2).sum(-1).mean(), rtol=1e-4)

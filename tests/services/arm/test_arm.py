@@ -5,6 +5,7 @@ import json
 import sys
 import types
 
+import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
@@ -219,7 +220,8 @@ def test_numbers_that_are_none(folder, option):
 def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
     shared = [str(folder / "block.stl"), "--hand", "allegro", "--attempts", "8", "--cache-dir", str(folder)]
     shared += ["--arm", str(folder / "seven.xml"), "--out", str(tmp_path)]
-    assert load("grasp")([*shared, "--base", "-0.6 0 0 0", "--lift", "0.1"])() == 0
+    film = ["--video", "--size", "320x240", "--fps", "2"]
+    assert load("grasp")([*shared, "--base", "-0.6 0 0 0", "--lift", "0.1", *film])() == 0
     facts = json.loads((tmp_path / "block" / "result.json").read_text())
     assert facts["arm"] == "seven" and facts["arm_base"] == [-0.6, 0, 0, 0] and facts["success"]
     assert "seven carries the hand within" in capsys.readouterr().out
@@ -236,6 +238,11 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
     assert since["sec"] + 1e-9 * since["nanosec"] == pytest.approx(float(rows[-1][0]))
     assert len(last["velocities"]) == len(names)
     assert np.asarray(Image.open(tmp_path / "block" / PICTURE)).std() > 10
+    frames = imageio_ffmpeg.read_frames(str(tmp_path / "block" / "grasp.mp4"))
+    assert next(frames)["size"] == (320, 240)
+    first, *_, last = (np.frombuffer(frame, np.uint8).reshape(240, 320, 3).astype(int) for frame in frames)
+    left = (np.abs(first - np.median(first, (0, 1))).sum(-1) > 60)[:, :160]
+    assert left.any() and np.abs(first - last).max() > 60  # something stands where the base is, and moves
 
     assert load("grasp")([*shared, "--base", "3 0 0 180", "--no-pictures"])() == 2
     said = capsys.readouterr().err

@@ -1,5 +1,6 @@
 """What reaches a robot while its policy answers, is silent, late, wrong or away."""
 
+import dataclasses
 import threading
 import time
 
@@ -25,8 +26,9 @@ LIMITS = JointLimits(
     kp=np.full(8, 2.0),
     kv=np.full(8, 0.1),
 )
-REQUEST = GraspRequest(q=np.zeros(FINGERS))
-STATE = {"q": np.zeros(FINGERS), "u": np.zeros(6)}
+REST = np.array([0.0, 0.0, 0.05])
+REQUEST = GraspRequest(q=np.zeros(FINGERS), object_pose=(REST, np.array([1.0, 0.0, 0.0, 0.0])))
+STATE = {"q": np.zeros(FINGERS), "u": np.zeros(6), "object_position": REST}
 
 
 def answer(value: object, wrist: object = None) -> Answer:
@@ -107,6 +109,85 @@ def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episo
         np.testing.assert_allclose(latched.q_target, command.q_target)
         guard.reset(REQUEST)
         assert guard.step(STATE).mode == "follow"
+
+
+@pytest.mark.parametrize(
+    ("changed", "mode"),
+    [
+        ({}, "open"),
+        ({"object_position": np.array([0.0, 0.0, 0.069])}, "open"),
+        ({"object_position": np.array([0.0, 0.0, 0.071])}, "freeze"),
+        ({"table": np.asarray(False)}, "freeze"),
+        ({"object_position": np.full(3, np.nan)}, "freeze"),
+        ({"q": np.full(FINGERS, np.nan)}, "freeze"),
+    ],
+)
+def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
+    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    with guarded(policy, clock, fallback="open") as guard:
+        guard.step({**STATE, **({} if "q" in changed or mode == "open" else changed)})
+        policy.outcome = TransportError("Nobody is there.")
+        clock.now += 2.5
+        now = {**STATE, **(changed if "object_position" in changed or "q" in changed else {})}
+        command = guard.step(now)
+        assert command.mode == mode
+        guard.open()
+        clock.now += 0.5
+        opened = guard.step(now)
+        assert opened.mode == "open"
+        np.testing.assert_allclose(opened.q_target, OPEN if "q" not in changed else command.q_target)
+        guard.reset(REQUEST)
+        assert guard.step(STATE).mode == "hold"
+
+
+def test_a_lasting_nan_holds_and_then_freezes_with_the_torque_of_the_last_measurement():
+    """2 N.m/rad from the joints at 0 to the targets at 0.2 and 0.1 rad."""
+    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    blind = {name: np.full_like(value, np.nan) for name, value in STATE.items()}
+    with guarded(policy, clock, fallback="open") as guard:
+        guard.step(STATE)
+        policy.outcome = RefusedError("The field 'q' is not finite.")
+        modes = []
+        for _ in range(8):
+            clock.now += 0.5
+            command = guard.step(blind)
+            modes.append(command.mode)
+            np.testing.assert_allclose(command.q_target, [0.2, 0.1])
+            np.testing.assert_allclose(command.q_torque, [0.4, 0.2])
+    assert modes == ["follow", *["hold"] * 3, *["freeze"] * 4]
+
+
+def test_limits_and_open_pose_are_those_of_the_policy_s_metadata():
+    policy = ScriptedPolicy(answer(np.array([0.9, 0.9])))
+    policy.metadata = lambda: {"hand": "two", "limits": LIMITS.as_lists(), "open_pose": OPEN.tolist()}
+    with Guard(policy, period=0.5, wait=0.4, stale=0.6, hold=2.0, clock=Clock()) as guard:
+        guard.reset(REQUEST)
+        np.testing.assert_allclose(guard.step(STATE).q_target, [0.5, 0.4])
+        guard.open()
+        np.testing.assert_allclose(guard.step(STATE).q_target, [0.5, 0.4])  # no time has passed
+    policy.metadata = lambda: {"hand": "two", "limits": None, "open_pose": OPEN.tolist()}
+    with pytest.raises(CongraspError, match="Joints of the hand 'two' share motors"):
+        Guard(policy)
+
+
+def test_the_palm_stays_above_the_table():
+    """The base is 0.1 m above the table's top, turned by half about x: its z axis points down."""
+    wrist = np.array([0.0, 0.0, 0.1]), np.array([0.0, 1.0, 0.0, 0.0])
+    limits = dataclasses.replace(LIMITS, palm=np.array([[0.0, 0.0, 0.03, 0.02]]), speed=np.full(8, 100.0))
+    down = answer(np.zeros(2), np.array([0.1, 0.0, 0.15, 0.0, 0.0, 0.0]))
+    with Guard(ScriptedPolicy(down), limits, OPEN, period=0.5, wait=0.4, stale=0.6, hold=2.0, clock=Clock()) as guard:
+        guard.reset(dataclasses.replace(REQUEST, wrist=wrist))
+        command = guard.step({**STATE, "u": down.u_target})
+        np.testing.assert_allclose(command.u_target, [0.1, 0.0, 0.05, 0.0, 0.0, 0.0], atol=1e-9)
+        assert guard.counters.table == 1
+        for wrong in ((np.zeros(3), np.zeros(4)), (np.full(3, np.nan), wrist[1])):
+            with pytest.raises(CongraspError, match="wrist's"):
+                guard.reset(dataclasses.replace(REQUEST, wrist=wrong))
+    with Guard(
+        ScriptedPolicy(down), limits, OPEN, table=(0.0, 0.0, 1.0, -1.0), period=0.5, wait=0.4, hold=2.0
+    ) as guard:
+        guard.reset(dataclasses.replace(REQUEST, wrist=wrist))
+        np.testing.assert_allclose(guard.step({**STATE, "u": down.u_target}).u_target[2], 0.15)
 
 
 def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_them():
@@ -234,7 +315,7 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
         for outcome, state, passed, begins in steps:
             policy.outcome = outcome
             if begins:
-                guard.reset(GraspRequest(q=np.full(FINGERS, 9.0)))
+                guard.reset(GraspRequest(q=np.full(FINGERS, 9.0), wrist=(np.zeros(3), np.array([1.0, 0, 0, 0]))))
                 last[FINGERS:] = 0.0
             clock.now += passed
             command = guard.step(state)
@@ -242,6 +323,7 @@ def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(step
             assert (target >= LIMITS.lower).all() and (target <= LIMITS.upper).all()
             assert (np.abs(target - last) <= LIMITS.speed * 0.5 + 1e-12).all()
             assert (np.abs(np.append(command.q_torque, command.u_torque)) <= LIMITS.torque).all()
+            assert command.u_target[2] >= -1e-9 or not guard._limiter._floor
             last = target
     assert guard.counters.steps == len(steps)
 

@@ -1,5 +1,7 @@
 """No command leaves the limits, whatever comes in."""
 
+import dataclasses
+import json
 import math
 
 import numpy as np
@@ -7,19 +9,32 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from congrasp.common.config import ControlConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.services.client.limits import JointLimits, Limiter, as_numbers
+from congrasp.services.client.floor import Floor
+from congrasp.services.client.limits import JointLimits, Limited, Limiter, as_numbers
 
-JOINTS, PERIOD = 3, 0.01
+JOINTS, PERIOD = 9, 0.01
+
+
+def with_wrist(fingers, slides, hinges):
+    return np.concatenate([fingers, np.repeat([slides, hinges], 3)])
+
+
 LIMITS = JointLimits(
-    lower=np.array([-0.5, 0.0, 0.2]),
-    upper=np.array([0.5, 1.6, 0.2]),
-    speed=np.array([6.0, 3.0, 1.0]),
-    torque=np.array([0.7, 0.0, 5.0]),
-    kp=np.array([3.0, 3.0, 50.0]),
-    kv=np.array([0.1, 0.0, 2.0]),
+    lower=with_wrist([-0.5, 0.0, 0.2], -0.3, -1.0),
+    upper=with_wrist([0.5, 1.6, 0.2], 0.3, 1.0),
+    speed=with_wrist([6.0, 3.0, 1.0], 1.5, 6.0),
+    torque=with_wrist([0.7, 0.0, 5.0], 24.0, 3.0),
+    kp=with_wrist([3.0, 3.0, 50.0], 2000.0, 70.0),
+    kv=with_wrist([0.1, 0.0, 2.0], 100.0, 4.0),
+    acceleration=with_wrist([0.0, 200.0, 0.0], 30.0, 0.0),
+    palm=np.array([[0.0, 0.0, -0.05, 0.02], [0.1, 0.0, 0.0, 0.03]]),
 )
+SLIDES, HINGES = slice(-6, -3), slice(-3, None)
+FLOOR = Floor(np.array([0.0, 0.6, 0.8, 0.1]), (np.array([0.1, 0.2, 0.2]), np.array([0.8, 0.0, 0.6, 0.0])), LIMITS.palm)
+"""Of which the palm begins above: (0.6, 0.8).(0.2, 0.2) - 0.1 = 0.18 m at the wrist."""
 ANY = st.floats(allow_nan=True, allow_infinity=True, width=64)
 NEAR = st.floats(-2.0, 2.0)
 VALUES = st.one_of(
@@ -45,14 +60,19 @@ STEPS = st.lists(st.tuples(VALUES, VALUES, VALUES, st.one_of(st.floats(0.0, 1.0)
 @settings(max_examples=60, deadline=None)
 @given(STEPS, st.lists(NEAR, min_size=JOINTS, max_size=JOINTS))
 def test_positions_speeds_and_torques_stay_within_the_limits_whatever_comes_in(steps, start):
-    limiter = Limiter(LIMITS, np.array(start), period=PERIOD)
+    limiter = Limiter(LIMITS, np.array(start), period=PERIOD, floor=FLOOR)
     last = limiter.target
+    least = min(FLOOR.clearance(last[-6:]), 0.0)
     for target, position, velocity, now in steps:
         limited = limiter.limit(target, position, velocity, now)
         assert np.isfinite(limited.target).all() and np.isfinite(limited.torque).all()
         assert (limited.target >= LIMITS.lower).all() and (limited.target <= LIMITS.upper).all()
         assert (np.abs(limited.target - last) <= LIMITS.speed * PERIOD + 1e-12).all()
         assert (np.abs(limited.torque) <= LIMITS.torque).all()
+        for three, fastest, strongest in ((SLIDES, 1.5, 24.0), (HINGES, 6.0, 3.0)):
+            assert np.linalg.norm((limited.target - last)[three]) <= fastest * PERIOD + 1e-9
+            assert np.linalg.norm(limited.torque[three]) <= strongest + 1e-9
+        assert FLOOR.clearance(limited.target[-6:]) >= least - 1e-9
         last = limited.target
 
 
@@ -71,11 +91,14 @@ def test_over_any_times_a_target_is_no_faster_than_its_limit(times):
 
 
 def test_a_target_goes_where_it_is_wanted_at_the_speed_and_torque_of_its_limits():
-    limits = JointLimits(*(np.array([x]) for x in (-1.0, 1.0, 6.0, 0.6, 3.0, 0.1)))
-    limiter = Limiter(limits, np.zeros(1), period=PERIOD)
+    limits = JointLimits(*(np.append(x, np.ones(6)) for x in (-1.0, 1.0, 6.0, 0.6, 3.0, 0.1)))
+    limits = dataclasses.replace(limits, lower=-limits.upper)
+    limiter = Limiter(limits, np.zeros(7), period=PERIOD)
 
-    def limit(target, position, velocity, now):
-        return limiter.limit(np.array([target]), np.array([position]), np.array([velocity]), now)
+    def limit(*given):
+        *three, now = given
+        found = limiter.limit(*(np.append(x, np.zeros(6)) for x in three), now)
+        return Limited(found.target[0], found.torque[0], found.by)
 
     assert limit(0.01, 0.0, 0.0, 0.0).target == pytest.approx(0.01)  # the first period
     fast = limit(0.5, 0.4, 0.0, 0.01)
@@ -88,7 +111,50 @@ def test_a_target_goes_where_it_is_wanted_at_the_speed_and_torque_of_its_limits(
     held = limit(math.nan, 0.1, 0.0, 0.04)
     assert held.target == pytest.approx(0.12) and held.by == ("not_finite",)
     unmeasured = limit(0.15, math.nan, 0.0, 0.05)
-    assert unmeasured.target == pytest.approx(0.12) and unmeasured.torque == 0.0
+    assert unmeasured.target == pytest.approx(0.12) and unmeasured.by == ("not_finite", "torque")
+    assert unmeasured.torque == pytest.approx(0.06)  # 3 N.m/rad from 0.1 rad, where the joint was last
+
+
+def test_wrist_targets_have_limits_of_speed_acceleration_and_force_by_their_norm():
+    free = {"kp": np.ones(7), "kv": np.zeros(7), "lower": np.full(7, -9.0), "upper": np.full(7, 9.0)}
+    limits = JointLimits(speed=np.full(7, 2.0), torque=np.full(7, 5.0), acceleration=np.full(7, 20.0), **free)
+    limiter = Limiter(limits, np.zeros(7), period=0.1)
+    goal = np.array([0.0, 0.6, 0.8, 0.0, 0.0, 0.0, 0.0])  # 1 m from where it is: 2 m/s after one step of 20 m/s^2
+    places = [np.zeros(7)]
+    for step in range(20):
+        places.append(limiter.limit(goal, places[-1], np.zeros(7), 0.1 * step).target)
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / 0.1
+    np.testing.assert_allclose(np.array(places)[:, 2] * 3, np.array(places)[:, 1] * 4, atol=1e-9)  # straight
+    assert speeds.max() == pytest.approx(2.0) and (np.abs(np.diff(speeds, prepend=0.0)) <= 2.0 + 1e-9).all()
+    np.testing.assert_allclose(
+        speeds[:6], [2.0, 2.0, 2.0, 2.0, 2.0, 0.0], atol=1e-9
+    )  # and stops there at once: 2 / 0.1
+    np.testing.assert_allclose(places[-1], goal, atol=1e-9)
+    far = Limiter(limits, np.zeros(7), period=0.1).limit(100.0 * goal, np.zeros(7), np.zeros(7), 0.0)
+    assert np.linalg.norm(far.torque) <= 5.0 and far.by == ("torque", "speed")
+    slow = dataclasses.replace(limits, acceleration=np.full(7, 2.0))
+    limiter, places = Limiter(slow, np.zeros(7), period=0.1), [np.zeros(7)]
+    for step in range(40):
+        places.append(limiter.limit(goal, places[-1], np.zeros(7), 0.1 * step).target)
+    speeds = np.diff(np.array(places) @ goal) / 0.1
+    np.testing.assert_allclose(speeds[:4], [0.2, 0.4, 0.6, 0.8], atol=1e-9)
+    assert (np.abs(np.diff(speeds)) <= 0.2 + 1e-9).all() and (np.array(places) @ goal <= 1.0 + 1e-9).all()
+    np.testing.assert_allclose(places[-1], goal, atol=1e-6)
+
+
+def test_a_palm_is_as_high_as_its_lowest_sphere():
+    """The base is 0.3 m up and turned by 90 degrees about x, so that its y axis points up: x, y, z are x, -z, y."""
+    half = np.sqrt(0.5)
+    floor = Floor(
+        np.array([0.0, 0.0, 1.0, 0.05]),
+        (np.array([0.0, 0.0, 0.3]), np.array([half, half, 0.0, 0.0])),
+        np.array([[0.0, -0.1, 0.0, 0.02], [0.0, 0.0, 0.2, 0.01]]),
+    )
+    np.testing.assert_allclose(floor.normal, [0.0, 1.0, 0.0], atol=1e-12)
+    assert floor.clearance(np.zeros(6)) == pytest.approx(0.3 - 0.05 - 0.1 - 0.02)
+    assert floor.clearance(np.array([0.5, -0.1, 0.7, 0.0, 0.0, 0.0])) == pytest.approx(0.03)
+    turned = floor.clearance(np.array([0.0, 0.0, 0.0, np.pi / 2, 0.0, 0.0]))  # y to z, z to -y: down
+    assert turned == pytest.approx(0.3 - 0.05 - 0.2 - 0.01)
 
 
 def test_limits_of_a_hand_are_those_of_its_model():
@@ -97,21 +163,43 @@ def test_limits_of_a_hand_are_those_of_its_model():
     np.testing.assert_allclose(limits.lower[:16], hand.lower + 0.01, atol=1e-6)
     narrow = JointLimits.of_hand(hand, margin=9.0)
     np.testing.assert_allclose(narrow.lower[:16], (hand.lower + hand.upper) / 2, atol=1e-6)
-    assert limits.torque[0] == 0.7 and limits.torque[16] == hand.wrist.slide_limit
+    assert limits.torque[0] == 0.7
+    mass = sum(link.mass for link in hand.links) + 0.65
+    assert limits.torque[16] == pytest.approx(15.0 * mass) and 23.0 < limits.torque[16] < 25.0  # a = 15 m/s^2
     assert limits.kp[-1] == hand.wrist.hinge_kp and len(limits.speed) == 22
+    older = JointLimits.of_hand(hand, ControlConfig(wrist_acceleration=0.0))
+    assert older.torque[16] == hand.wrist.slide_limit
+    again = JointLimits(**json.loads(json.dumps(limits.as_lists())))
+    for field in dataclasses.fields(limits):
+        np.testing.assert_array_equal(getattr(again, field.name), getattr(limits, field.name))
+
+
+def test_a_limit_of_the_grip_is_one_of_the_torque_by_the_way_to_the_fingertip():
+    hand = get_hand("allegro")
+    limits = JointLimits.of_hand(hand, grip=5.0)
+    last, root = hand.links[hand.tip_links[1]], hand.finger_roots[1]
+    first = next(link for link in hand.links if link.name == root)
+    for link in (first, last):
+        joint = link.joints[0]
+        lever = np.linalg.norm(np.subtract(last.tip, joint.anchor))
+        expected = min(5.0 * lever, joint.torque_limit)
+        assert limits.torque[hand.joints.index(joint)] == pytest.approx(expected) and 0.02 < lever < 0.2
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"speed": [np.nan]}, {"torque": [-1.0]}, {"upper": [-2.0]}, {"kp": [0.0]}, {"kv": [0.0, 0.0]}]
+    "wrong",
+    [{"speed": [np.nan]}, {"torque": [-1.0]}, {"upper": [-2.0]}, {"kp": [0.0]}, {"kv": [0.0, 0.0]}, {"palm": [0.0]}],
 )
 def test_limits_that_are_none_are_refused(wrong):
     fields = {"lower": [-1.0], "upper": [1.0], "speed": [1.0], "torque": [1.0], "kp": [1.0], "kv": [0.0]}
     with pytest.raises(CongraspError, match="limits"):
-        JointLimits(**{name: np.array(value) for name, value in {**fields, **wrong}.items()})
+        JointLimits(**{name: np.repeat(value, 7) for name, value in {**fields, **wrong}.items()})
     with pytest.raises(ValueError, match="read-only"):
         LIMITS.upper[0] = np.nan
     with pytest.raises(CongraspError, match="finite"):
-        Limiter(LIMITS, np.array([0.0, math.inf, 0.0]))
+        Limiter(LIMITS, np.full(9, math.inf))
+    with pytest.raises(CongraspError, match="six joints of the wrist"):
+        JointLimits(**{name: np.array(value) for name, value in fields.items()})
 
 
 def test_what_is_no_array_of_numbers_is_nan():

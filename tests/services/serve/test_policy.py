@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig, SensingConfig, TaskConfig
 from congrasp.common.errors import CongraspError, ContradictionError, RefusedError, UnknownConstraintError
+from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.request import GraspRequest
 from congrasp.common.transport import urls
@@ -14,6 +15,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.services.client.episode import EpisodePolicy
 from congrasp.services.client.policy import Policy
 from congrasp.services.client.policy_client import PolicyClient
+from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.local import LocalPolicy, load_policy
 from congrasp.services.serve.server import PolicyServer, follow_file
@@ -209,3 +211,32 @@ def test_a_policy_that_looks_back_is_told_what_was_before(episode):
     same(policy.act_each([states[3]])[0], expected)
     moved = {**states[0], "u": states[0]["u"] + np.array([0.01, 0, 0, 0, 0, 0])}
     assert not np.array_equal(policy.act_each([moved])[0].u_target, policy.act_each([states[0]])[0].u_target)
+
+
+class Recorder(EpisodePolicy):
+    """Keeps the fields of each query, and wants every joint at zero."""
+
+    def __init__(self, task):
+        super().__init__()
+        self.function, self.sent = PolicyFunction(get_hand(task.hand), task), []
+
+    def _query(self, query):
+        layout = self.function.layout
+        self.sent.append({name: x[0] for name, x in layout.unpack(layout.parse(query).vectors).items()})
+        zeros = np.zeros((1, len(layout.hand.motors) + len(layout.hand.joints) + 12), np.float32)
+        return self.function.reply(query, Inference(zeros, [[]]), {"version": 1, "total_ms": 0.0})
+
+
+@pytest.mark.parametrize(("settle", "expected"), [(0.04, [0.0, 6.0, 4.0, 4.0, 4.0]), (0.0, [0.0] * 5)])
+def test_a_student_is_guided_by_the_mean_of_where_the_object_rests(episode, settle, expected):
+    """Readings 0, 12, 0, 90 and 0 mm from the first one: the fourth has moved; one that is refused does not count."""
+    policy = Recorder(dataclasses.replace(STUDENT.task, sensing=SensingConfig(settle=settle)))
+    policy.reset(dataclasses.replace(episode.request, constraints={"heading": episode.request.constraints["heading"]}))
+    start = episode.state["object_position"]
+    policy.act(episode.state)
+    for x in (0.012, 0.0, 0.09, 0.0):
+        with pytest.raises(RefusedError, match="unknown field 'colour'"):
+            policy.act({**episode.state, "colour": np.zeros(3)})
+        policy.act({**episode.state, "object_position": start + np.array([x, 0.0, 0.0])})
+    found = [1e3 * (sent["object_position_initial"] - start) for sent in policy.sent if "past_q" in sent]
+    np.testing.assert_allclose([x for x, _, _ in found], expected, atol=1e-4)

@@ -1,5 +1,6 @@
-"""The example's robot keeps to its limits while its policy server is killed and comes back."""
+"""The examples' loops keep a simulated robot to its limits while their policy server is killed and comes back."""
 
+import contextlib
 import dataclasses
 import importlib.util
 import pathlib
@@ -15,6 +16,8 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.services.serve.load import wait_until_ready
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
+from tests.base_install import steady_server
+from tests.benchmarks.robot import SEED, Rig
 
 EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "robot_loop.py"
 SECONDS = 120.0
@@ -29,12 +32,37 @@ def example():
     return module
 
 
-def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(example, tmp_path):
-    config = dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
+@pytest.fixture(scope="module")
+def config():
+    return dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
+
+
+@pytest.fixture(scope="module")
+def robot(example, config):
+    hand = get_hand(config.task.hand)
+    return example.MujocoRobot(hand, config.task, SEED, congrasp.JointLimits.of_hand(hand))
+
+
+def test_the_node_follows_a_server_and_opens_without_one(robot, config, tmp_path):
+    """Over Zenoh, in a process of its own; nothing was lifted, so that the hand opens when the server has gone."""
+    with contextlib.closing(Rig(tmp_path, robot, config.task)) as rig:
+        with steady_server(config.task.hand) as port:
+            rig.begin(f"tcp/127.0.0.1:{port}", "--hold", "0.4")
+            rig.run(lambda: "follow" in "".join(rig.lines) and rig.commands > 60, SECONDS)
+        rig.run(lambda: rig.lines[-1].startswith("open:"), SECONDS)
+        commands = rig.commands
+        rig.run(lambda: rig.commands > commands + 50, SECONDS)
+        assert any(line.startswith("hold:") for line in rig.lines)
+    assert robot.beyond <= 0.0 and robot.strongest <= 1.0 + 1e-6
+
+
+def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(
+    example, robot, config, tmp_path
+):
     bundles.save(untrained(config), tmp_path / "policy.safetensors")
     task, hand = config.task, get_hand(config.task.hand)
     limits = congrasp.JointLimits.of_hand(hand)
-    robot = example.MujocoRobot(hand, task, 1_000_000, limits)
+    robot.reset()
     server = example.Server(tmp_path / "policy.safetensors")
     try:
         client = congrasp.PolicyClient(server.url, hand=hand.name, timeout=0.2, wait=SECONDS)

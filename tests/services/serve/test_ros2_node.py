@@ -23,6 +23,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.services.client.policy import Answer
 
 EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "ros2_node.py"
+OUTPUTS = {"joint_command": "sensor_msgs/msg/JointState", "wrist_command": "geometry_msgs/msg/PoseStamped"}
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 HAND = get_hand("allegro")
 NAMES = [joint.name for joint in HAND.joints]
@@ -31,10 +32,12 @@ BASE, BASE_TURN = np.array([0.1, -0.2, 0.3]), Rotation.from_euler("XYZ", [0.4, -
 
 @pytest.fixture(scope="module")
 def example():
+    sys.path.insert(0, str(EXAMPLE.parent))  # of a script, where its `ros2_bus` is
     spec = importlib.util.spec_from_file_location("ros2_node", EXAMPLE)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
+    sys.path.remove(str(EXAMPLE.parent))
     return module
 
 
@@ -43,7 +46,7 @@ class SteadyPolicy:
 
     def __init__(self):
         self.request, self.state = None, None
-        self.wanted = HAND.q_open + 0.05, np.array([0.01, 0.0, -0.01, 0.02, 0.0, 0.03])
+        self.wanted = HAND.q_open + 0.05, np.array([0.004, 0.0, -0.004, 0.02, 0.0, 0.01])
 
     def reset(self, request):
         self.request = request
@@ -58,26 +61,41 @@ class SteadyPolicy:
         pass
 
 
-def stamped(position, rotation):
+def header(frame="world", age=0.0):
+    stamp = time.time_ns() - round(1e9 * age)
+    return Fields(stamp=Fields(sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id=frame)
+
+
+def fields_of(position, rotation):
     x, y, z, w = map(float, rotation.as_quat())
-    place = dict(zip("xyz", map(float, position), strict=True))
-    header = Fields(stamp=Fields(sec=1, nanosec=2), frame_id="world")
-    return Fields(header=header, pose=Fields(position=Fields(**place), orientation=Fields(x=x, y=y, z=z, w=w)))
+    return Fields(**dict(zip("xyz", map(float, position), strict=True))), Fields(x=x, y=y, z=z, w=w)
+
+
+def posed(position, rotation, **stamp):
+    position, orientation = fields_of(position, rotation)
+    return Fields(header=header(**stamp), pose=Fields(position=position, orientation=orientation))
+
+
+def frame(child, parent, position, rotation, **stamp):
+    translation, turn = fields_of(position, rotation)
+    transform = Fields(translation=translation, rotation=turn)
+    return Fields(header=header(parent, **stamp), child_frame_id=child, transform=transform)
 
 
 def robot_says(obj):
     """Messages of a robot whose joints come in another order and with a stranger among them."""
     order = [*reversed(range(16))]
-    header = Fields(stamp=Fields(sec=1, nanosec=2), frame_id="")
     names = [*(NAMES[i] for i in order), "elbow"]
     angles = [*HAND.q_open[order].tolist(), 0.7]
-    joints = Fields(header=header, name=names, position=angles, velocity=[], effort=[])
+    joints = Fields(header=header(""), name=names, position=angles, velocity=[], effort=[])
     lying = Rotation.from_euler("z", 0.5)
-    return {
-        "joint_states": joints,
-        "wrist_pose": stamped(BASE, BASE_TURN),
-        "object_pose": stamped(np.array([0.0, 0.1, 0.05]) + lying.apply(obj.origin), lying),
-    }
+    elsewhere = Fields(header=header(""), name=["wheel"], position=[3.0], velocity=[], effort=[])
+    return [
+        ("joint_states", joints),
+        ("joint_states", elsewhere),
+        ("wrist_pose", posed(BASE, BASE_TURN)),
+        ("object_pose", posed(np.array([0.0, 0.1, 0.05]) + lying.apply(obj.origin), lying)),
+    ]
 
 
 def check(policy, obj, commanded):
@@ -94,7 +112,7 @@ def check(policy, obj, commanded):
     np.testing.assert_allclose(joints.effort, 3.0 * 0.05 * np.ones(16), atol=1e-5)  # kp of Allegro, 0.05 rad ahead
     place, turn = wrist.pose.position, wrist.pose.orientation
     np.testing.assert_allclose([place.x, place.y, place.z], BASE + BASE_TURN.as_matrix() @ u_wanted[:3], atol=1e-6)
-    cos, sin = np.cos([0.02, 0.03]), np.sin([0.02, 0.03])
+    cos, sin = np.cos([0.02, 0.01]), np.sin([0.02, 0.01])
     about_x = np.array([[1, 0, 0], [0, cos[0], -sin[0]], [0, sin[0], cos[0]]])
     about_z = np.array([[cos[1], -sin[1], 0], [sin[1], cos[1], 0], [0, 0, 1]])
     found = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
@@ -103,15 +121,38 @@ def check(policy, obj, commanded):
 
 
 @contextlib.contextmanager
-def node_of(example, bus):
+def node_of(example, bus, lift=0.0, **given):
     """A node with a steady policy, and the object that it grasps."""
     policy, obj = SteadyPolicy(), procedural.generate(7)
     limits = congrasp.JointLimits.of_hand(HAND)
+    arguments = example.Arguments("capsule:7", robot_age=3.0, **given)  # on a machine with other work
+    plan = example.Plan("world", 3, lift, 0.02, arguments.dry_run)
+    request = congrasp.GraspRequest(surface=obj.points)
     with congrasp.Guard(policy, limits, HAND.q_open, period=0.05, wait=0.04, stale=0.2, hold=0.6) as guard:
+        sensors = example.Sensors(arguments, NAMES, obj.origin, 0.4)
         try:
-            yield example.PolicyNode(bus, guard, HAND, obj, np.array([0.0, 0.0, -2.0]), 50), policy, obj
+            yield example.PolicyNode(bus, guard, sensors, request, plan), policy, obj
         finally:
             bus.close()
+
+
+class Wire:
+    """A bus in this process: messages that are there at every step, and the last ones that were sent."""
+
+    def __init__(self):
+        self.said, self.sent = [], {}
+
+    def make(self, kind, **fields):
+        return Fields(**fields)
+
+    def receive(self):
+        return self.said
+
+    def publish(self, topic, message):
+        self.sent[topic] = message
+
+    def close(self):
+        pass
 
 
 def until(look, seconds=20.0):
@@ -123,8 +164,9 @@ def until(look, seconds=20.0):
 
 
 def arrived(node, policy):
-    """Whether the targets, which the limits slow down, are where the policy wants them."""
-    return np.allclose(node._guard._limiter.target, np.concatenate(policy.wanted))
+    """Whether the targets, which the limits slow down, rest where the policy wants them."""
+    limiter = node._guard._limiter
+    return np.allclose(limiter.target, np.concatenate(policy.wanted)) and np.allclose(limiter._speed, 0.0)
 
 
 def schema(kind):
@@ -139,15 +181,16 @@ def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     write = {k: serialize_dynamic(*schema(k))[schema(k)[0]] for k in set(example.INPUTS.values())}
-    read = {k: generate_dynamic(*schema(k))[schema(k)[0]] for k in set(example.OUTPUTS.values())}
+    read = {k: generate_dynamic(*schema(k))[schema(k)[0]] for k in set(OUTPUTS.values())}
     with zenoh.open(config) as robot, node_of(example, example.ZenohBus(endpoint)) as (node, policy, obj):
-        heard = {t: robot.declare_subscriber(t, zenoh.handlers.RingChannel(1)) for t in example.OUTPUTS}
-        said = robot_says(obj)
+        heard = {t: robot.declare_subscriber(t, zenoh.handlers.RingChannel(1)) for t in OUTPUTS}
+        silent = []
 
         def turn():
             """The robot speaks and the node acts; whether it follows its policy."""
-            for topic, message in said.items():
-                robot.put(topic, write[example.INPUTS[topic]](message))
+            for topic, message in robot_says(obj):
+                if topic not in silent:
+                    robot.put(topic, write[example.INPUTS[topic]](message))
             command = node.step()
             return command is not None and command.mode == "follow"
 
@@ -160,15 +203,15 @@ def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
         until(lambda: turn() and arrived(node, policy))
         turn()
         newest = {t: until(lambda s=s: s.try_recv()).payload.to_bytes() for t, s in heard.items()}
-        check(policy, obj, [read[example.OUTPUTS[t]](payload) for t, payload in newest.items()])
-        said["object_pose"].pose.orientation = Fields(x=0.0, y=0.0, z=0.0, w=0.0)
+        check(policy, obj, [read[OUTPUTS[t]](payload) for t, payload in newest.items()])
+        silent.append("object_pose")
         until(lambda: not turn())
-        assert until(lambda: (turn(), node._guard._latched)[1])  # a tracker without a pose: held, then the fallback
+        assert until(lambda: (turn(), node._guard._latched)[1]) == "freeze"  # a tracker that is lost
 
 
 def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
     """Against a stand-in for rclpy that takes what rclpy takes: messages by class, arrays as lists."""
-    said, sent, callbacks = {}, {}, {}
+    said, sent, callbacks = [], {}, {}
 
     class Node:
         def create_subscription(self, kind, topic, callback, qos):
@@ -194,20 +237,123 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
         return type(kind.rpartition("/")[2], (), {"__init__": make})
 
     def spin_once(node, timeout_sec):
-        for topic, callback in callbacks.items():
-            callback(said[topic])
+        if said:
+            topic, message = said.pop(0)
+            callbacks[topic](message)
 
-    qos = Fields(QoSProfile=Fields, ReliabilityPolicy=Fields(BEST_EFFORT=1))
+    policies = {"ReliabilityPolicy": Fields(BEST_EFFORT=1), "DurabilityPolicy": Fields(TRANSIENT_LOCAL=1)}
+    qos = Fields(QoSProfile=Fields, **policies)
     rclpy = Fields(init=lambda: None, create_node=lambda name: Node(), spin_once=spin_once, try_shutdown=lambda: None)
     monkeypatch.setitem(sys.modules, "rclpy", rclpy)
     monkeypatch.setitem(sys.modules, "rclpy.qos", qos)
-    for package in ("sensor_msgs", "geometry_msgs", "std_msgs", "builtin_interfaces"):
+    for package in ("sensor_msgs", "geometry_msgs", "std_msgs", "builtin_interfaces", "tf2_msgs"):
         kinds = [kind for kind in STORE.types if kind.startswith(f"{package}/msg/")]
         monkeypatch.setitem(sys.modules, package, types.ModuleType(package))
         module = Fields(**{kind.rpartition("/")[2]: message(kind) for kind in kinds})
         monkeypatch.setitem(sys.modules, f"{package}.msg", module)
     with node_of(example, example.RosBus()) as (node, policy, obj):
-        said.update(robot_says(obj))
-        until(lambda: node.step().mode == "follow" and arrived(node, policy))
-        node.step()
+
+        def turn():
+            said.extend(robot_says(obj))
+            command = node.step()
+            return command.mode == "follow" and arrived(node, policy)
+
+        until(turn)
+        turn()
         check(policy, obj, [sent["joint_command"], sent["wrist_command"]])
+
+
+def test_without_rclpy_it_is_one_line(example, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py", "mug:7"])
+    with pytest.raises(congrasp.CongraspError, match=r"ROS 2's rclpy cannot be imported here\. Source") as caught:
+        example.main()
+    assert "\n" not in str(caught.value)
+
+
+def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
+    """A robot that calls the first joint `motor_1`, says nothing of its wrist, and sees the object in a lost frame."""
+    bus = Wire()
+    with node_of(example, bus) as (node, _, obj):
+        (_, joints), _, _, (_, thing) = robot_says(obj)
+        joints.name[joints.name.index(NAMES[0])] = "motor_1"
+        thing.header.frame_id = "camera"
+        bus.said = [("joint_states", joints), ("object_pose", thing)]
+        assert node.step() is None
+        line = example.report(None, node._guard, node._sensors)
+        assert ", motor_1, " in line
+        assert line.startswith(f"Waiting for the joints {NAMES[0]} in joint_states (there: ")
+        assert "; see --joint-map); wrist_pose; object_pose: a pose, and tf from its frame 'camera'" in line
+    with node_of(example, bus, joint_map=(f"{NAMES[0]}=motor_1",)) as (node, _, obj):
+        node.step()
+        assert node._sensors.missing().startswith("wrist_pose; ") and node._sensors.names[0] == "motor_1"
+        old = dict(robot_says(obj))["wrist_pose"]
+        old.header = header(age=9.0)
+        bus.said = [("wrist_pose", old)]
+        assert node.step() is None and "wrist_pose (the last one is 9." in node._sensors.missing()
+    with pytest.raises(congrasp.CongraspError, match="--joint-map has 'elbow=motor_1'"):
+        example.joints_of(("elbow=motor_1",), NAMES)
+
+
+def test_poses_come_through_frames_and_offsets_and_go_back_the_same_way(example):
+    """The base stands at (1, 0, 0), turned by 90 degrees about z; the camera hangs 2 m above it and looks along its z;
+    it is really 1 cm farther along its own x axis. The palm is 10 cm along the flange's z axis.
+
+    An object at (0.3, 0.2, 0) of the camera is at (0.31, 0.2, 2) of the base, so at (1 - 0.2, 0.31, 2) of the world.
+    """
+    bus, level = Wire(), Rotation.identity()
+    quarter = Rotation.from_euler("z", 90, degrees=True)
+    with node_of(example, bus, mount="0 0 0.1 0 0 0", hand_eye="0.01 0 0 0 0 0") as (node, policy, obj):
+        fixed = Fields(transforms=[frame("base", "world", [1.0, 0.0, 0.0], quarter, age=99.0)])
+        moving = Fields(transforms=[frame("camera", "base", [0.0, 0.0, 2.0], level)])
+        thing = posed(np.array([0.3, 0.2, 0.0]) + obj.origin, level, frame="camera")
+        flange = posed([0.5, 0.0, 0.3], level, frame="base")
+        joints = robot_says(obj)[0]
+        bus.said = [("tf_static", fixed), ("tf", moving), joints, ("object_pose", thing), ("wrist_pose", flange)]
+        assert node.step().mode == "follow"
+        np.testing.assert_allclose(policy.request.object_pose[0], [0.8, 0.31, 2.0], atol=1e-9)
+        np.testing.assert_allclose(policy.request.wrist[0], [1.0, 0.5, 0.4], atol=1e-9)
+        np.testing.assert_allclose(policy.request.wrist[1], quarter.as_quat(scalar_first=True), atol=1e-9)
+        u = node._guard._limiter.target[-6:]
+        turned = quarter * Rotation.from_euler("XYZ", u[3:])
+        place = bus.sent["wrist_command"].pose.position
+        expected = np.array([1.0, 0.5, 0.4]) + quarter.apply(u[:3]) - turned.apply([0.0, 0.0, 0.1])
+        np.testing.assert_allclose([place.x, place.y, place.z], expected, atol=1e-9)
+        moving.transforms[0].header = header("base", age=9.0)
+        node.step()
+        assert "tf from its frame 'camera'" in node._sensors.missing()
+
+
+def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
+    """3 steps of approach; then 10 cm at 2 cm a step, with a smooth beginning and end: 3 s^2 - 2 s^3."""
+    bus = Wire()
+    with node_of(example, bus, lift=0.1) as (node, policy, obj):
+        heights, tables = [], []
+
+        def risen():
+            bus.said = robot_says(obj)
+            if bus.sent:
+                bus.said[2] = "wrist_pose", Fields(header=header(), pose=bus.sent["wrist_command"].pose)
+            node.step()
+            heights.append(bus.sent["wrist_command"].pose.position.z)
+            tables.append(policy.state is None or bool(policy.state["table"]))
+            seen = 0.0 if policy.state is None else policy.state["object_position"][2]
+            return seen == pytest.approx(-0.05) and heights[-1] - heights[0] == pytest.approx(0.1, abs=0.005)
+
+        until(risen)
+        rise = [0.1 * s**2 * (3 - 2 * s) for s in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)]
+        assert tables[0] and not tables[-1]
+        assert [float(node._plan.rise(3 + n)[2]) for n in range(6)] == pytest.approx(rise)
+    bus.sent = {}
+    with node_of(example, bus, dry_run=True) as (node, _, obj):
+        bus.said = robot_says(obj)
+        command = node.step()
+        line = example.report(command, node._guard, node._sensors)
+        assert command is not None and bus.sent == {} and line.startswith(command.mode)
+
+
+def test_a_slow_hand_has_a_share_of_the_speed(example):
+    limits = congrasp.JointLimits.of_hand(HAND)
+    slow = example.slowed(limits, 0.25)
+    np.testing.assert_allclose(slow.speed, limits.speed / 4)
+    np.testing.assert_allclose(slow.acceleration, limits.acceleration / 16)

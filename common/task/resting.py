@@ -1,0 +1,31 @@
+"""Resting pose of an object: the mean of a tracker's readings; imports neither NumPy nor JAX."""
+
+from typing import Any
+
+Array = Any
+
+
+def resting_mean(
+    xp: Any, mean: Array, count: Array, reading: Array, table: Array, settle: float
+) -> tuple[Array, Array]:
+    """Adds a reading to an object's mean pose while it rests on the table and no reading is far from the mean.
+
+    Args:
+      xp: numpy or jax.numpy.
+      mean: (..., 7) position, m, and quaternion so far.
+      count: (...) readings in it; 0 once the object has moved, from then on for good.
+      reading: (..., 7) the newest one.
+      table: (...) bool: the table is there.
+      settle: m within which a reading counts.
+
+    Returns:
+      The mean and the count with the newest reading.
+    """
+    away = reading[..., :3] - mean[..., :3]
+    still = (count > 0) & table & (xp.sqrt((away * away).sum(-1)) <= settle)
+    same = (mean[..., 3:] * reading[..., 3:]).sum(-1)[..., None] >= 0.0  # a quaternion and its negative are one turn
+    turn = count[..., None] * mean[..., 3:] + xp.where(same, 1.0, -1.0) * reading[..., 3:]
+    length = xp.sqrt((turn * turn).sum(-1))[..., None]
+    place = mean[..., :3] + away / (count[..., None] + 1)
+    found = xp.concatenate([place, turn / xp.maximum(length, 1e-9)], -1)
+    return xp.where(still[..., None], found, mean), xp.where(still, count + 1, 0)

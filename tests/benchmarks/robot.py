@@ -1,0 +1,204 @@
+"""The ROS 2 node's loop over Zenoh: a simulated hand on a wrist, the node and the policy server as processes."""
+
+import contextlib
+import importlib.util
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+from zenoh.handlers import RingChannel
+
+import congrasp
+from congrasp.common.config import TaskConfig
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural, store
+from congrasp.common.objects.pool import scale_objects
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.transport.ports import free_port
+
+EXAMPLES = pathlib.Path(__file__).resolve().parents[2] / "examples"
+JOINTS, POSE = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+SEED = 1_000_000
+"""Of the object."""
+_DROP = 0.03
+"""m below its height at the end of the lift from which on an object counts as dropped."""
+
+
+def example(name: str) -> Any:
+    """Imports a program of `examples/`."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Rig:
+    """A simulated hand whose joints, wrist and object are topics, and which follows the topics of commands.
+
+    Attributes:
+      robot: the simulation (`examples/robot_loop.py`).
+      lines: output of the node, line by line.
+      commands: commands of the node so far.
+    """
+
+    def __init__(self, folder: pathlib.Path, robot: Any, task: TaskConfig):
+        """Opens the topics.
+
+        Args:
+          folder: takes the object's file and the node's output.
+          robot: a `MujocoRobot` with the object of `SEED`.
+          task: its task.
+        """
+        self.robot, self._folder, self._hand, hand = robot, folder, task.hand, get_hand(task.hand)
+        (obj,) = scale_objects(hand, task, [procedural.generate(SEED)])
+        self._object = folder / f"object{store.SUFFIX}"
+        store.save(obj, self._object)
+        self._origin, self._names = np.asarray(obj.origin), [joint.name for joint in hand.joints]
+        position, quaternion = self.robot.request.wrist
+        self._base = np.asarray(position), Rotation.from_quat(quaternion, scalar_first=True)
+        self._endpoint, config = f"tcp/127.0.0.1:{free_port()}", zenoh.Config()
+        settings = {"mode": "peer", "listen/endpoints": [self._endpoint], "scouting/multicast/enabled": False}
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+        self._session = zenoh.open(config)
+        topics = ("joint_command", "wrist_command")
+        self._heard = {topic: self._session.declare_subscriber(topic, RingChannel(1)) for topic in topics}
+        self._node: subprocess.Popen[bytes] | None = None
+        self._ticker, self.commands, self._highest = congrasp.Ticker(100.0), 0, -np.inf
+        self._target = np.array(self.robot.request.q), np.zeros(6)
+
+    @property
+    def lines(self) -> list[str]:
+        return (self._folder / "node.txt").read_text().splitlines()
+
+    def begin(self, server: str, *options: str) -> None:
+        """Puts hand and object to where an episode begins, and starts the node."""
+        self.end()
+        self.robot.reset()
+        self._target, self._highest = (np.array(self.robot.request.q), np.zeros(6)), -np.inf
+        heading = " ".join(f"{x:.6f}" for x in self.robot.request.constraints["heading"]["direction"])
+        command = [sys.executable, str(EXAMPLES / "ros2_node.py"), str(self._object), "--zenoh", self._endpoint]
+        command += ["--connect", server, "--heading", heading, "--hand", self._hand, *options]
+        with (self._folder / "node.txt").open("wb") as output:
+            environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parent)}
+            self._node = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
+
+    def end(self) -> None:
+        """Kills the node."""
+        if self._node:
+            self._node.kill()
+            self._node.wait()
+
+    def close(self) -> None:
+        """Kills the node and closes the topics."""
+        self.end()
+        self._session.close()
+
+    def run(self, until: Callable[[], bool], seconds: float) -> None:
+        """Simulates in real time until a condition holds, for at most so many seconds."""
+        deadline = time.monotonic() + seconds
+        while not until():
+            assert time.monotonic() < deadline, self.lines[-3:]
+            self._ticker.wait()
+            self._step()
+
+    @property
+    def lifted(self) -> float:
+        """Metres by which the object is above where it began."""
+        return float(self.robot.height - self.robot.request.object_pose[0][2])
+
+    @property
+    def dropped(self) -> bool:
+        """True if the object fell after it was lifted."""
+        return bool(self._highest > 2 * _DROP and self.lifted < self._highest - _DROP)
+
+    def _step(self) -> None:
+        """One control step: publishes measurements, follows the newest commands."""
+        state = self.robot.state()
+        turn = self._base[1] * Rotation.from_euler("XYZ", state["u"][3:])
+        thing = Rotation.from_quat(state["object_quaternion"], scalar_first=True)
+        self._send_joints(state["q"])
+        self._send_pose("wrist_pose", self._base[0] + self._base[1].apply(state["u"][:3]), turn)
+        self._send_pose("object_pose", state["object_position"] + thing.apply(self._origin), thing)
+        joints, wrist = (subscriber.try_recv() for subscriber in self._heard.values())
+        q_target, u_target = self._target
+        if joints is not None:
+            self.commands += 1
+            q_target = np.array(STORE.deserialize_cdr(joints.payload.to_bytes(), JOINTS).position)
+        if wrist is not None:
+            pose = STORE.deserialize_cdr(wrist.payload.to_bytes(), POSE).pose
+            place, around = pose.position, pose.orientation
+            back = self._base[1].inv()
+            turn = back * Rotation.from_quat([around.x, around.y, around.z, around.w])
+            moved = back.apply(np.array([place.x, place.y, place.z]) - self._base[0])
+            u_target = np.append(moved, turn.as_euler("XYZ"))
+        self._target = q_target, u_target
+        self.robot.move(congrasp.Command(q_target, u_target, q_target, u_target, "follow", None))
+        self._highest = max(self._highest, self.lifted)
+
+    def _header(self) -> Any:
+        types, stamp = STORE.types, time.time_ns()
+        now = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+        return types["std_msgs/msg/Header"](stamp=now, frame_id="world")
+
+    def _send_joints(self, q: np.ndarray) -> None:
+        none = np.zeros(0)
+        message = STORE.types[JOINTS](self._header(), self._names, np.asarray(q, float), none, none)
+        self._session.put("joint_states", bytes(STORE.serialize_cdr(message, JOINTS)))
+
+    def _send_pose(self, topic: str, position: np.ndarray, rotation: Rotation) -> None:
+        types, (x, y, z, w) = STORE.types, rotation.as_quat().tolist()
+        place = types["geometry_msgs/msg/Point"](*np.asarray(position, float).tolist())
+        pose = types["geometry_msgs/msg/Pose"](place, types["geometry_msgs/msg/Quaternion"](x, y, z, w))
+        self._session.put(topic, bytes(STORE.serialize_cdr(types[POSE](self._header(), pose), POSE)))
+
+
+def bench_robot(seconds: float, kill_every: float, folder: pathlib.Path) -> bool:
+    """Lifts an object again and again while the server is killed; prints the outcome and returns whether it is good.
+
+    Args:
+      seconds: duration.
+      kill_every: seconds from one kill to the next; half of them come while the object is held.
+      folder: takes the node's output.
+    """
+    loop, policy = example("robot_loop"), policy_file(None, "allegro")
+    hand, task = get_hand("allegro"), bundles.load(policy).task
+    robot = loop.MujocoRobot(hand, task, SEED, congrasp.JointLimits.of_hand(hand, task.control))
+    with contextlib.closing(Rig(folder, robot, task)) as rig:
+        server = loop.Server(policy)
+        counts = {"episodes": 0, "lifted": 0, "kills": 0, "dropped after a kill": 0, "dropped": 0}
+        end, kill = time.monotonic() + seconds, time.monotonic() + kill_every
+        try:
+            while time.monotonic() < end:
+                rig.begin(server.url, "--lift", "0.1")
+                counts["episodes"] += 1
+                rig.run(lambda: "follow" in "\n".join(rig.lines), 240.0)
+                over = time.monotonic() + 8.0
+                rig.run(lambda over=over: rig.dropped or time.monotonic() > over, 20.0)
+                counts["lifted"] += rig.lifted > 2 * _DROP
+                counts["dropped"] += rig.dropped
+                if time.monotonic() > kill:
+                    kill += kill_every
+                    server.kill()
+                    counts["kills"] += 1
+                    over = time.monotonic() + 5.0
+                    rig.run(lambda over=over: time.monotonic() > over, 20.0)
+                    counts["dropped after a kill"] += rig.dropped
+                    server.start()
+        finally:
+            server.kill()
+    shares = {"beyond": rig.robot.beyond, "fastest": rig.robot.fastest, "strongest": rig.robot.strongest}
+    print(json.dumps({**counts, **{name: round(float(x), 4) for name, x in shares.items()}}, indent=1))
+    return not counts["dropped after a kill"] and rig.robot.beyond <= 0.0
