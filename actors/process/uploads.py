@@ -17,6 +17,26 @@ Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 """Outcome of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""
 _BACKOFF = (0.1, 0.5)  # first and longest delay between two attempts, s
 _SLOWEST = 100e3  # bytes a second of a link that is waited for
+_LONGEST_TICK = 1.0  # s
+
+
+class RunningClock:
+    """Seconds for which this process ran: a time in which it was frozen or starved counts as one second at most.
+
+    It must be read more often than that to be right.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._seconds, self._read = 0.0, time.monotonic()
+
+    def __call__(self) -> float:
+        """The seconds until now."""
+        with self._lock:
+            now = time.monotonic()
+            self._seconds += min(now - self._read, _LONGEST_TICK)
+            self._read = now
+            return self._seconds
 
 
 class _Upload(NamedTuple):
@@ -45,6 +65,7 @@ class Uploads:
         max_refusals: int,
         request_timeout: float,
         patience: float,
+        clock: RunningClock,
         journal: Journal | None,
     ):
         """Starts the threads.
@@ -57,6 +78,7 @@ class Uploads:
           max_refusals: rollouts refused in a row after which nothing more is sent.
           request_timeout: seconds that sending may take, and more by the rollout's size.
           patience: seconds without any answer after which the learner is given up.
+          clock: measures them.
           journal: where each answer is written down.
         """
         self.failure: CongraspError | None = None
@@ -64,7 +86,7 @@ class Uploads:
         self.closed = threading.Event()
         self._transport, self._key, self._on_reply = transport, key, on_reply
         self._max_refusals, self._timeout, self._patience = max_refusals, request_timeout, patience
-        self._journal = journal
+        self._clock, self._journal = clock, journal
         self._refusals = 0
         self._queue: queue.SimpleQueue[_Upload | None] = queue.SimpleQueue()
         self._pending: set[Future[Outcome]] = set()
@@ -116,7 +138,7 @@ class Uploads:
 
     def _deliver(self, message: Message) -> Outcome:
         """Sends one rollout until it has an outcome."""
-        answered = time.monotonic()
+        answered = self._clock()
         damaged = 0
         # To send again what is still on its way would only fill a slow link; a dead one ends the query by itself.
         timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience)
@@ -127,13 +149,13 @@ class Uploads:
                 reply = self._transport.query(self._key, message, timeout=timeout)
             except RefusedError as error:  # it arrived damaged, or the learner failed on it
                 damaged += 1
-                answered = time.monotonic()
+                answered = self._clock()
                 if damaged >= self._max_refusals:
                     return self._refused(str(error))
             except TransportError as error:
-                check_timeout(answered, self._patience, error)
+                check_timeout(self._clock() - answered, self._patience, error)
             else:
-                answered = time.monotonic()
+                answered = self._clock()
                 self._on_reply(reply.meta)
                 if self.failure:
                     raise self.failure
@@ -163,15 +185,15 @@ class Uploads:
         return "refused"
 
 
-def check_timeout(answered: float, patience: float, error: TransportError) -> None:
-    """Raises `TransportError` if the learner's last answer was too long ago.
+def check_timeout(silence: float, patience: float, error: TransportError) -> None:
+    """Raises `TransportError` if the learner has been silent for too long.
 
     Args:
-      answered: when that was, on the monotonic clock.
-      patience: seconds after which it was too long ago.
+      silence: seconds since its last answer.
+      patience: seconds after which they are too many.
       error: what came instead of an answer.
     """
-    if time.monotonic() - answered > patience:
+    if silence > patience:
         raise TransportError(
             f"The learner has not answered for {patience:g} s: {error}", "Start the actor again later."
         ) from None

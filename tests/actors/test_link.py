@@ -285,6 +285,21 @@ def test_silent_learner_is_given_up(ends):
         link.acquire_ticket(5)
 
 
+def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(ends, monkeypatch):
+    hub, make = ends
+    learner, link = Learner(hub), make(patience=5.0)
+    link.config(5)
+    learner.transport.close()
+    outcome = link.upload(rollout(), TICKET)
+    assert link.acquire_ticket(0.2) is None
+    running = time.monotonic
+    monkeypatch.setattr(time, "monotonic", lambda: running() + 60.0)  # what a process sees that was stopped
+    assert link.acquire_ticket(0.2) is None
+    assert not outcome.done()
+    Learner(hub, life="2")
+    assert outcome.result(10) == "accepted" and link.acquire_ticket(10)
+
+
 def test_learner_that_talks_nonsense_ends_the_link(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
