@@ -1,6 +1,8 @@
 """Rollouts on their way to the learner: each is sent until it has an outcome, across restarts of the learner."""
 
 import itertools
+import logging
+import math
 import queue
 import threading
 import time
@@ -18,25 +20,50 @@ Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 _BACKOFF = (0.1, 0.5)  # first and longest delay between two attempts, s
 _SLOWEST = 100e3  # bytes a second of a link that is waited for
 _LONGEST_TICK = 1.0  # s
+_NOTICED, _NOTICE_AGAIN = 5.0, 60.0  # seconds of silence of which a line is logged, and between two lines
+_log = logging.getLogger(__name__)
 
 
-class RunningClock:
-    """Seconds for which this process ran: a time in which it was frozen or starved counts as one second at most.
+class Patience:
+    """Limit of the learner's silence, in seconds for which this process ran.
 
-    It must be read more often than that to be right.
+    Of a time in which it was frozen or starved, one second counts. It must be read more often than that to be right.
+
+    Attributes:
+      limit: seconds.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, limit: float):
+        """Begins to count."""
+        self.limit = limit
         self._lock = threading.Lock()
         self._seconds, self._read = 0.0, time.monotonic()
+        self._noticed = -math.inf
 
-    def __call__(self) -> float:
+    def now(self) -> float:
         """The seconds until now."""
         with self._lock:
             now = time.monotonic()
             self._seconds += min(now - self._read, _LONGEST_TICK)
             self._read = now
             return self._seconds
+
+    def check(self, answered: float, error: TransportError) -> None:
+        """Logs that there is no answer, once a minute, and raises `TransportError` when that has been so for too long.
+
+        Args:
+          answered: when there was one last.
+          error: what came instead of an answer.
+        """
+        now = self.now()
+        silence = now - answered
+        if silence > self.limit:
+            raise TransportError(
+                f"The learner has not answered for {self.limit:g} s: {error}", "Start the actor again later."
+            ) from None
+        if silence > _NOTICED and now - self._noticed > _NOTICE_AGAIN:
+            self._noticed = now
+            _log.warning("The learner does not answer; waiting for up to %g s: %s", self.limit, error)
 
 
 class _Upload(NamedTuple):
@@ -64,8 +91,7 @@ class Uploads:
         window: int,
         max_refusals: int,
         request_timeout: float,
-        patience: float,
-        clock: RunningClock,
+        patience: Patience,
         journal: Journal | None,
     ):
         """Starts the threads.
@@ -77,8 +103,7 @@ class Uploads:
           window: rollouts on their way at a time.
           max_refusals: rollouts refused in a row after which nothing more is sent.
           request_timeout: seconds that sending may take, and more by the rollout's size.
-          patience: seconds without any answer after which the learner is given up.
-          clock: measures them.
+          patience: after which the learner is given up.
           journal: where each answer is written down.
         """
         self.failure: CongraspError | None = None
@@ -86,7 +111,7 @@ class Uploads:
         self.closed = threading.Event()
         self._transport, self._key, self._on_reply = transport, key, on_reply
         self._max_refusals, self._timeout, self._patience = max_refusals, request_timeout, patience
-        self._clock, self._journal = clock, journal
+        self._journal = journal
         self._refusals = 0
         self._queue: queue.SimpleQueue[_Upload | None] = queue.SimpleQueue()
         self._pending: set[Future[Outcome]] = set()
@@ -138,10 +163,10 @@ class Uploads:
 
     def _deliver(self, message: Message) -> Outcome:
         """Sends one rollout until it has an outcome."""
-        answered = self._clock()
+        answered = self._patience.now()
         damaged = 0
         # To send again what is still on its way would only fill a slow link; a dead one ends the query by itself.
-        timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience)
+        timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience.limit)
         delays = backoff()
         while not self.closed.is_set():
             delay = next(delays)
@@ -149,13 +174,13 @@ class Uploads:
                 reply = self._transport.query(self._key, message, timeout=timeout)
             except RefusedError as error:  # it arrived damaged, or the learner failed on it
                 damaged += 1
-                answered = self._clock()
+                answered = self._patience.now()
                 if damaged >= self._max_refusals:
                     return self._refused(str(error))
             except TransportError as error:
-                check_timeout(self._clock() - answered, self._patience, error)
+                self._patience.check(answered, error)
             else:
-                answered = self._clock()
+                answered = self._patience.now()
                 self._on_reply(reply.meta)
                 if self.failure:
                     raise self.failure
@@ -183,20 +208,6 @@ class Uploads:
                 "Start the actor with the version of congrasp that the learner has.",
             )
         return "refused"
-
-
-def check_timeout(silence: float, patience: float, error: TransportError) -> None:
-    """Raises `TransportError` if the learner has been silent for too long.
-
-    Args:
-      silence: seconds since its last answer.
-      patience: seconds after which they are too many.
-      error: what came instead of an answer.
-    """
-    if silence > patience:
-        raise TransportError(
-            f"The learner has not answered for {patience:g} s: {error}", "Start the actor again later."
-        ) from None
 
 
 def backoff() -> "itertools.chain[float]":
