@@ -41,7 +41,7 @@ def _forward(near: socket.socket, address: tuple[str, int]) -> None:
             far = socket.create_connection(address)
             break
         time.sleep(_PAUSE)
-    with near, far:
+    with near, far, contextlib.suppress(OSError):
         threading.Thread(target=_backward, args=(far, near), daemon=True, name="relay-in").start()
         while data := near.recv(1 << 16):
             with contextlib.suppress(OSError):
