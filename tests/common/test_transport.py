@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from congrasp.common.errors import CongraspError, OverloadedError, RefusedError, TransportError
+from congrasp.common.transport import zenoh_session
 from congrasp.common.transport.keys import Keys, check_name, flow, matches, parse_alive
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
@@ -417,3 +418,11 @@ def test_admission_sends_requests_away_unread(pair):
     )
     assert client.query(KEYS.ticket("a"), Message(), timeout=60).meta == {"read": True}
     assert client.query(KEYS.ticket("b"), Message(), timeout=60).meta == {"later": KEYS.ticket("b")}
+
+
+def test_a_listener_leaves_files_free_for_its_threads_whatever_the_limit_is(monkeypatch):
+    """Zenoh panics in a process that has no file left."""
+    monkeypatch.setattr(zenoh_session.resource, "getrlimit", lambda kind: (1024, 1024))
+    settings = zenoh_session.configuration("policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None)
+    taken = [int(settings.get_json(f"transport/unicast/{name}")) for name in ("accept_pending", "max_sessions")]
+    assert taken == [256, 256]

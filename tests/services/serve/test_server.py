@@ -33,7 +33,7 @@ from congrasp.services.ops.metrics import ServerMetrics, exposed
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.requests import Query
-from congrasp.services.serve.server import DEPTH, PolicyServer, follow_file, follow_run
+from congrasp.services.serve.server import DEPTH, SHARE, PolicyServer, follow_file, follow_run
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
 from tests.services.ops.test_metrics import scrape
@@ -70,7 +70,9 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
     with PolicyClient(endpoint) as client:
         client.reset(episode.request)
         first, second = (client.act(episode.state) for _ in range(2))
-        assert client.health()["ready"] and client.health()["hand"] == "human"
+        health = client.health()
+        assert health["ready"] and health["hand"] == "human"
+        assert (health["queue_limit"], health["peer_limit"]) == (DEPTH, SHARE) and health["states_per_second"] > 100
     assert first.q_target.shape == (20,) and first.u_target.shape == (6,) and first.action.shape == (26,)
     assert first.version == 0 and first.active == ("The heading guides the wrist.",)
     # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the limits.
