@@ -1,6 +1,6 @@
-"""Attempts: grasps side by side that begin as they are asked to, all of them recorded.
+"""Attempts: parallel grasps with requested initial conditions and constraints, all recorded.
 
-Training and evaluation draw their episodes at random; here someone asks for certain ones.
+Training and evaluation draw their episodes at random; attempts follow a request.
 """
 
 import functools
@@ -37,13 +37,13 @@ class Outcome(NamedTuple):
     aligned: np.ndarray
     """(B,) bool."""
     metrics: dict[str, np.ndarray]
-    """(B,) each, by the names in `actors.env.metric_names` and those of `actors.stress.assess`."""
+    """(B,) each, by the names in `actors.env.metric_names` and `actors.stress.assess`."""
     trace: Trace
     """(T, B, ...)."""
 
 
 class Attempts:
-    """A policy that grasps one object after another, each in several ways at once, by its mean action."""
+    """Grasps objects one after another with a policy's mean action, each in several ways in parallel."""
 
     def __init__(
         self,
@@ -56,16 +56,16 @@ class Attempts:
         lift: float = 0.0,
         speed: float = 0.0,
     ):
-        """Compiles nothing yet.
+        """Sets up the attempts; nothing is compiled yet.
 
         Args:
           hand: the hand.
-          task: the task; of its hold only the part that counts for success is taken.
+          task: the task; only the part of its hold that counts for success is used.
           bundle: the policy.
           hold: control steps without the table, or after the lift.
           threads: threads of the physics.
-          lift: metres by which the hand goes up after the approach; the table then stands to the end.
-          speed: of the wrist along the heading at the start, m/s.
+          lift: height by which the hand rises after the approach, m; the table then stays until the end.
+          speed: initial speed of the wrist along the heading, m/s.
         """
         self.speed = speed
         self._lift = lift
@@ -81,7 +81,7 @@ class Attempts:
 
     @property
     def phases(self) -> dict[str, float]:
-        """When the grasp, a lift and the hold begin, seconds from the first step."""
+        """Start times of the grasp, a lift and the hold, in seconds from the first step."""
         removal = self._task.approach_steps
         begins = {"grasp": 0, "hold": removal + protocols.lift_steps(self._task, self._lift)}
         if self._lift:
@@ -91,12 +91,12 @@ class Attempts:
     def run(
         self, obj: GraspObject, request: RequestedEpisodes, progress: Callable[[int], None] = lambda step: None
     ) -> Outcome:
-        """Grasps an object in B ways; another B than the last one is compiled anew.
+        """Grasps an object in B ways; a different B than before causes a recompilation.
 
         Args:
           obj: the object.
           request: the episodes.
-          progress: told how many of the T control steps are done.
+          progress: called with the number of completed control steps.
         """
         conditions, resolution = self._initial(request)
         batch = len(request.rest)
@@ -104,7 +104,7 @@ class Attempts:
             self.close()
             self._worker = self._new_worker(obj, batch)
         task, hold = self._task, self._hold
-        height = 0.0 if self._lift else protocols.LIFT_HEIGHT  # of the lift that follows the hold
+        height = 0.0 if self._lift else protocols.LIFT_HEIGHT  # duration of the lift after the hold
         protocol = protocols.stress(task, [obj], hold, height)
         if self._lift:
             protocol = protocols.lift_first(task, [obj], hold, self._lift)
@@ -128,7 +128,7 @@ class Attempts:
     def episode(
         self, outcome: Outcome, index: int, surface: Surface, obj: GraspObject, about: dict[str, Any]
     ) -> Message:
-        """One attempt as an episode for logs and pictures; `about` has what else its meta data says."""
+        """Returns one attempt as an episode for logs and pictures; `about` has further metadata."""
         metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
         trace = Trace(*(field[:, index] for field in outcome.trace))
         meta = {"version": self._bundle.version, "success": metrics["success"] > 0, "metrics": metrics}
@@ -136,17 +136,17 @@ class Attempts:
         return episode_message(self._hand, self._task, trace, outcome.goal.row(index), surface, obj, meta)
 
     def renew(self, bundle: PolicyBundle) -> None:
-        """Newer weights of the same policy; nothing is compiled anew."""
-        self._bundle.spec.require(bundle.spec, "that was to take its place")
+        """Replaces the weights of the policy without recompilation."""
+        self._bundle.spec.require(bundle.spec, "that was to replace it")
         self._bundle = bundle
 
     def close(self) -> None:
-        """Ends the physics' threads."""
+        """Stops the threads of the physics."""
         if self._worker is not None:
             self._worker.physics.close()
 
     def _new_worker(self, obj: GraspObject, batch: int) -> RolloutWorker:
-        """A worker of `batch` environments on this object, that acts by the mean and traces all of them."""
+        """Returns a worker of `batch` environments on this object that acts with the mean and traces all of them."""
         policy = functools.partial(act_by_mean, self._bundle.spec.layout)
         physics = NativePhysics(self._hand, self._task, [obj], self._threads)
         return RolloutWorker(

@@ -1,7 +1,7 @@
 """The environment: `reset` and `step` over a batch of hands and objects.
 
-A step is `targets`, what physics makes of them, and `advance`. Engines that JAX cannot trace stand between the two
-compiled halves (`actors.rollout`); `step` puts them together for those that it can.
+A step consists of `targets`, the physics step, and `advance`. An engine that JAX cannot trace is called between the two
+compiled halves (`actors.rollout`); for traceable engines `step` combines all three.
 """
 
 import dataclasses
@@ -31,16 +31,16 @@ from congrasp.common.task.types import Action, Array, Goal, SceneState, Surface
 
 
 class Settings(NamedTuple):
-    """What may change between steps without compiling anew."""
+    """Settings that may change between steps without recompilation."""
 
     weights: RewardWeights
     control: ControlConfig
     protocol: Protocol | None = None
-    """What is done to hand and object after the table's removal; nothing by default."""
+    """Lift and pushes after the table's removal; none by default."""
     probe_data: Any = None
-    """Arrays that the probe of a rollout reads beside the scene."""
+    """Additional arrays for the probe of a rollout."""
     masses: Array | None = None
-    """(N,) kg, of the engine's objects, where the critic's privileged inputs are recorded."""
+    """(N,) masses of the engine's objects, kg, if the critic's privileged inputs are recorded."""
 
 
 class View(NamedTuple):
@@ -51,69 +51,69 @@ class View(NamedTuple):
 
 
 class Views(NamedTuple):
-    """A control step as it is, and as the policy sees it."""
+    """A control step in the true state, and as observed by the policy."""
 
     true: View
     sensed: View | None
-    """What the sensors show; None where the policy sees the truth."""
+    """Scene from the sensors; None if the policy observes the true state."""
 
 
 class EnvState(NamedTuple):
     """A batch of B environments between two control steps."""
 
     physics: Any
-    """The engine's state; None where the engine keeps it in place."""
+    """State of the engine; None for an engine that keeps it internally."""
     views: Views | None
-    """The scene after the step; None inside of a loop around an engine that is not compiled."""
+    """Scene after the step; None inside a loop around an engine that is not compiled."""
     reset_state: ResetState
-    """What the present episodes started from."""
+    """Initial states of the current episodes."""
     goal: Goal
     """Active constraints."""
     surface: Surface
     """Surface points of the objects."""
     region: Array
-    """(B,) int: the region of the constraint bank that the episodes were drawn from."""
+    """(B,) int: region of the constraint bank from which the episodes were drawn."""
     hold: Array
-    """(B,) control steps without the table that the episode's metrics are of."""
+    """(B,) control steps without the table that the episode's metrics cover."""
     after: Array
-    """(B,) control steps that follow them before the episode ends."""
+    """(B,) control steps after those, before the episode ends."""
     frame: Frame
-    """The carried frame in which the episode is seen; the world's where there is no protocol."""
+    """The carried frame in which the episode is observed; the world frame without a protocol."""
     time: Array
-    """(B,) control steps since the episode began."""
+    """(B,) control steps since the start of the episode."""
     q_target: Array
     """(B, F) targets of the previous step."""
     u_target: Array
     """(B, 6)."""
     momentum: Array
-    """(B, 6) of the observer of the wrist's load (`common.task.control.track_load`)."""
+    """(B, 6) momentum of the observer of the wrist's load (`common.task.control.track_load`)."""
     tracker: Tracker | None
-    """What shows the objects' poses; None where the policy sees the true ones."""
+    """Trackers of the objects' poses; None if the policy observes the true ones."""
     readings: Readings | None
-    """What the sensors said last, likewise."""
+    """Latest readings of the sensors; None if the policy observes the true state."""
     success: Success
-    """What is known of the episodes' success."""
+    """Progress of the success protocol."""
     sums: dict[str, Array]
     """Sums (B,) of errors, forces and reward over the episode."""
     terms: Array
-    """(B, terms) sums of the reward's terms over the episode."""
+    """(B, terms) sums of the reward terms over the episode."""
     grasps: Grasps
     """Grasps of successful episodes that may become references."""
     finished: Array
-    """(B, fields) metrics of the episode that ended last, in the order of `episode_fields`."""
+    """(B, fields) metrics of the last finished episode, in the order of `episode_fields`."""
     has_finished: Array
-    """(B,) bool: an episode ended since the flag was cleared."""
+    """(B,) bool: an episode has ended since the flag was cleared."""
 
 
 class Transition(NamedTuple):
-    """What one control step brought."""
+    """Result of one control step."""
 
     reward: Array
     """(B,)."""
     terminal: Array
     """(B,) bool: the episode ended with this step."""
     truncated: Array
-    """(B,) bool: it ended because the clock ran out while the object was up, in a state that has a value."""
+    """(B,) bool: it ended by the time limit while the object was held, in a state that has a value."""
     terms: Array
     """(B, terms) weighted reward terms."""
     errors: dict[str, tuple[Array, Array]]
@@ -126,22 +126,22 @@ class GraspEnv:
     """The grasping task on a physics engine."""
 
     def __init__(self, hand: Hand, task: TaskConfig, physics: Physics):
-        """Allocates nothing yet.
+        """Creates the environment; nothing is allocated yet.
 
         Args:
           hand: the hand.
           task: the task.
-          physics: the engine, with the objects that initial conditions name by index.
+          physics: the engine, with the objects that initial conditions refer to by index.
         """
         self.hand, self.task, self.physics = hand, task, physics
         self.settings = Settings(task.reward, task.control)
 
     def reset(self, initial: InitialConditions) -> EnvState:
-        """Episodes that begin as they are told, in every environment."""
+        """Starts episodes from initial conditions, in every environment."""
         return self.state_of(initial, self.physics.start(initial.reset_state))
 
     def state_of(self, initial: InitialConditions, physics: Any) -> EnvState:
-        """Episodes that have just begun in an engine that was started from their `reset_state`."""
+        """Returns the state of episodes whose engine was just started from their `reset_state`."""
         batch = initial.reset_state.q.shape[0]
         zero, no, index = jnp.zeros(batch), jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32)
         reset_state = initial.reset_state
@@ -171,12 +171,12 @@ class GraspEnv:
         return self.with_scene(state, self.physics.read(physics)) if self.physics.compiled else state
 
     def restart(self, state: EnvState, mask: Array, initial: InitialConditions) -> EnvState:
-        """New episodes in the masked environments (B,); the others go on, with their contacts."""
+        """Starts new episodes in the masked environments (B,); the others continue, with their contacts."""
         physics = self.physics.reset(state.physics, mask, initial.reset_state)
         return self.merge(state, mask, self.state_of(initial, physics))
 
     def merge(self, state: EnvState, mask: Array, fresh: EnvState) -> EnvState:
-        """`fresh` in the masked environments (B,), but for what is not of the episode; its engine is merged already."""
+        """Selects `fresh` in the masked environments (B,) for all episode fields; the engine is already merged."""
         kept: dict[str, Any] = {name: getattr(state, name) for name in ("grasps", "finished", "has_finished")}
         views = where_environments(mask, fresh.views, state.views) if self.physics.compiled else None
         apart: dict[str, Any] = {"physics": None, "views": None}
@@ -184,12 +184,12 @@ class GraspEnv:
         return merged._replace(physics=fresh.physics, views=views)
 
     def step(self, state: EnvState, action: Array, settings: Settings | None = None) -> tuple[EnvState, Transition]:
-        """One control step of an engine that can be traced; episodes that ended stay in place.
+        """Simulates one control step of a traceable engine; finished episodes are not restarted.
 
         Args:
           state: the environments.
           action: (B, M + 6) residual action.
-          settings: reward weights and control, may be traced; those of the task by default.
+          settings: reward weights and control, possibly traced; those of the task by default.
         """
         settings = settings or self.settings
         target, command = self.targets(state, action, settings)
@@ -197,7 +197,7 @@ class GraspEnv:
         return self.advance(state._replace(physics=physics), target, physics_state, settings)
 
     def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, tuple[Array, ...]]:
-        """Joint targets of an action, and what the engine's step takes (`Physics.step`)."""
+        """Returns the joint targets of an action, and the inputs of the engine's step (`Physics.step`)."""
         target, table = decode(self.seen(state), settings.control, action), self.table_present(state)
         motors = motor_positions(self.hand, target.q_target)
         if settings.protocol is None:
@@ -212,12 +212,12 @@ class GraspEnv:
     def advance(
         self, state: EnvState, target: Action, physics_state: PhysicsState, settings: Settings
     ) -> tuple[EnvState, Transition]:
-        """What follows from a control step that the engine has made.
+        """Completes a control step after the engine has simulated it.
 
         Args:
-          state: before the step; its `physics` is after it already.
-          target: the joint targets of the step.
-          physics_state: the engine after it.
+          state: state before the step, except for `physics`, which is after it.
+          target: joint targets of the step.
+          physics_state: state of the engine after the step.
           settings: see `step`.
         """
         task, had_table = self.task, self.table_present(state)
@@ -239,7 +239,7 @@ class GraspEnv:
         stacked = jnp.stack([found[name] for name in terms(task)], -1)
         reward = jnp.sum(stacked, -1)
         error = metrics.errors(scene)
-        # The paper's window ends `hold_steps` after the removal, however much longer the episode holds.
+        # The paper's window ends `hold_steps` after the removal, however long the episode continues.
         window = ~had_table & (state.time <= task.approach_steps + task.hold_steps)
         force = jnp.linalg.norm(scene.features.force, axis=-1)
         state = state._replace(
@@ -260,7 +260,7 @@ class GraspEnv:
             counts, terminal = counts | fell, terminal | fell
         finished = jnp.where(counts[:, None], self._episode(state, up), state.finished)
         state = state._replace(finished=finished, has_finished=state.has_finished | counts)
-        # Without the object up an end is final, whatever brought it about: the fall has been paid for.
+        # If the object is not held, any end is final: the reward already contains the fall.
         transition = Transition(
             reward=reward,
             terminal=terminal,
@@ -272,7 +272,7 @@ class GraspEnv:
         return state, transition
 
     def with_scene(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
-        """The environments with the scene that the engine shows, as the carried frame sees it."""
+        """Returns the environments with the engine's scene, expressed in the carried frame."""
         reset_state = state.reset_state
         physics_state = protocols.carried(physics_state, reset_state.base_quaternion, state.frame)
         scene = SceneState(
@@ -306,26 +306,26 @@ class GraspEnv:
         return state._replace(views=Views(self._view(state, scene), sensed))
 
     def _view(self, state: EnvState, scene: SceneState) -> View:
-        """A control step with its features."""
+        """Returns a control step with its features."""
         return View(scene, features(self.hand, self.task, scene, state.surface, state.goal))
 
     def scene_of(self, state: EnvState) -> Scene:
-        """The present control step as the task's terms see it."""
-        assert state.views is not None, "`with_scene` comes first"
+        """Scene of the current control step, as input of the task's terms."""
+        assert state.views is not None, "call `with_scene` first"
         return Scene(self.hand, self.task, *state.views.true, state.goal)
 
     def seen(self, state: EnvState) -> Scene:
-        """The present control step as the policy sees it."""
-        assert state.views is not None, "`with_scene` comes first"
+        """Scene of the current control step as observed by the policy."""
+        assert state.views is not None, "call `with_scene` first"
         view = state.views.sensed or state.views.true
         return Scene(self.hand, self.task, *view, state.goal, state.readings)
 
     def privileged(self, state: EnvState) -> Scene:
-        """The present control step as a policy sees it that sees all."""
+        """Scene of the current control step as observed by a policy of the full state."""
         return self.scene_of(state)._replace(task=dataclasses.replace(self.task, observation="full"))
 
     def critic_inputs(self, state: EnvState, masses: Array) -> Array:
-        """(B, P) privileged inputs of the critic; `masses` are those of `Settings`."""
+        """Privileged inputs (B, P) of the critic; `masses` are those of `Settings`."""
         start = state.reset_state
         parameters = privileged.Parameters(
             mass=masses[start.object_index] * start.mass_scale,
@@ -338,7 +338,7 @@ class GraspEnv:
         return privileged.observe(self.scene_of(state), parameters)
 
     def _first_readings(self, initial: InitialConditions) -> dict[str, Any]:
-        """Tracker and readings of episodes that begin; None where the policy needs none."""
+        """Initial tracker and readings of episodes; None if the policy needs none."""
         if not self.task.sensed:
             return {"tracker": None, "readings": None}
         start, task = initial.reset_state, self.task
@@ -349,7 +349,7 @@ class GraspEnv:
         return {"tracker": tracker, "readings": sensing.still(first, task.history)}
 
     def _sense(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
-        """The environments with what the sensors say after a control step, in the carried frame."""
+        """Returns the environments with the sensors' readings after a control step, in the carried frame."""
         if state.tracker is None or state.readings is None:
             return state
         position, quaternion = physics_state.object_position, physics_state.object_quaternion
@@ -362,11 +362,11 @@ class GraspEnv:
         return state._replace(tracker=tracker, readings=sensing.push(state.readings, newest))
 
     def table_present(self, state: EnvState) -> Array:
-        """(B,) bool: whether the table stands in the coming control step."""
+        """(B,) bool: the table is present in the coming control step."""
         return (state.time < self.task.approach_steps) | state.reset_state.stationary
 
     def _episode(self, state: EnvState, up: Array) -> Array:
-        """(B, fields) metrics of the present episodes, as if they ended now."""
+        """Metrics (B, fields) of the current episodes, as if they ended now."""
         task, sums, known = self.task, state.sums, state.success
         after = max(task.hold_steps, 1)
         values = {

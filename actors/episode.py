@@ -30,21 +30,21 @@ def episode_message(
     obj: GraspObject,
     meta: dict[str, Any],
 ) -> Message:
-    """The episode up to its end within the trace, or the whole trace where it goes on.
+    """Returns the episode up to its end within the trace, or the whole trace if it does not end.
 
     Args:
       hand: the hand.
-      task: its control step is written down.
+      task: the task, for the length of its control step.
       trace: T steps of one environment.
-      goal: that environment's goal, without a batch axis.
-      surface: its surface, without a batch axis.
+      goal: goal of the environment, without a batch axis.
+      surface: surface of its object, without a batch axis.
       obj: its object.
       meta: further entries: version, actor, success, metrics.
     """
     ends = np.flatnonzero(np.asarray(trace.terminal))
     steps = int(ends[0]) + 1 if len(ends) else len(np.asarray(trace.terminal))
     cut = Trace(*(np.asarray(field)[:steps] for field in trace))
-    # Of the whole trace, however early the episode ends: another length would be compiled anew.
+    # For the whole trace, however early the episode ends: another length would be recompiled.
     position, quaternion = _frames(hand, trace.q, trace.wrist_position, trace.wrist_quaternion)
     arrays = {
         "link_position": position[:steps],
@@ -63,7 +63,7 @@ def episode_message(
         **{f"goal/{name}": value for name, value in goal.flat().items()},
         **{f"active/{name}": value for name, value in goal.active.items()},
         "surface_points": surface.points,
-        "surface_minus": surface.avoid,
+        "surface_avoid": surface.avoid,
         **_geometry(obj),
     }
     return Message(
@@ -74,14 +74,14 @@ def episode_message(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _frames(hand: Hand, q: Array, wrist_position: Array, wrist_quaternion: Array) -> tuple[Array, Array]:
-    """The links' frames (T, L, 3), (T, L, 4) in the world."""
+    """Frames (T, L, 3), (T, L, 4) of the links in the world frame."""
     local_position, local_quaternion = link_poses(hand, q)
     turn = jnp.broadcast_to(wrist_quaternion[:, None], local_quaternion.shape)
     return rotations.compose_pose(wrist_position[:, None], turn, local_position, local_quaternion)
 
 
 def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
-    """The object's convex pieces and its mesh, as arrays of the message."""
+    """Convex pieces and mesh of the object, as arrays of the message."""
     pieces = obj.pieces
     colours = {"colour_points": obj.colours.points, "colour_values": obj.colours.values} if obj.colours else {}
     return {
@@ -97,5 +97,5 @@ def _geometry(obj: GraspObject) -> dict[str, np.ndarray]:
 
 
 def _plain(array: np.ndarray) -> np.ndarray:
-    """The array, in float32 instead of float64."""
+    """Returns the array, with float64 converted to float32."""
     return array.astype(np.float32) if array.dtype == np.float64 else array

@@ -1,4 +1,4 @@
-"""An episode of environment 0 for the logs, which begins within one rollout and may end some rollouts later."""
+"""Episodes of environment 0 for the logs, which may extend over several rollouts."""
 
 from typing import NamedTuple
 
@@ -10,39 +10,39 @@ from congrasp.common.task.types import Goal, Surface
 
 
 class Followed(NamedTuple):
-    """An episode from its beginning on."""
+    """An episode from its beginning."""
 
     goal: Goal
-    """Without a batch axis, as the surface."""
+    """Goal and surface, without a batch axis."""
     surface: Surface
     object_index: int
     trace: Trace
-    """To the episode's last step."""
+    """Trace up to the episode's last step."""
 
 
 class Follower:
-    """Puts the traces of successive rollouts together, from the beginning of an episode on."""
+    """Concatenates the traces of successive rollouts from the beginning of an episode on."""
 
     def __init__(self) -> None:
-        """Follows nothing yet."""
+        """Creates an idle follower."""
         self._begun: Followed | None = None
 
     def forget(self) -> None:
-        """Drops what is followed: the environments start anew."""
+        """Drops the followed episode, because the environments restart."""
         self._begun = None
 
     def add(self, trace: Trace, before: EnvState | None, after: EnvState, *, due: bool) -> Followed | None:
-        """Takes a rollout.
+        """Adds a rollout.
 
         Args:
-          trace: (T, ...) of environment 0.
-          before: the environments before it, if environment 0 was at an episode's beginning.
-          after: the environments after it.
-          due: whether to follow an episode that begins in it, where none is followed.
+          trace: (T, ...) trace of environment 0.
+          before: the environments before the rollout, if environment 0 was at the beginning of an episode.
+          after: the environments after the rollout.
+          due: follows an episode that begins in the rollout, if none is being followed.
 
         Returns:
-          The episode with the rollout in which it ends, unless another one ends in it, too: what the rollout says of
-          its last episode would be said of the wrong one.
+          The episode, once its last rollout arrives; None if a later episode ends in the same rollout, since the
+          rollout only has metrics of its last one.
         """
         if self._begun is not None:
             parts = zip(self._begun.trace, trace, strict=True)
@@ -59,7 +59,7 @@ class Follower:
 
 
 def _begun(state: EnvState, trace: Trace, first: int) -> Followed:
-    """An episode whose goal and object a state has, and whose trace begins with step `first` of a rollout."""
+    """Returns an episode with the goal and object of a state, whose trace begins with step `first` of a rollout."""
     return Followed(
         state.goal.row(0),
         Surface(*(np.asarray(field[0]) for field in state.surface)),

@@ -1,7 +1,7 @@
-"""Reference poses and trajectories from the policy's own grasps (paper, section Hand Morphology).
+"""Reference poses and trajectories from the policy's grasps (paper, section Hand Morphology).
 
-Successful episodes under a heading alone leave their final states behind; now and then these replace poses of the
-constraint bank, so that much of what later episodes ask for is what this hand can do.
+Final states of successful episodes under a heading only periodically replace poses of the constraint bank. Many of the
+goals of later episodes are thus feasible for this hand.
 """
 
 import functools
@@ -24,14 +24,14 @@ from congrasp.common.task.types import Array
 
 
 class Grasps(NamedTuple):
-    """Final states of the grasps of a batch of environments, in the object frame."""
+    """Final states of grasps in a batch of environments, in the object frame."""
 
     found: Array
-    """(B,) bool: the environment had a successful episode since its grasp was last taken."""
+    """(B,) bool: the environment had a successful episode since its grasp was last collected."""
     object_index: Array
     """(B,) int."""
     region: Array
-    """(B,) int, the axis V of the constraint bank."""
+    """(B,) int, index along the axis V of the constraint bank."""
     q: Array
     """(B, F) finger angles."""
     position: Array
@@ -44,7 +44,7 @@ RENEWED = (
     *("pose_q", "pose_position", "pose_quaternion", "trajectory_position", "trajectory_quaternion"),
     *("pose_valid", "grasps"),
 )
-"""Fields of the constraint bank that `renew` writes."""
+"""Fields of the constraint bank written by `renew`."""
 
 
 def collect(
@@ -55,15 +55,15 @@ def collect(
     object_index: Array,
     region: Array,
 ) -> Grasps:
-    """The grasps, with those that succeeded just now near to their heading, and under constraints that let them.
+    """Adds the grasps that succeeded in this step close to their heading, under constraints that allow references.
 
     Args:
       scene: the control step.
-      grasps: before it.
-      error: of the step, by the names of the constraints' errors: numerators and denominators (B,).
+      grasps: grasps before the step.
+      error: errors of the step by name: numerators and denominators (B,).
       up: (B,) bool: the object has not fallen.
-      object_index: (B,) int.
-      region: (B,) int, the axis V of the constraint bank.
+      object_index: (B,) int, indices of the objects.
+      region: (B,) int, indices along the axis V of the constraint bank.
     """
     task = scene.task
     now = (scene.state.time == task.approach_steps + task.hold_steps) & up
@@ -84,12 +84,12 @@ def collect(
 
 @functools.partial(jax.jit, static_argnames=("hand", "task"))
 def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, key: Array) -> ConstraintBank:
-    """The constraint bank with grasps in the places of random reference poses of their objects and regions.
+    """Replaces random reference poses in the constraint bank by grasps of the same objects and regions.
 
-    Places whose pose no resting pose allows are taken first, and of the others only the first half. These become a
-    reservoir (Vitter 1985, algorithm R): after n grasps of an object and region a further one comes in by places / n,
-    so that they are of the policy at all its ages, not of the present one alone. A policy that had learnt from its
-    latest grasps alone held 97 % of these, and 66 % of another policy's.
+    Entries that are not allowed in any resting pose are replaced first; of the others only the first half. These form a
+    reservoir (Vitter 1985, algorithm R): after n grasps of an object and region, a further one is stored with
+    probability places / n, so that the references come from the policy at all ages, not only from the current one. A
+    policy trained with references from its latest grasps only held 97 % of these, but 66 % of another policy's.
     """
     slot_key, path_key, chance_key = jax.random.split(key, 3)
     objects = bank.pose_q.shape[0]
@@ -104,10 +104,10 @@ def renew(hand: Hand, task: TaskConfig, bank: ConstraintBank, grasps: Grasps, ke
     own = jnp.arange(unused.shape[1]) < places
     slot = jnp.argmax(2.0 * unused + own * jax.random.uniform(slot_key, unused.shape), -1)
     place = grasps.object_index, grasps.region, slot
-    # Of several grasps for one place the last is taken, in all arrays: a scatter would mix them on a GPU.
+    # Of several grasps for one entry the last is used for all arrays: a scatter would mix them on a GPU.
     number = jnp.arange(slot.size)
     taken = jnp.full(bank.pose_q.shape[:3], -1).at[place].max(jnp.where(usable, number, -1))
-    # What is written outside of an array is dropped.
+    # Writes outside an array are dropped.
     row = jnp.where(usable & (taken[place] == number), grasps.object_index, objects)
     where = row, grasps.region, slot
     return bank._replace(

@@ -1,5 +1,4 @@
-"""Initial conditions: what episodes start from, drawn from a constraint bank (paper, sections Training Setup and Hand
-Initialization) or given."""
+"""Initial conditions, given or drawn from a constraint bank (paper, sections Training Setup, Hand Initialization)."""
 
 import zlib
 from collections.abc import Collection, Mapping, Sequence
@@ -24,68 +23,68 @@ from congrasp.common.task.sensing import Sensors, draw_sensors
 from congrasp.common.task.types import Array, Goal, Surface
 
 _CLEARANCE = 0.005
-"""Metres over the table that a hand begins with at least."""
+"""Least initial height of the hand over the table, m."""
 
 
 class InitialConditions(NamedTuple):
-    """B episodes that are about to begin."""
+    """Initial conditions of B episodes."""
 
     reset_state: ResetState
-    """Object, hand and masses at the start."""
+    """Initial state of object and hand, and masses."""
     goal: Goal
     """Active constraints, after the priority rules."""
     surface: Surface
     """Labelled surface points of the objects."""
     region: Array
-    """(B,) int: the region of the constraint bank that they were drawn from."""
+    """(B,) int: region of the constraint bank from which they were drawn."""
     hold: Array
-    """(B,) int: control steps without the table before the episode ends."""
+    """(B,) int: control steps without the table before the end of the episode."""
     sensors: Sensors
-    """What shows the objects' poses to policies that do not see the true ones."""
+    """Trackers of the objects' poses, for policies that do not observe the true ones."""
 
 
 class Approach(NamedTuple):
-    """How B approaches begin, beside what their constraints say."""
+    """Start of B approaches, apart from their constraints."""
 
     back_off: Array
-    """(B,) m from the aligned wrist back, where the heading guides it."""
+    """(B,) distance back from the aligned wrist where the heading guides it, m."""
     margin: Array
-    """(B,) m that the fingers are opened wider than the object."""
+    """(B,) distance by which the fingers are opened wider than the object, m."""
     speed: Array
-    """(B,) m/s of the wrist along the heading."""
+    """(B,) speed of the wrist along the heading, m/s."""
 
 
 class RequestedEpisodes(NamedTuple):
-    """What a batch of episodes is asked for, before the priority rules; object frame."""
+    """A batch of requested episodes, before the priority rules; object frame."""
 
     goal: Goal
-    """Goal arrays; those of absent constraints may hold anything finite, and what it says is active is ignored."""
+    """Goal arrays; those of absent constraints may hold any finite values, and the active flags are ignored."""
     asked: dict[str, Array]
-    """(B,) bool by the name of each optional constraint."""
+    """(B,) bool for each optional constraint by name: True if requested."""
     surface: Surface
     rest: Array
-    """(B, 7) the object's pose on the table."""
+    """(B, 7) pose of the object on the table."""
 
 
 def sample(
     hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, batch: int, stationary: Array | bool = False
 ) -> InitialConditions:
-    """Objects, resting poses, constraints and initial hands, drawn at random.
+    """Draws objects, resting poses, constraints and initial hands at random.
 
-    Each constraint draws from a key of its own, so that one more leaves the draws of the others as they were.
+    Each constraint draws from a separate key, so that adding one does not change the draws of the others.
 
     Args:
       hand: the hand.
       task: probabilities of the constraints, and ranges.
-      bank: what is drawn from.
+      bank: the constraint bank.
       key: random key.
-      batch: B.
-      stationary: () bool, holds the objects in place (the paper's first phase).
+      batch: number B of episodes.
+      stationary: () bool, fixes the objects (the paper's first phase).
     """
     keys = iter(jax.random.split(key, 3))
     share = jnp.cumsum(bank.weight)
     objects = jnp.searchsorted(share, share[-1] * jax.random.uniform(next(keys), (batch,)), side="right")
-    objects = jnp.minimum(objects, len(bank.weight) - 1).astype(jnp.int32)  # rounding may reach the end
+    objects = jnp.minimum(objects, len(bank.weight) - 1).astype(jnp.int32)  # rounding may reach the upper bound
     rests = jax.random.randint(next(keys), (batch,), 0, bank.rest.shape[1])
     wanted = {
         c.name: jax.random.uniform(own_key(key, c.name, 0), (batch,)) < getattr(task, f"p_{c.name}")
@@ -100,7 +99,7 @@ def sample(
 
 
 def _varied(task: TaskConfig, key: Array, batch: int) -> Approach:
-    """Approaches as training begins them: from near and far, at rest or in motion, opened more or less widely."""
+    """Draws approaches for training: from near and far, at rest or in motion, with different openings."""
     distance, margin, speed = jax.random.uniform(key, (3, batch))
     near, far = task.back_off_range
     narrow, wide = task.preshape_margin
@@ -109,12 +108,12 @@ def _varied(task: TaskConfig, key: Array, batch: int) -> Approach:
 
 
 def _nominal(task: TaskConfig, batch: int) -> Approach:
-    """Approaches as the exam and requests begin them."""
+    """Returns the nominal approaches of evaluation and requests."""
     return Approach(jnp.full(batch, task.back_off), jnp.full(batch, MARGIN), jnp.zeros(batch))
 
 
 def _disturbance(task: TaskConfig, key: Array, batch: int) -> Array | None:
-    """(B,) between 0 and 1, how far an episode's references are off; None where none ever is."""
+    """Scale (B,) between 0 and 1 of the disturbance of an episode's references; None if there is none."""
     if not task.disturbed_references:
         return None
     which, amount = jax.random.uniform(key, (2, batch))
@@ -122,32 +121,32 @@ def _disturbance(task: TaskConfig, key: Array, batch: int) -> Array | None:
 
 
 class PlannedEpisodes(NamedTuple):
-    """B episodes whose objects and constraints are decided on, and what their draws depend on beside these."""
+    """B episodes with given objects and constraints, and the inputs of their draws."""
 
     objects: np.ndarray
     """(B,) int."""
     rests: np.ndarray
-    """(B,) int, resting poses."""
+    """(B,) int, indices of the resting poses."""
     names: np.ndarray
-    """(B,) uint32, of the objects: their place in the bank counts for nothing."""
+    """(B,) uint32, seeds of the objects, independent of their position in the bank."""
     numbers: np.ndarray
-    """(B,) int, of the episode among those of its object."""
+    """(B,) int, index of the episode among those of its object."""
 
 
 def planned(
     hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, plan: PlannedEpisodes, asked: Sequence[str]
 ) -> InitialConditions:
-    """Planned episodes under the constraints of these names; each draws from a key of its own.
+    """Draws planned episodes under the constraints of these names, each from a separate key.
 
-    So an episode is the same whichever others there are.
+    An episode therefore does not depend on the others.
 
     Args:
       hand: the hand.
       task: ranges.
-      bank: what is drawn from; it must allow the constraints (`allowing`).
+      bank: the constraint bank; it must allow the constraints (`allowing`).
       key: random key of all episodes under these constraints.
       plan: the episodes.
-      asked: names of the optional constraints that every episode has.
+      asked: names of the optional constraints of every episode.
     """
 
     def one(episode: PlannedEpisodes) -> InitialConditions:
@@ -160,7 +159,7 @@ def planned(
 
 
 def allowing(task: TaskConfig, bank: ConstraintBank, asked: Collection[str]) -> np.ndarray:
-    """(N, R) bool: objects and resting poses in which the constraints of these names can be drawn together."""
+    """(N, R) bool: objects and resting poses for which the constraints of these names can be drawn together."""
     objects, rests = (jnp.asarray(axis.ravel()) for axis in np.indices(bank.has_affordance.shape))
     wanted = {c.name: jnp.full(objects.shape, c.name in asked) for c in optional(task)}
     draw, found = _available(task, Draw(bank, objects, rests), wanted)
@@ -173,7 +172,7 @@ def allowing(task: TaskConfig, bank: ConstraintBank, asked: Collection[str]) -> 
 
 
 def _available(task: TaskConfig, draw: Draw, wanted: Mapping[str, Array]) -> tuple[Draw, dict[str, Array]]:
-    """The draw with its region, and which of the wanted constraints (B,) can be had, in the order of the tuple."""
+    """Returns the draw with its region, and the available ones of the wanted constraints (B,), in order."""
     asked, draw = {}, draw._replace(region=jnp.zeros_like(draw.objects))
     for constraint in optional(task):
         asked[constraint.name] = wanted[constraint.name] & constraint.available(draw)
@@ -190,7 +189,7 @@ def _drawn(
     stationary: Array | bool,
     approach: Approach,
 ) -> InitialConditions:
-    """What is left to draw of B episodes of given objects, resting poses and (where they can be had) constraints."""
+    """Draws the rest of B episodes with given objects, resting poses and (where available) constraints."""
     bank, batch = draw.bank, draw.objects.shape
     mass, friction, length = (jax.random.uniform(part, batch) for part in jax.random.split(key, 3))
     low, high = task.mass_range
@@ -217,7 +216,7 @@ def _drawn(
         gain_scale=gain_low + (gain_high - gain_low) * jax.random.uniform(own_key(key, "gains", 0), batch),
         stationary=jnp.broadcast_to(stationary, batch),
     )
-    # Squared, so that short holds, whose beginning every episode shares, stay the rule.
+    # Squared, so that short holds, whose beginning every episode shares, remain the most common.
     longer = jnp.floor(length**2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
     hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
     sensors = draw_sensors(task.sensing, task.control_dt, own_key(key, "sensing", 0), len(hold))
@@ -225,10 +224,10 @@ def _drawn(
 
 
 def _references(task: TaskConfig, draw: Draw, asked: Mapping[str, Array], key: Array) -> dict[str, Array]:
-    """Index (B,) of the reference of each constraint that is drawn from them.
+    """Index (B,) of the reference of each constraint that is drawn from references.
 
-    Each draws its own (the paper's potentially misaligned pairs). With `aligned_references` all take one that every
-    constraint which is asked for allows; where there is none, each its own.
+    Each constraint draws independently (the paper's potentially misaligned pairs). With `aligned_references`, all use
+    one that every requested constraint allows; where there is none, each draws independently.
     """
     together = _allowed_together(task, draw, asked)
     found = {}
@@ -241,12 +240,12 @@ def _references(task: TaskConfig, draw: Draw, asked: Mapping[str, Array], key: A
 
 
 def _allowed(task: TaskConfig, draw: Draw) -> dict[str, Array]:
-    """References (B, M) bool that each constraint which is drawn from them allows."""
+    """References (B, M) bool allowed by each constraint that is drawn from references."""
     return {c.name: c.allowed(draw) for c in optional(task) if c.from_reference}
 
 
 def _allowed_together(task: TaskConfig, draw: Draw, asked: Mapping[str, Array]) -> Array:
-    """(B, M) bool: references that every constraint which is asked for allows."""
+    """(B, M) bool: references allowed by every requested constraint."""
     together = jnp.ones_like(draw.allowed)
     for name, own in _allowed(task, draw).items():
         together &= own | ~asked[name][:, None]
@@ -254,28 +253,28 @@ def _allowed_together(task: TaskConfig, draw: Draw, asked: Mapping[str, Array]) 
 
 
 def own_key(key: Array, name: str, stage: int) -> Array:
-    """The random key of one stage of a constraint's draws: whether it is asked for, its goal arrays, its reference."""
+    """Random key of one stage of a constraint's draws: whether it is requested, its goal arrays, its reference."""
     return jax.random.fold_in(jax.random.fold_in(key, zlib.crc32(name.encode())), stage)
 
 
 def handover_speed(task: TaskConfig) -> float:
-    """Wrist speed (m/s) at which a planned reach hands over: three quarters of the fastest start in training."""
+    """Wrist speed (m/s) at the end of a planned reach: three quarters of the fastest start in training."""
     return 0.75 * task.initial_speed * task.back_off / task.back_off_range[1]
 
 
 def given(
     hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int, speed: float = 0.0
 ) -> tuple[InitialConditions, Resolution]:
-    """Episodes as they are asked for, of one object of nominal mass and friction, and what the priority rules did.
+    """Returns requested episodes of one object of nominal mass and friction, and the effects of the priority rules.
 
-    The object's pose is shown as it is, whatever tracker the policy was trained with.
+    The policy observes the true pose of the object, whatever tracker it was trained with.
 
     Args:
       hand: the hand.
       task: geometry of the approach.
       request: the episodes.
       hold: control steps without the table.
-      speed: of the wrist along the heading at the start, m/s.
+      speed: initial speed of the wrist along the heading, m/s.
     """
     resolution = resolve(hand, request.surface, request.goal, request.asked)
     batch = request.rest.shape[0]
@@ -312,7 +311,7 @@ def start(
     gain_scale: Array,
     stationary: Array,
 ) -> ResetState:
-    """The hand where its constraints let it begin, beside the objects in their resting poses (B, 7)."""
+    """Returns initial conditions with the hand where its constraints place it, for objects in resting poses (B, 7)."""
     q, base_position, base_quaternion = initial_hand(hand, task, goal, surface, rest, approach)
     along = rotations.rotate(rest[:, 3:], goal["heading"].direction)
     velocity = rotations.rotate(rotations.conjugate(base_quaternion), approach.speed[:, None] * along)
@@ -334,18 +333,17 @@ def start(
 def initial_hand(
     hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: Array, approach: Approach | None = None
 ) -> tuple[Array, Array, Array]:
-    """Finger angles (B, F) and world wrist poses (B, 3), (B, 4) at the start, as the constraints have it.
+    """Initial finger angles (B, F) and world wrist poses (B, 3), (B, 4), determined by the constraints.
 
-    The fingers are opened to the object's width at the heading, and a hand that would be in the table begins as much
-    higher.
+    The fingers are opened to the object's width at the heading, and a hand that would be in the table is raised.
 
     Args:
       hand: the hand.
       task: geometry of the approach.
-      goal: after the priority rules.
-      surface: of the objects.
-      rest: (B, 7) the objects' resting poses.
-      approach: how it begins; nominally by default.
+      goal: goal after the priority rules.
+      surface: surface of the objects.
+      rest: (B, 7) resting poses of the objects.
+      approach: start of the approach; nominal by default.
     """
     approach = approach or _nominal(task, len(rest))
     q = jnp.broadcast_to(jnp.array(hand.q_open), (rest.shape[0], len(hand.joints)))
@@ -365,7 +363,7 @@ def initial_hand(
 
 
 def _lowest(hand: Hand, q: Array, position: Array, quaternion: Array) -> Array:
-    """(B,) m over the table of the lowest point of hands at wrist poses (B, 3), (B, 4), world frame."""
+    """Height (B,) in m over the table of the lowest point of hands at wrist poses (B, 3), (B, 4), world frame."""
     ends = kinematics.capsules(hand, kinematics.link_transforms(hand, q)).reshape(len(q), -1, 3)
     height = jnp.sum(rotations.to_matrix(quaternion)[:, None, 2] * ends, -1) + position[:, 2:]
     return jnp.min(height - np.repeat(hand.capsule_radii, 2), -1)

@@ -1,7 +1,7 @@
-"""Rollouts: the one driver of control steps, for training, evaluation, attempts and benchmarks alike.
+"""Rollouts: the single driver of control steps, for training, evaluation, attempts and benchmarks.
 
-With a compiled engine the whole rollout is one program (`jax.lax.scan`); with one that JAX cannot trace, the same
-functions are compiled piecewise around its step.
+With a compiled engine the whole rollout is one program (`jax.lax.scan`); otherwise the same functions are compiled
+separately around the engine's step.
 """
 
 import concurrent.futures
@@ -28,17 +28,17 @@ from congrasp.common.task.observation import observe
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.types import Action, Array
 
-Policy = Callable[[Any, Array, Array], tuple[Array, Array]]
+ActFunction = Callable[[Any, Array, Array], tuple[Array, Array]]
 """(parameters, observation (B, D) float32, random key) -> action (B, A), log-probability (B,)."""
 Probe = Callable[[Scene, Array, Any], Any]
-"""(the scene after a control step, the objects' indices (B,), `Settings.probe_data`) -> a pytree of arrays that someone
-wants of every environment and step."""
+"""(scene after a control step, indices of the objects (B,), `Settings.probe_data`) -> a pytree of arrays to record for
+every environment and step."""
 
 
 class Trace(NamedTuple):
-    """What is kept of one environment, or of several, at every step, for logs and pictures (T leads).
+    """Recorded values of one environment, or of several, at every step, for logs and pictures (T leads).
 
-    Poses are the world's, also where the policy sees a carried frame (`actors.stress`).
+    Poses are in the world frame, even if the policy observes a carried frame (`actors.stress`).
     """
 
     q: Array
@@ -68,56 +68,56 @@ class Rollout(NamedTuple):
     action: Array
     """(T, B, A)."""
     log_probability: Array
-    """(T, B) under the behaviour policy."""
+    """(T, B) log probability under the behaviour policy."""
     reward: Array
     """(T, B)."""
     terminal: Array
     """(T, B) bool: the episode ended with this step."""
     truncated: Array
-    """(T, B) bool: it ended by its time limit with the object up (`actors.env.Transition`)."""
+    """(T, B) bool: it ended by its time limit with the object held (`actors.env.Transition`)."""
     occupancy: Array
     """(T, 2), see `actors.physics.engine.PhysicsState`."""
     last_observation: Array
     """(B, D)."""
     episodes: Array
-    """(B, fields) metrics of the last episode that ended in each environment, in the order of `episode_fields`."""
+    """(B, fields) metrics of the last finished episode of each environment, in the order of `episode_fields`."""
     has_episode: Array
     """(B,) bool."""
     trace: Trace
     probed: Any
-    """What the probe returned, with leading axis T; None without a probe."""
+    """Result of the probe, with leading axis T; None without a probe."""
     teacher_observation: Array | None = None
-    """(T, B, S) what a policy sees that sees all, where a teacher is to say what it would do."""
+    """(T, B, S) full observation, for a teacher that labels the rollout."""
     privileged: Array | None = None
-    """(T, B, P) privileged inputs of the critic (`common.task.privileged`), where they are recorded."""
+    """(T, B, P) privileged inputs of the critic (`common.task.privileged`), if recorded."""
     last_privileged: Array | None = None
     """(B, P)."""
 
 
 class _Seen(NamedTuple):
-    """Observations of one control step, in the precision that the learner gets."""
+    """Observations of one control step, in the learner's precision."""
 
     observation: Array
     """(B, D)."""
     teacher_observation: Array | None
-    """(B, S) of a policy that sees all, if that is recorded."""
+    """(B, S) full observation, if recorded."""
     privileged: Array | None
-    """(B, P) of the critic, likewise."""
+    """(B, P) privileged inputs of the critic, if recorded."""
 
 
 class _Decision(NamedTuple):
-    """What the policy wants of the coming control step."""
+    """Decision of the policy for the coming control step."""
 
     seen: _Seen
     action: Array
     log_probability: Array
     target: Action
     command: tuple[Array, ...]
-    """What the engine's step takes."""
+    """Inputs of the engine's step."""
 
 
 class RolloutWorker:
-    """Environments that go on from one rollout to the next."""
+    """Environments that continue from one rollout to the next."""
 
     def __init__(
         self,
@@ -125,7 +125,7 @@ class RolloutWorker:
         task: TaskConfig,
         physics: Physics,
         bank: ConstraintBank | None,
-        policy: Policy,
+        policy: ActFunction,
         *,
         batch: int,
         seed: int,
@@ -136,22 +136,23 @@ class RolloutWorker:
         taught: bool = False,
         privileged: Sequence[GraspObject] = (),
     ):
-        """Starts fresh episodes, if there is a bank.
+        """Creates the worker, and starts episodes if there is a bank.
 
         Args:
           hand: the hand.
           task: the task.
-          physics: the engine; its objects are those of the bank.
-          bank: what episodes are drawn from; without one they are given to `begin`, and stay in place at their end.
-          policy: a pure function; parameters are given at each rollout.
-          batch: B, number of environments.
+          physics: the engine, with the objects of the bank.
+          bank: constraint bank of the episodes; without one, `begin` sets the episodes, which do not restart at their
+            end.
+          policy: a pure function; `collect` passes its parameters.
+          batch: number B of environments.
           seed: seed of episodes and actions.
-          half_precision: observations are rounded to half precision, for the policy as well as for the learner.
-          probe: what else to keep of every step.
-          traced: of which environments a trace is kept.
-          staggered: the first episodes end early, each at a time of its own, so that short rollouts show all phases of
-            the task from then on.
-          taught: `Rollout.teacher_observation` is recorded.
+          half_precision: rounds observations to half precision, for the policy and for the learner.
+          probe: computes additional values to record at every step.
+          traced: environments whose trace is recorded.
+          staggered: ends the first episodes early at different times, so that short rollouts then contain all phases of
+            the task.
+          taught: records `Rollout.teacher_observation`.
           privileged: the engine's objects, if `Rollout.privileged` is recorded.
         """
         self.physics, self.env = physics, GraspEnv(hand, task, physics)
@@ -177,15 +178,15 @@ class RolloutWorker:
             self.restart()
 
     def adjust(self, **settings: Any) -> None:
-        """Other `Settings` by name, from the next control step on; what is new in kind or shape is compiled anew."""
+        """Changes `Settings` by name from the next control step on; new types or shapes are recompiled."""
         self._settings = self._settings._replace(**settings)
 
     def configure(self, weights: RewardWeights, *, stationary: bool) -> None:
-        """Sets the reward's weights, and whether the objects of episodes that start from now on are held in place."""
+        """Sets the reward weights, and whether the objects of episodes that start from now on are fixed."""
         self._settings, self._stationary = self._settings._replace(weights=weights), np.array(stationary)
 
     def replace_objects(self, objects: Sequence[GraspObject], bank: ConstraintBank | None) -> None:
-        """Episodes that start from now on are drawn from these objects, as many as before, and their bank."""
+        """Replaces the objects by as many others, with their bank, for episodes that start from now on."""
         physics = self.physics.replace_objects(self.state.physics if self.state else None, objects)
         self._bank = _on_device(bank)
         if self._settings.masses is not None:
@@ -195,7 +196,7 @@ class RolloutWorker:
             self.take_grasps()
 
     def restart(self) -> None:
-        """Fresh episodes in every environment."""
+        """Starts new episodes in every environment."""
         self._episode_key, key = _split(self._episode_key)
         conditions = self._sample_jit(self._bank, key, self._stationary)
         if self._staggered:
@@ -205,7 +206,7 @@ class RolloutWorker:
         self.begin(conditions)
 
     def begin(self, conditions: InitialConditions) -> None:
-        """Goes on with these episodes, which are about to begin, one for each environment."""
+        """Starts these episodes, one in each environment."""
         kept, conditions = self.state, _on_device(conditions)
         if self.physics.compiled:
             self.state = self._begin_jit(conditions, _on_device(kept))
@@ -220,8 +221,8 @@ class RolloutWorker:
             self.state = self.state._replace(grasps=kept.grasps)
 
     def renew(self, mask: np.ndarray, conditions: InitialConditions) -> None:
-        """Goes on with these episodes, which are about to begin, in the masked environments (B,)."""
-        assert self.state is not None, "no episode was begun"
+        """Starts these episodes in the masked environments (B,)."""
+        assert self.state is not None, "call `begin` first"
         conditions = _on_device(conditions)
         if self.physics.compiled:
             self.state = self._restart_jit(self.state, mask, conditions)
@@ -231,15 +232,15 @@ class RolloutWorker:
         self.state = self._with_scene_jit(state, self.physics.read(None))
 
     def observe(self) -> Array:
-        """(B, D) what a policy sees of the present control step."""
+        """Observation (B, D) of the current control step by the policy."""
         return self._look_jit(self.state, self._settings).observation
 
     def compile(self, parameters: Any, steps: int) -> None:
-        """Compiles what `collect` and `renew_references` run, all at once, and runs nothing; for compiled engines.
+        """Compiles the programs of `collect` and `renew_references` without running them; for compiled engines.
 
         Args:
-          parameters: of the policy, as for `collect`.
-          steps: T.
+          parameters: parameters of the policy, as for `collect`.
+          steps: number T of steps.
         """
         given, grasps = self._scan_arguments(parameters, self._key), self.state.grasps if self.state else None
         programs = [self._scan_jit.lower(*given, steps=steps)]
@@ -249,35 +250,35 @@ class RolloutWorker:
 
     @property
     def bank(self) -> ConstraintBank:
-        """What episodes are drawn from at present."""
+        """Current constraint bank of the episodes."""
         assert self._bank is not None, "these episodes are given"
         return self._bank
 
     def weigh_objects(self, weight: np.ndarray) -> None:
-        """Episodes that start from now on draw objects by these weights (N,)."""
+        """Sets the weights (N,) with which episodes that start from now on draw objects."""
         self._bank = self.bank._replace(weight=jnp.asarray(weight, jnp.float32))
 
     def renew_references(self) -> None:
-        """Puts the grasps that succeeded since the last call into the bank as reference poses."""
+        """Stores the grasps that succeeded since the last call as reference poses in the bank."""
         self._key, key = _split(self._key)
         self._bank = harvest.renew(self._hand, self._task, self.bank, self.take_grasps(), key)
 
     def take_grasps(self) -> Grasps:
-        """The grasps that succeeded since the last call."""
-        assert self.state is not None, "no episode was begun"
+        """Returns the grasps that succeeded since the last call."""
+        assert self.state is not None, "call `begin` first"
         grasps = self.state.grasps
         self.state = self.state._replace(grasps=grasps._replace(found=_on_device(np.zeros(self.batch, bool))))
         return grasps
 
     def collect(self, parameters: Any, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
-        """The next `steps` control steps under these policy parameters.
+        """Simulates the next `steps` control steps with these policy parameters.
 
         Args:
-          parameters: of the policy.
-          steps: T.
-          progress: told how many steps are done, by engines that are not compiled.
+          parameters: parameters of the policy.
+          steps: number T of steps.
+          progress: called with the number of completed steps, by engines that are not compiled.
         """
-        assert self.state is not None, "no episode was begun"
+        assert self.state is not None, "call `begin` first"
         self._key, key = _split(self._key)
         self.state = _on_device(self.state._replace(has_finished=np.zeros(self.batch, bool)))
         if self.physics.compiled:
@@ -285,11 +286,11 @@ class RolloutWorker:
         return self._collect_stepwise(parameters, key, steps, progress)
 
     def _sample(self, bank: ConstraintBank, key: Array, stationary: Array) -> InitialConditions:
-        """Fresh episodes for all environments, drawn from the bank."""
+        """Draws initial conditions for all environments from the bank."""
         return initial.sample(self._hand, self._task, bank, key, self.batch, stationary)
 
     def _begin(self, conditions: InitialConditions, kept: EnvState | None) -> EnvState:
-        """Episodes in every environment, of which a compiled engine's are started or, where it runs already, reset."""
+        """Starts episodes in every environment; a compiled engine is started or, if it runs already, reset."""
         if not self.physics.compiled:
             return self.env.state_of(conditions, None)
         if kept is None:
@@ -298,11 +299,11 @@ class RolloutWorker:
         return self.env.state_of(conditions, physics)._replace(grasps=kept.grasps)
 
     def _merge(self, state: EnvState, mask: Array, fresh: InitialConditions) -> EnvState:
-        """Fresh episodes in the masked environments (B,), whose engine was reset apart."""
+        """Merges fresh episodes into the masked environments (B,), whose engine was reset separately."""
         return self.env.merge(state, mask, self.env.state_of(fresh, None))
 
     def _look(self, state: EnvState, settings: Settings) -> _Seen:
-        """Observations of the present control step."""
+        """Returns the observations of the current control step."""
         observation = observe(self.env.seen(state)).astype(self._dtype)
         everything = observe(self.env.privileged(state)).astype(self._dtype) if self._taught else None
         masses = settings.masses
@@ -310,14 +311,14 @@ class RolloutWorker:
         return _Seen(observation, everything, inputs)
 
     def _decide(self, parameters: Any, settings: Settings, state: EnvState, key: Array) -> _Decision:
-        """Observation, action and joint targets of the coming step."""
+        """Returns observation, action and joint targets of the coming step."""
         seen = self._look(state, settings)
         action, log_probability = self._policy(parameters, seen.observation.astype(jnp.float32), key)
         target, command = self.env.targets(state, action, settings)
         return _Decision(seen, action, log_probability, target, command)
 
     def _kept(self, state: EnvState, action: Array, transition: Transition, settings: Settings) -> tuple[Trace, Any]:
-        """What trace and probe keep of a step."""
+        """Returns the recorded values of trace and probe of a step."""
         scene = self.env.scene_of(state)
         probed = self._probe(scene, state.reset_state.object_index, settings.probe_data)
         return _traced(scene, state.frame, action, transition, self._traced), probed
@@ -332,9 +333,9 @@ class RolloutWorker:
         keys: Array,
         step: Array,
     ) -> tuple[dict[str, Any], Transition, tuple[Trace, Any], _Decision]:
-        """Ends a control step and decides on the next one: one call between two of the engine's.
+        """Completes a control step and decides on the next one: one call between two steps of the engine.
 
-        Of the state only what changed is returned, because every array that passes through a call has its price.
+        Only the changed part of the state is returned, because every array that passes through a call has a cost.
         """
         after, transition = self.env.advance(state, decision.target, physics_state, settings)
         kept = self._kept(after, decision.action, transition, settings)
@@ -344,8 +345,8 @@ class RolloutWorker:
         return changed, transition, kept, following
 
     def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
-        """A rollout with an engine that JAX cannot trace; see `collect`."""
-        # One key more than there are steps: what is decided after the last one only yields `last_observation`.
+        """Collects a rollout with an engine that JAX cannot trace; see `collect`."""
+        # One more key than steps: the decision after the last step only yields `last_observation`.
         keys = jax.random.split(key, steps + 1)
         key_data = jax.random.key_data(keys)
         parameters, settings = _on_device((parameters, self._settings))
@@ -378,12 +379,12 @@ class RolloutWorker:
         return _rollout(self.state, columns, decision.seen, trace, probed)
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
-        """A rollout as one program; see `collect`."""
+        """Collects a rollout as one program; see `collect`."""
         (self.state, self._episode_key), rollout = self._scan_jit(*self._scan_arguments(parameters, key), steps=steps)
         return rollout
 
     def _scan_arguments(self, parameters: Any, key: Array) -> tuple[Any, ...]:
-        """What `_scan` takes but for the steps."""
+        """Arguments of `_scan` except for the steps."""
         parameters, bank, carry = _on_device((parameters, self._bank, (self.state, self._episode_key)))
         return parameters, self._settings, self._stationary, bank, carry, key
 
@@ -397,7 +398,7 @@ class RolloutWorker:
         key: Array,
         steps: int,
     ) -> tuple[tuple[EnvState, Array], Rollout]:
-        """`steps` control steps and the fresh episodes where some end; traced."""
+        """Scans `steps` control steps, with new episodes where some end; traced."""
 
         def renew(operand: Any) -> Any:
             state, episode_key, terminal = operand
@@ -423,17 +424,17 @@ class RolloutWorker:
 
 
 def _on_device(tree: Any) -> Any:
-    """The arrays committed to this process's device: those that are not would have programs compiled once more."""
+    """Commits the arrays to this process's device: uncommitted ones would cause another compilation."""
     return jax.device_put(tree, jax.local_devices()[0])
 
 
 def _masses(objects: Sequence[GraspObject]) -> Array:
-    """(N,) kg."""
+    """Masses (N,) in kg."""
     return _on_device(np.array([obj.mass for obj in objects], np.float32))
 
 
 def _row(seen: _Seen, action: Array, log_probability: Array, transition: Transition) -> dict[str, Any]:
-    """A control step's part of a `Rollout`, by its fields."""
+    """Fields of a `Rollout` for one control step."""
     return {
         **seen._asdict(),
         "action": action,
@@ -446,7 +447,7 @@ def _row(seen: _Seen, action: Array, log_probability: Array, transition: Transit
 
 
 def _rollout(state: EnvState, columns: dict[str, Any], last: _Seen, trace: Trace, probed: Any) -> Rollout:
-    """The rollout of stacked rows (`_row`) that ends in this state, whose observations are `last`."""
+    """Returns the rollout of stacked rows (`_row`) that ends in this state, with the observations `last`."""
     return Rollout(
         **columns,
         last_observation=last.observation,
@@ -463,7 +464,7 @@ _split = jax.jit(lambda key: tuple(jax.random.split(key)))
 
 
 def _traced(scene: Scene, frame: Frame, action: Array, transition: Transition, where: int | slice) -> Trace:
-    """What is kept of a step of one environment, or of several."""
+    """Recorded values of a step for one environment, or for several."""
     state, features = scene.state, scene.features
     force = jnp.sum(jnp.where(state.contact_found[where][..., None], state.contact_force[where], 0.0), -2)
     errors = [
@@ -489,6 +490,6 @@ def _traced(scene: Scene, frame: Frame, action: Array, transition: Transition, w
 
 
 def finished_episodes(rollout: Rollout, task: TaskConfig) -> dict[str, np.ndarray]:
-    """Metrics (E,) of the E episodes that ended, by the names in `actors.env.episode_fields`."""
+    """Metrics (E,) of the E finished episodes, by the names in `actors.env.episode_fields`."""
     rows = np.asarray(rollout.episodes)[np.asarray(rollout.has_episode)]
     return dict(zip(episode_fields(task), rows.T, strict=True))

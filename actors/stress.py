@@ -1,8 +1,8 @@
-"""What is done to a grasp after the table is removed: the hand is carried upwards, and the object is pushed.
+"""Stress test of a grasp after the table is removed: the hand is lifted, and the object is pushed.
 
-The lift is a frame that moves: the policy sees hand and object as they are in it, so that its features and goals know
-nothing of the lift, and the wrist's joint targets get the way of the frame. Pushes are forces on the object. Both
-follow from the control steps since the table's removal, so that the episode goes on as it does everywhere else.
+The lift is a moving frame: the policy observes hand and object relative to it, so that features and goals are
+independent of the lift, and the wrist's joint targets include the motion of the frame. Pushes are forces on the object.
+Both depend on the control steps since the table's removal; the episode is otherwise unchanged.
 """
 
 import itertools
@@ -27,17 +27,17 @@ from congrasp.common.task.types import Array
 GRAVITY = 9.81
 """m/s^2."""
 LIFT_HEIGHT, LIFT_SPEED, LIFT_ACCELERATION = 0.15, 0.3, 3.0
-"""m, m/s and m/s^2 of the lift that a grasp should survive."""
+"""Height (m), speed (m/s) and acceleration (m/s^2) of the lift."""
 PUSH_SECONDS = 0.25
-"""How long each push lasts."""
+"""Duration of each push, s."""
 PUSH_FORCE = 1.0
-"""N of the second six pushes; the first six are half of the object's weight."""
+"""Force of the second six pushes, N; that of the first six is half of the object's weight."""
 FARTHEST, MOST_TURNED = 0.05, float(np.radians(15.0))
-"""m and rad from where the object was in the wrist's frame, beyond which it has not survived (DexGraspBench's)."""
+"""Greatest change of the object's pose in the wrist frame for survival, m and rad (as in DexGraspBench)."""
 SURVIVAL = ("lift_survival", "push_survival_weight", "push_survival")
-"""Names of what a grasp survives."""
+"""Names of the survived parts."""
 ASSESSED = (*plausibility.MEASURES, "clean", *SURVIVAL)
-"""Names of all that `assess` returns."""
+"""Names of all results of `assess`."""
 _STILL_SECONDS = 0.1  # after the lift
 _DIRECTIONS = np.concatenate([np.stack([axis, -axis]) for axis in np.eye(3, dtype=np.float32)])
 
@@ -45,25 +45,25 @@ _DIRECTIONS = np.concatenate([np.stack([axis, -axis]) for axis in np.eye(3, dtyp
 class Protocol(NamedTuple):
     """A lift, then six pushes with half of the object's weight and six with 1 N; times count from the table's removal.
 
-    The pushes are DexGraspBench's (one along each axis of the world and one against it), but follow one another in the
-    same grasp, last 0.25 s instead of 2 s, and act beside gravity. Its force, 10 m/s^2 times the mass, is 1 N for its
-    objects of 100 g.
+    The pushes are those of DexGraspBench (along each axis of the world frame, in both directions), but they follow one
+    another in the same grasp, last 0.25 s instead of 2 s, and act in addition to gravity. Its force, 10 m/s^2 times the
+    mass, is 1 N for its objects of 100 g.
     """
 
     lift_start: Array
-    """() control steps."""
+    """() start, control steps."""
     lift_height: Array
     """() m."""
     push_start: Array
-    """() control steps."""
+    """() duration, control steps."""
     masses: Array
-    """(N,) kg, of the engine's objects."""
+    """(N,) masses of the engine's objects, kg."""
     table: Array | bool = False
-    """() bool: the table stands on; that the policy sees it gone is what it knows a lift by."""
+    """() bool: the table stays. The policy observes it as removed, which signals the lift."""
 
 
 class Frame(NamedTuple):
-    """Where the carried frame is above the world's, and how it moves, in B environments."""
+    """Height and motion of the carried frame relative to the world frame, in B environments."""
 
     height: Array
     """(B,) m."""
@@ -74,20 +74,20 @@ class Frame(NamedTuple):
 
 
 def stress(task: TaskConfig, objects: Sequence[GraspObject], start: int, height: float = LIFT_HEIGHT) -> Protocol:
-    """The lift by `height` metres, then all pushes, from `start` control steps after the table's removal on."""
+    """Returns a lift by `height` metres and all pushes, starting `start` control steps after the table's removal."""
     push_start = np.float32(start + lift_steps(task, height))
     masses = np.array([obj.mass for obj in objects], np.float32)
     return Protocol(np.float32(start), np.float32(height), push_start, masses)
 
 
 def lift_first(task: TaskConfig, objects: Sequence[GraspObject], hold: int, height: float) -> Protocol:
-    """The lift by `height` metres off the table, which stands on, instead of its removal; all pushes after `hold`."""
+    """Returns a lift by `height` metres off the table, which stays, instead of its removal; all pushes after `hold`."""
     protocol = stress(task, objects, hold, 0.0)
     return protocol._replace(lift_start=np.float32(0), lift_height=np.float32(height), table=True)
 
 
 def lift_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
-    """Control steps of a lift and of the moment after it in which the hand comes to rest; none without a height."""
+    """Control steps of a lift, including the time until the hand is at rest; 0 without a height."""
     if not height:
         return 0
     seconds = height / LIFT_SPEED + LIFT_SPEED / LIFT_ACCELERATION + _STILL_SECONDS
@@ -105,16 +105,16 @@ def stress_steps(task: TaskConfig, height: float = LIFT_HEIGHT) -> int:
 
 
 def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
-    """The carried frame `time` (B,) control steps into the episode.
+    """Carried frame `time` (B,) control steps into the episode.
 
-    Its speed rises and falls with at most `LIFT_ACCELERATION` and is at most `LIFT_SPEED`: a ramp, less the same ramp
-    by height / speed later.
+    Its acceleration is at most `LIFT_ACCELERATION` and its speed at most `LIFT_SPEED`: a ramp minus the same ramp
+    delayed by height / speed.
     """
     since = (time - task.approach_steps - protocol.lift_start) * task.control_dt
     rise = LIFT_SPEED / LIFT_ACCELERATION
 
     def ramp(seconds: Array) -> Frame:
-        """One that speeds up to `LIFT_SPEED` and goes on."""
+        """Frame that accelerates to `LIFT_SPEED` and continues."""
         speeding = jnp.clip(seconds, 0.0, rise)
         way = 0.5 * LIFT_ACCELERATION * speeding**2 + LIFT_SPEED * jnp.maximum(seconds - rise, 0.0)
         speeds_up = (seconds > 0.0) & (seconds < rise)
@@ -125,14 +125,14 @@ def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
 
 
 def push(protocol: Protocol, task: TaskConfig, time: Array, index: Array, mass_scale: Array) -> Array:
-    """(B, 3) force on the objects in the control step that begins `time` (B,) steps into the episode, world frame, N.
+    """Force (B, 3) on the objects in the control step that begins `time` (B,) steps into the episode, world frame, N.
 
     Args:
-      protocol: when.
-      task: length of a control step.
-      time: control steps since the episode began.
-      index: (B,) int, the objects.
-      mass_scale: (B,) factors of their masses.
+      protocol: times of the pushes.
+      task: the task, for the length of a control step.
+      time: (B,) control steps since the start of the episode.
+      index: (B,) int, indices of the objects.
+      mass_scale: (B,) factors on their masses.
     """
     number = jnp.floor((time - task.approach_steps - protocol.push_start) / push_steps(task)).astype(jnp.int32)
     weight = GRAVITY * jnp.asarray(protocol.masses)[index] * mass_scale
@@ -142,11 +142,11 @@ def push(protocol: Protocol, task: TaskConfig, time: Array, index: Array, mass_s
 
 
 def carried(state: PhysicsState, base_quaternion: Array, frame: Frame) -> PhysicsState:
-    """Hand and object as the carried frame sees them.
+    """Transforms hand and object to the carried frame.
 
     Args:
-      state: in the world.
-      base_quaternion: (B, 4) of the wrist's base, whose axes the slides follow.
+      state: state in the world frame.
+      base_quaternion: (B, 4) orientation of the wrist's base, along whose axes the slides move.
       frame: the carried frame.
     """
     way, speed = up(frame.height), up(frame.speed)
@@ -160,9 +160,9 @@ def carried(state: PhysicsState, base_quaternion: Array, frame: Frame) -> Physic
 
 
 def carried_targets(u_target: Array, hand: Hand, base_quaternion: Array, frame: Frame) -> Array:
-    """Wrist targets (B, 6) of the carried frame in the world, for a control step in whose middle it is at `frame`.
+    """Transforms wrist targets (B, 6) from the carried frame to the world frame, at the middle of a control step.
 
-    They lead by what makes up for the servo's damping of the frame's speed, and for the hand's inertia.
+    They lead to compensate for the servo's damping of the frame's speed, and for the hand's inertia.
     """
     gains = hand.wrist
     lead = (gains.slide_kv * frame.speed + hand.wrist_inertia[0] * frame.acceleration) / gains.slide_kp
@@ -170,30 +170,30 @@ def carried_targets(u_target: Array, hand: Hand, base_quaternion: Array, frame: 
 
 
 def slides(base_quaternion: Array, height: Array) -> Array:
-    """(B, 6) wrist joints that go up by `height` (B,)."""
+    """Wrist joints (B, 6) of a rise by `height` (B,)."""
     return jnp.pad(rotations.rotate(rotations.conjugate(base_quaternion), up(height)), ((0, 0), (0, 3)))
 
 
 def up(length: Array) -> Array:
-    """Vectors (B, 3) upwards of these lengths (B,)."""
+    """Upward vectors (B, 3) of these lengths (B,)."""
     return jnp.pad(length[:, None], ((0, 0), (2, 0)))
 
 
 def assess(
     samples: Sample, held: np.ndarray, task: TaskConfig, hold: int, height: float = LIFT_HEIGHT
 ) -> dict[str, np.ndarray]:
-    """Measures (B,) of episodes and what their grasps survive.
+    """Measures (B,) of episodes and the survival of their grasps.
 
     Args:
-      samples: of the approach, the hold, and if it was simulated `stress`; NumPy arrays (T, B, ...).
-      held: (B,) bool, whether the object was held until the hold's end.
+      samples: samples of the approach, the hold and, if simulated, `stress`; NumPy arrays (T, B, ...).
+      held: (B,) bool, True if the object was held until the end of the hold.
       task: the task.
       hold: control steps without the table.
-      height: of the lift, m.
+      height: height of the lift, m.
 
     Returns:
-      Those of `common.task.plausibility.measures`, of the time until the hold's end; `clean`, 0 or 1, which means what
-      it says where the hold is of two seconds; and those of `survival`, NaN where there was no `stress`.
+      Those of `common.task.plausibility.measures` up to the end of the hold; `clean`, 0 or 1, which is defined for a
+      hold of two seconds; and those of `survival`, NaN without `stress`.
     """
     end = task.approach_steps + hold
     until, after = (jax.tree.map(operator.itemgetter(part), samples) for part in (slice(end), slice(end - 1, None)))
@@ -210,18 +210,18 @@ def survival(
     task: TaskConfig,
     height: float = LIFT_HEIGHT,
 ) -> dict[str, np.ndarray]:
-    """Which grasps survived the parts of `stress`: (B,) 1 or 0 each, NaN where it was not simulated.
+    """Survival of the parts of `stress`: (B,) 1 or 0 each, NaN if it was not simulated.
 
-    Every control step counts, and each part begins from where the object is then; what is lost in one part is lost in
-    the next ones too.
+    Every control step counts, and each part is relative to the object's pose at its beginning; an object lost in one
+    part is lost in the following ones.
 
     Args:
       object_position: (1 + T, B, 3) in the wrist frame, m, after the last control step of the hold and after the
         `stress_steps` that follow it.
       object_quaternion: (1 + T, B, 4) object frame to wrist frame.
-      held: (B,) bool, whether the object was held until then.
-      task: length of a control step.
-      height: of the lift, m.
+      held: (B,) bool, True if the object was held until then.
+      task: the task, for the length of a control step.
+      height: height of the lift, m.
 
     Returns:
       `lift_survival`, `push_survival_weight` (six pushes with half of the object's weight), and `push_survival` (these

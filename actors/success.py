@@ -1,4 +1,4 @@
-"""The success protocol: the table is removed, and the object must stay up (paper, section Metrics)."""
+"""Success protocol: the table is removed, and the object must stay up (paper, section Metrics)."""
 
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from congrasp.common.task.types import Array
 
 
 class Success(NamedTuple):
-    """What is known so far of the success of B episodes."""
+    """Progress of the success protocol in B episodes."""
 
     removal_height: Array
-    """(B,) object's height when the table was removed, m."""
+    """(B,) height of the object when the table was removed, m."""
     links_at_removal: Array
-    """(B,) links in contact then."""
+    """(B,) number of links in contact at that time."""
     moved_at_removal: Array
-    """(B,) metres the object had moved by then."""
+    """(B,) displacement of the object up to that time, m."""
     kept: Array
     """(B,) bool: the object had not fallen `hold_steps` after the removal (the paper's success)."""
     diverged: Array
@@ -26,22 +26,22 @@ class Success(NamedTuple):
 
 
 def begin(height: Array) -> Success:
-    """Episodes whose objects start at these heights (B,)."""
+    """Returns the initial progress of episodes whose objects start at these heights (B,)."""
     zero, no = jnp.zeros_like(height), jnp.zeros(height.shape, bool)
     return Success(height, zero, zero, no, no)
 
 
 def track(task: TaskConfig, success: Success, scene: Scene, diverged: Array) -> tuple[Success, Array]:
-    """One control step further.
+    """Advances the protocol by one control step.
 
     Args:
-      task: when the table is removed, and from where on an object has fallen.
-      success: before the step.
-      scene: after it.
-      diverged: (B,) bool, in this step.
+      task: the task, for the time of the table's removal and the drop height.
+      success: progress before the step.
+      scene: scene after the step.
+      diverged: (B,) bool, True if the physics diverged in this step.
 
     Returns:
-      After the step, and (B,) bool whether the object is up.
+      Progress after the step, and (B,) bool, True if the object is up.
     """
     state = scene.state
     removed_now = state.time == task.approach_steps

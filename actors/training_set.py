@@ -1,4 +1,4 @@
-"""What an actor trains on: its objects, and the constraint bank that their episodes are drawn from."""
+"""Training set of an actor: its objects and the constraint bank of their episodes."""
 
 import dataclasses
 import pathlib
@@ -19,22 +19,22 @@ from congrasp.common.wire.codec import Message
 
 
 class TrainingSet(NamedTuple):
-    """N objects in the hand's size, and their constraints."""
+    """N objects scaled for the hand, and their constraints."""
 
     objects: list[GraspObject]
     bank: ConstraintBank
 
 
 def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
-    """Procedural objects, those of a folder, or both, with procedural constraints or those of constraint sets.
+    """Returns procedural objects, those of a folder, or both, with procedural constraints or those of constraint sets.
 
     Args:
       hand: the hand.
-      config: of the run.
-      number: of the actor, whose procedural objects are its own.
+      config: configuration of the run.
+      number: number of the actor, which selects its procedural objects.
 
     Raises:
-      CongraspError: a folder holds nothing that can be trained on, or a set is not for this hand.
+      CongraspError: a folder has no usable objects, or a set is for another hand.
     """
     objects, task, seed = config.objects, config.task, config.seed + number
     if not objects.folder:
@@ -48,12 +48,12 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
         if not sets:
             raise CongraspError(
                 f"{objects.constraints} holds no constraint set ({objects.split}) of an object in {objects.folder}.",
-                "Name folders that belong together.",
+                "Pass folders that belong together.",
             )
         if sets[0].meta["hand"] != hand.name:
             raise CongraspError(
                 f"The constraint sets in {objects.constraints} are for the hand '{sets[0].meta['hand']}'.",
-                f"Make them for '{hand.name}', or train that hand.",
+                f"Generate them for '{hand.name}', or train that hand.",
             )
     pool = scale_objects(hand, task, found)
     captured = with_columns(hand, task, bank_of(sets, objects.split)) if sets else None
@@ -65,5 +65,5 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
     both = stacked([*rows_of(bank), *rows_of(build_bank(hand, task, beside, seed))])
     if share := objects.folder_share:
         weights = [share / len(pool)] * len(pool) + [(1 - share) / len(beside)] * len(beside)
-        both = both._replace(weight=np.array(weights, np.float32))
+        both = both._replace(weight=both.weight * np.array(weights, np.float32))
     return TrainingSet(pool + beside, with_columns(hand, task, both))

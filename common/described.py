@@ -1,4 +1,4 @@
-"""Arrays of files that say what they hold, checked against the very text that their readers see."""
+"""Self-describing arrays of files, checked against the descriptions shown to their readers."""
 
 from collections.abc import Collection, Mapping
 
@@ -13,22 +13,22 @@ def check_arrays(
     largest: float,
     sizes: Mapping[str, int] | None = None,
 ) -> dict[str, int]:
-    """Raises an error for the first array that is not what its meaning says.
+    """Checks arrays against their descriptions.
 
     Args:
-      arrays: by name.
-      meanings: of those that must be there: a shape of letters and numbers, then words, `(T, 3) m, world`; the word
-        "text" behind the shape or the word "bool" somewhere says that it holds no numbers.
-      indices: names of those that hold whole numbers.
-      largest: what no number may reach.
-      sizes: what letters stand for; the others take the size of the first array that has them.
+      arrays: arrays by name.
+      meanings: descriptions of the required arrays: a shape of letters and numbers, then words, such as `(T, 3) m,
+        world`. The word "text" after the shape, or "bool" anywhere, marks an array without numbers.
+      indices: names of integer arrays.
+      largest: exclusive bound of the absolute values.
+      sizes: known sizes by letter; any other letter takes the size of the first array that has it.
 
     Returns:
-      The size of every letter.
+      Sizes by letter.
 
     Raises:
-      ValueError: an array is empty, or has another shape or type, or numbers that are not finite or too large.
-      KeyError: there is no such array.
+      ValueError: an array is empty, has the wrong shape or type, or holds numbers that are not finite or too large.
+      KeyError: an array is missing.
     """
     known = dict(sizes or {})
     for name, meaning in meanings.items():
@@ -41,10 +41,10 @@ def check_arrays(
                 known.setdefault(letter, int(letter) if letter.isdigit() else size)
         wanted = [known.get(letter) for letter in letters]
         if wanted != list(array.shape):
-            raise ValueError(f"{name} has shape {array.shape}, where ({words}) is {tuple(wanted)}")
+            raise ValueError(f"{name} has shape {array.shape}, but ({words}) requires {tuple(wanted)}")
         kinds = "U" if ") text" in meaning else "b" if "bool" in meaning else "iu" if name in indices else "biuf"
         if array.dtype.kind not in kinds:
-            raise ValueError(f"{name} is of the type {array.dtype}")
+            raise ValueError(f"{name} has the type {array.dtype}")
         if kinds == "biuf" and not (np.isfinite(array).all() and np.abs(array.astype(float)).max() < largest):
-            raise ValueError(f"{name} holds numbers that are not finite, or absurdly large")
+            raise ValueError(f"{name} holds numbers that are not finite or too large")
     return known

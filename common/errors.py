@@ -2,16 +2,16 @@
 
 import re
 
-_LONGEST = 2000  # characters: a line may quote what somebody else wrote
+_LONGEST = 2000  # characters: a line may quote input from elsewhere
 _UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 class CongraspError(Exception):
-    """Bad input or a broken surrounding, said in one line.
+    """Bad input or an environment error, described in one line.
 
     Attributes:
-      exit_code: what the command line returns to the shell for this error.
-      code: names the kind on the wire, beside the sentence; empty where a program cannot do anything about the kind.
+      exit_code: exit code of the command line for this error.
+      code: kind of the error on the wire, alongside the message; empty where a program cannot handle the kind.
     """
 
     exit_code = 2
@@ -33,23 +33,34 @@ _EXTRAS = {
 
 
 class MissingPackageError(CongraspError):
-    """A package is absent that comes with one of the extras."""
+    """A package of one of the extras is not installed."""
 
     def __init__(self, what: str, package: str):
-        """Args: what needs it, and its import name."""
+        """Creates the error.
+
+        Args:
+          what: the feature that needs the package.
+          package: its import name.
+        """
         extra = _EXTRAS.get(package, "train")
         super().__init__(f"{what} needs the package '{package}'.", f"Run: pip install 'congrasp[{extra}]'")
 
 
 class TooWideError(CongraspError):
-    """The object is wider, wherever it can be approached, than the hand opens."""
+    """The object is wider than the hand opens, wherever it can be approached."""
 
     def __init__(self, name: str, width: float, opening: float):
-        """Args: the object's name, its smallest local width and the hand's widest opening, m."""
+        """Creates the error.
+
+        Args:
+          name: name of the object.
+          width: its smallest local width, m.
+          opening: widest opening of the hand, m.
+        """
         super().__init__(
-            f"'{name}' is too wide: {100 * width:.1f} cm where the hand would close, which opens to "
+            f"'{name}' is too wide: {100 * width:.1f} cm where the hand would close, but the hand opens to "
             f"{100 * opening:.1f} cm.",
-            "Scale the object, approach a narrower part, or take a larger hand.",
+            "Scale the object, approach a narrower part, or use a larger hand.",
         )
 
 
@@ -60,29 +71,29 @@ class PhysicsError(CongraspError):
 
 
 class TransportError(CongraspError):
-    """A peer did not answer within its deadline, or refused."""
+    """A peer refused, or did not answer within its deadline."""
 
     exit_code = 4
 
 
 class RefusedError(TransportError):
-    """Whoever was asked, a peer or a policy in this process, cannot do what the request says."""
+    """A peer, or a policy in this process, cannot serve the request."""
 
 
 class OverloadedError(RefusedError):
-    """Too many wait already; known at once, so that the caller can do something else within its deadline."""
+    """Too many requests are waiting; raised at once, so that the caller can use the rest of its deadline."""
 
     code = "overloaded"
 
 
 class LateError(RefusedError):
-    """The request's deadline passed while it waited."""
+    """The request's deadline passed while it was queued."""
 
     code = "late"
 
 
 class UnknownConstraintError(RefusedError):
-    """There is no such constraint, or the policy does not know it."""
+    """The constraint does not exist, or the policy does not support it."""
 
     exit_code = CongraspError.exit_code
     code = "unknown_constraint"
@@ -96,7 +107,7 @@ class ContradictionError(RefusedError):
 
 
 class LayoutError(RefusedError):
-    """A packed query follows another layout than the policy's."""
+    """A packed query has a layout other than the policy's."""
 
     code = "layout"
 
@@ -107,5 +118,5 @@ _BY_CODE = {
 
 
 def error_of(code: str, message: str) -> RefusedError:
-    """What a caller raises for an error of the one it asked: the class that the code names, else `RefusedError`."""
+    """Returns the exception for a peer's error: of the class of `code`, or else a `RefusedError`."""
     return _BY_CODE.get(code, RefusedError)(message)

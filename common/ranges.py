@@ -1,4 +1,4 @@
-"""What a task and its networks may be set to where a file or a message says it, and how far a simulation may go."""
+"""Limits of tasks and networks that come from files or messages, and limits of a simulation."""
 
 import dataclasses
 import math
@@ -9,13 +9,13 @@ from congrasp.common.config import NetworkConfig, TaskConfig
 from congrasp.common.objects.spec import SURFACE_POINTS
 
 MAX_SPEED = 400.0
-"""A joint faster than this (m/s or rad/s) marks a diverged environment."""
+"""A joint speed above this (m/s or rad/s) marks a diverged environment."""
 MAX_DISTANCE = 25.0
-"""A joint position beyond this (m or rad) marks a diverged environment; free fall of 2 s stays below it."""
+"""A joint position beyond this (m or rad) marks a diverged environment; a free fall of 2 s stays below it."""
 MAX_NUMBER = 1e6
-"""Largest number of any field."""
+"""Largest absolute value of any field."""
 MAX_INPUTS, MAX_ACTIONS = 16_384, 256
-"""Largest observation and action of a policy."""
+"""Largest sizes of a policy's observation and action."""
 _TASK: dict[str, tuple[float, float]] = {
     "object_scale": (0.0, 100.0),
     "control_dt": (1e-4, 1.0),
@@ -28,12 +28,12 @@ _TASK: dict[str, tuple[float, float]] = {
     "history": (2, 64),
 }
 _SENSING = {"period": 10.0, "delay": 1.0, "position_noise": 1.0, "rotation_noise": 3.2, "dropout": 1.0}
-"""Upper ends of the ranges of a task's tracker."""
+"""Upper bounds of the ranges of a task's tracker."""
 _LAYERS, _UNITS = 16, 8192
 
 
 def task_faults(task: TaskConfig) -> Iterator[str]:
-    """What is out of range in a task, one phrase for each fault."""
+    """Yields the fields of a task that are out of range, one phrase each."""
     yield from _numbers(task)
     for name, (low, high) in _TASK.items():
         value = getattr(task, name)
@@ -50,13 +50,13 @@ def task_faults(task: TaskConfig) -> Iterator[str]:
 
 
 def network_faults(network: NetworkConfig, layout: Sequence[tuple[str, int]], action_size: int) -> Iterator[str]:
-    """What is out of range in the networks of a policy with an observation and an action of these sizes."""
+    """Yields the sizes of a policy's networks, observation and action that are out of range, one phrase each."""
     yield from _numbers(network)
     if not 1 <= len(network.hidden) <= _LAYERS or not all(1 <= units <= _UNITS for units in network.hidden):
         yield f"hidden is {str(network.hidden)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} units"
     if not 1 <= network.encoder <= _UNITS:
         yield f"encoder is {network.encoder}, not 1 to {_UNITS}"
-    sizes = [size for _, size in layout]  # a policy of headings alone has no mask
+    sizes = [size for _, size in layout]  # a policy of headings only has no mask
     if not all(size >= (name != "mask") for name, size in layout) or not 1 <= sum(sizes) <= MAX_INPUTS:
         yield f"the observation has {str(sizes)[:60]} values, not 1 to {MAX_INPUTS}"
     if not 1 <= action_size <= MAX_ACTIONS:
@@ -64,7 +64,7 @@ def network_faults(network: NetworkConfig, layout: Sequence[tuple[str, int]], ac
 
 
 def _numbers(config: Any) -> Iterator[str]:
-    """Numbers of a configuration, at any depth, that are not finite or absurdly large."""
+    """Yields numbers of a configuration, at any depth, that are not finite or too large."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):

@@ -1,4 +1,4 @@
-"""Constraints on one object: the same for a policy in this process, a server, `congrasp grasp` and the studio."""
+"""Grasp request: constraints on one object, for a policy in this process, a server, `congrasp grasp` and the studio."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,30 +11,30 @@ Pose = tuple[np.ndarray, np.ndarray]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GraspRequest:
-    """Constraints on one object, and where the episode begins.
+    """Constraints on one object, and the initial state of the episode.
 
-    What is left out is free: `congrasp grasp` then attempts several. A control loop must give `surface`, `q`, `wrist`
-    and `object_pose`.
+    Omitted fields are free: `congrasp grasp` then attempts several values. A control loop must set `surface`, `q`,
+    `wrist` and `object_pose`.
     """
 
     constraints: Mapping[str, Mapping[str, np.ndarray]] = dataclasses.field(default_factory=lambda: {"heading": {}})
-    """By the name of each constraint that is asked for, its goal arrays by field, object frame, metres and radians
+    """Goal arrays of the requested constraints by constraint and field, object frame, metres and radians
     (`common.task.constraints`): `{"heading": {"direction": (0, 0, -1)}, "fingers": {"allowed": (1, 1, 0, 0, 0)}}`."""
     avoid: np.ndarray | None = None
-    """(N,) bool: points of the surface that must not be touched, where an affordance is asked for."""
+    """(N,) bool: surface points that must not be touched, for an affordance."""
     above: bool = False
-    """The hand comes within 30 degrees of straight down, however the object lies."""
+    """Restricts the approach to 30 degrees around straight down, in any pose of the object."""
     rest: int | None = None
-    """Which of the object's resting poses it starts from."""
+    """Index of the object's initial resting pose."""
     surface: np.ndarray | None = None
-    """(N, 3) m, object frame: points of the object's surface."""
+    """(N, 3) points of the object's surface, object frame, m."""
     q: np.ndarray | None = None
-    """(F,) rad: finger angles at the start."""
+    """(F,) initial finger angles, rad."""
     wrist: Pose | None = None
-    """The wrist's pose in the world at the start: the base of the virtual wrist joints."""
+    """Initial pose of the wrist in the world frame: the base of the virtual wrist joints."""
     object_pose: Pose | None = None
-    """The object's pose in the world at the start."""
+    """Initial pose of the object in the world frame."""
 
     def given(self, constraint: str, field: str) -> np.ndarray | None:
-        """One goal array, if it is asked for."""
+        """Returns a goal array, or None if it is not requested."""
         return self.constraints.get(constraint, {}).get(field)

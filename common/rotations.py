@@ -6,7 +6,7 @@ import numpy as np
 from congrasp.common.task.types import Array
 
 _UNDECIDED = 1e-5
-"""Cosine of the y angle from which on the x angle is left where it was (`quaternion_to_euler`)."""
+"""Cosine of the y angle below which the x angle keeps its previous value (`quaternion_to_euler`)."""
 
 
 def multiply(a: Array, b: Array) -> Array:
@@ -55,7 +55,7 @@ def from_matrix(m: Array) -> Array:
         [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]],
         -1,
     )
-    # Row k holds 4 q_k q: build the four candidates and take the one with the largest component.
+    # Row k holds 4 q_k q; the candidate with the largest component is the most accurate.
     w_row = jnp.concatenate([1.0 + trace[..., None], skew], -1)
     symmetric = m + jnp.swapaxes(m, -1, -2)
     squares = 1.0 - trace[..., None] + 2.0 * diagonal[..., 1:]
@@ -108,20 +108,19 @@ def euler_to_quaternion(angles: Array) -> Array:
 
 
 def quaternion_to_euler(q: Array, near: Array) -> Array:
-    """Intrinsic x-y-z angles (..., 3) of quaternions (..., 4): those nearest to given ones.
+    """Intrinsic x-y-z angles (..., 3) of quaternions (..., 4), chosen nearest to given ones.
 
-    (x, y, z) and (x + pi, pi - y, z + pi) are one rotation, to which any whole turns may be added: of all these the
-    angles with the least sum of squared differences are taken, each within pi of `near`, so that a path that is
-    followed step by step does not jump where y passes +-90 degrees. There only x + z or x - z is determined, and x
-    stays near.
+    (x, y, z) and (x + pi, pi - y, z + pi) are the same rotation, up to whole turns. The result is the solution with the
+    least sum of squared differences from `near`, each within pi, so that a path followed step by step does not jump
+    where y passes +-90 degrees. There only x + z or x - z is determined, and x keeps its value.
 
     Args:
       q: unit quaternions.
-      near: (..., 3) rad, such as the present angles.
+      near: (..., 3) rad, such as the current angles.
     """
     m = to_matrix(q)
-    # A weight on the present x decides where the matrix does not: it moves x by less than 0.1 degrees while y is more
-    # than a third of a degree from 90. y and z are exact for whatever x is taken.
+    # A weight on the current x decides where the matrix does not: it moves x by less than 0.1 degrees while y is more
+    # than a third of a degree from 90. y and z are exact for any x.
     sine, cosine = _UNDECIDED * jnp.sin(near[..., 0]), _UNDECIDED * jnp.cos(near[..., 0])
     branches = [
         _euler_given_x(m, jnp.arctan2(sine - side * m[..., 1, 2], cosine + side * m[..., 2, 2])) for side in (1.0, -1.0)
@@ -132,7 +131,7 @@ def quaternion_to_euler(q: Array, near: Array) -> Array:
 
 
 def _euler_given_x(m: Array, x: Array) -> Array:
-    """Angles (..., 3) of matrices (..., 3, 3) whose x (...,) is known: those of Rx(-x) R = Ry Rz."""
+    """Angles (..., 3) of matrices (..., 3, 3) for a known x (...,): those of Rx(-x) R = Ry Rz."""
     s, c = jnp.sin(x), jnp.cos(x)
     y = jnp.arctan2(m[..., 0, 2], c * m[..., 2, 2] - s * m[..., 1, 2])
     z = jnp.arctan2(c * m[..., 1, 0] + s * m[..., 2, 0], c * m[..., 1, 1] + s * m[..., 2, 1])
@@ -145,12 +144,12 @@ def wrapped(angle: Array) -> Array:
 
 
 def shortest(a: Array, b: Array, axis: Array) -> Array:
-    """Quaternions (..., 4) of the least rotations from unit vectors a (..., 3) to b (..., 3).
+    """Quaternions (..., 4) of the smallest rotations from unit vectors a (..., 3) to b (..., 3).
 
     Args:
-      a: from.
-      b: to.
-      axis: (..., 3) unit, orthogonal to a: the axis where b is -a, and every axis would do.
+      a: initial vectors.
+      b: final vectors.
+      axis: (..., 3) unit, orthogonal to a: the axis used if b is -a, where any is valid.
     """
     q = jnp.concatenate([1.0 + jnp.sum(a * b, -1, keepdims=True), jnp.cross(a, b)], -1)
     length = jnp.linalg.norm(q, axis=-1, keepdims=True)
@@ -170,27 +169,27 @@ def frame_from_axes(primary: Array, secondary: Array) -> Array:
 
 
 def apply(matrix: Array, points: Array) -> Array:
-    """Points (..., N, 3) turned by matrices (..., 3, 3).
+    """Points (..., N, 3) rotated by matrices (..., 3, 3).
 
-    Written out, because calling a matrix product of this size costs more than its arithmetic.
+    Written out, because the overhead of a matrix product of this size exceeds its arithmetic.
     """
     return sum(matrix[..., None, :, i] * points[..., i, None] for i in range(3))
 
 
 def transform(position: Array, quaternion: Array, points: Array) -> Array:
-    """Points (..., N, 3) of a body's frame into the frame in which the body's pose (..., 3), (..., 4) is given."""
+    """Transforms points (..., N, 3) of a body's frame into the frame of the body's pose (..., 3), (..., 4)."""
     return apply(to_matrix(quaternion), points) + position[..., None, :]
 
 
 def inverse_transform(position: Array, quaternion: Array, points: Array) -> Array:
-    """The inverse of `transform`: points (..., N, 3) into the body's frame."""
+    """Transforms points (..., N, 3) into the frame of a body with this pose; the inverse of `transform`."""
     return apply(jnp.swapaxes(to_matrix(quaternion), -1, -2), points - position[..., None, :])
 
 
 def relative_pose(
     position: Array, quaternion: Array, other_position: Array, other_quaternion: Array
 ) -> tuple[Array, Array]:
-    """Pose of `other` seen from the frame of the first pose (..., 3), (..., 4)."""
+    """Pose of `other` in the frame of the first pose (..., 3), (..., 4)."""
     inverse = conjugate(quaternion)
     return rotate(inverse, other_position - position), multiply(inverse, other_quaternion)
 
@@ -198,11 +197,11 @@ def relative_pose(
 def compose_pose(
     position: Array, quaternion: Array, local_position: Array, local_quaternion: Array
 ) -> tuple[Array, Array]:
-    """A pose given in the frame of the first pose, in the frame in which the first pose is given."""
+    """Composes poses: a pose local to the first one, expressed in the frame of the first one."""
     return position + rotate(quaternion, local_position), multiply(quaternion, local_quaternion)
 
 
 def continuous(q: np.ndarray) -> np.ndarray:
-    """Quaternions (T, 4) of a motion without jumps of sign, so that neighbours can be interpolated."""
+    """Quaternions (T, 4) of a motion without sign flips, so that neighbours can be interpolated."""
     flips = np.sign(np.sum(q[1:] * q[:-1], -1))
     return q * np.cumprod(np.concatenate([[1.0], np.where(flips == 0, 1.0, flips)]))[:, None]

@@ -2,7 +2,7 @@
 
     import congrasp
 
-    found = congrasp.grasp("mug.obj", heading="0 0 -1", fingers="thumb index")   # a motion for an object
+    found = congrasp.grasp("mug:7", heading="above")                             # or "mug.obj": a motion for an object
     congrasp.save_motion("mug.npz", found.motion)
 
     with congrasp.PolicyClient("tcp/127.0.0.1:7457") as policy:                  # or congrasp.load_policy()
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from congrasp.common.request import GraspRequest
     from congrasp.services.assets.objects.options import ImportOptions
     from congrasp.services.client.guard import Command, Guard
+    from congrasp.services.client.left import LeftPolicy
     from congrasp.services.client.limits import JointLimits
     from congrasp.services.client.policy import Answer, Policy
     from congrasp.services.client.policy_client import PolicyClient
@@ -51,6 +52,7 @@ __all__ = [
     "ImportOptions",
     "JointLimits",
     "LateError",
+    "LeftPolicy",
     "OverloadedError",
     "PhysicsError",
     "Policy",
@@ -76,6 +78,7 @@ _MODULES = {
     "Guard": "congrasp.services.client.guard",
     "ImportOptions": "congrasp.services.assets.objects.options",
     "JointLimits": "congrasp.services.client.limits",
+    "LeftPolicy": "congrasp.services.client.left",
     "Policy": "congrasp.services.client.policy",
     "PolicyClient": "congrasp.services.client.policy_client",
     "Ticker": "congrasp.services.client.ticker",

@@ -1,4 +1,4 @@
-"""How the documentation is built: `make docs`, or `sphinx-build -W docs build/docs`."""
+"""Sphinx configuration: `make docs`, or `sphinx-build -W docs build/docs`."""
 
 import pathlib
 import sys

@@ -1,4 +1,4 @@
-"""Pages of the reference that are made from the code, so that they cannot fall behind it."""
+"""Reference pages generated from the code."""
 
 import contextlib
 import dataclasses
@@ -22,14 +22,14 @@ from congrasp.services.cli import main
 
 _WIDTH = 100
 _DEFAULT = 60
-"""Characters of a default value that are shown."""
+"""Most characters of a default value."""
 
 
 class Commands(Directive):
     """The help of every command and its subcommands."""
 
     def run(self) -> list[nodes.Node]:
-        """A section for each command."""
+        """Returns a section for each command."""
         return [
             _section(f"congrasp {' '.join(words)}", [_literal(_help(words))])
             for name in main.COMMANDS
@@ -38,25 +38,25 @@ class Commands(Directive):
 
 
 class Configuration(Directive):
-    """Every field of a run's configuration: its name on the command line, its default, and what it means."""
+    """Every field of a run's configuration: option, default and meaning."""
 
     def run(self) -> list[nodes.Node]:
-        """A table."""
+        """Returns a table."""
         rows = [(f"--{name}", _short(value), text) for name, value, text in _fields(RunConfig(), "")]
         return [_table(("option", "default", "meaning"), rows)]
 
 
 class Messages(Directive):
-    """What every kind of message on the wire holds."""
+    """Entries of every kind of message on the wire."""
 
     def run(self) -> list[nodes.Node]:
-        """A section for each kind."""
+        """Returns a section for each kind."""
         specs = [value for value in vars(messages).values() if isinstance(value, MessageSpec)]
         return [_section(spec.kind, [_table(("entry", "type", "shape"), list(_entries(spec)))]) for spec in specs]
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Makes the directives known to Sphinx."""
+    """Registers the directives with Sphinx."""
     for name, directive in (("commands", Commands), ("configuration", Configuration), ("messages", Messages)):
         app.add_directive(name, directive)
     return {"parallel_read_safe": True}
@@ -69,16 +69,16 @@ def _words(command: str) -> Iterator[list[str]]:
 
 
 def _help(words: list[str]) -> str:
-    said = io.StringIO()
+    printed = io.StringIO()
     os.environ["COLUMNS"] = str(_WIDTH)
-    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         main.load(words[0])([*words[1:], "--help"])
-    lines = said.getvalue().rstrip().splitlines()
+    lines = printed.getvalue().rstrip().splitlines()
     return "\n".join(textwrap.fill(line, _WIDTH) if len(line) > _WIDTH else line for line in lines)
 
 
 def _fields(config: typing.Any, prefix: str) -> Iterator[tuple[str, typing.Any, str]]:
-    """Name, default and meaning of every field, those of nested dataclasses after a dot."""
+    """Yields name, default and meaning of every field; nested dataclasses follow a dot."""
     meanings = _meanings(type(config))
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), f"{prefix}{field.name}".replace("_", "-")
@@ -89,7 +89,7 @@ def _fields(config: typing.Any, prefix: str) -> Iterator[tuple[str, typing.Any, 
 
 
 def _meanings(kind: type) -> dict[str, str]:
-    """What the fields of a dataclass mean: the docstrings under them, or `Doc` where constraints declare them."""
+    """Returns the meaning of each field of a dataclass: its docstring, or `Doc` where constraints declare it."""
     written = "".join(inspect.getsource(base) for base in kind.__mro__ if base.__module__ == kind.__module__)
     hints = typing.get_type_hints(kind, include_extras=True)
     declared = {

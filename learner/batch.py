@@ -1,4 +1,4 @@
-"""A batch: rollouts side by side along their axis of worlds, which is also the one that ranks divide it along."""
+"""Batches: rollouts concatenated along their axis of worlds, along which ranks shard them."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,7 +15,7 @@ from congrasp.learner.distributed.collectives import AXIS
 
 
 def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> RolloutForm:
-    """The arrays and sizes of a run's rollouts, of which its algorithm learns from those of `schema`."""
+    """Returns the form of a run's rollouts, with the arrays of `schema` for its algorithm."""
     return RolloutForm(
         steps=config.rollout_steps,
         worlds=config.environments,
@@ -29,7 +29,7 @@ def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> Rollout
 
 
 def collate(rollouts: Sequence[Mapping[str, Array]], schema: Schema) -> dict[str, Array]:
-    """The schema's arrays of several rollouts of equal length, joined where the rollouts are: on host or device."""
+    """Concatenates the schema's arrays of several rollouts of equal length, on host or device."""
     if len(rollouts) == 1:
         return {name: rollouts[0][name] for name in schema}
     joined = {}
@@ -41,7 +41,7 @@ def collate(rollouts: Sequence[Mapping[str, Array]], schema: Schema) -> dict[str
 
 
 def partition_specs(schema: Schema) -> dict[str, PartitionSpec]:
-    """How each array of a batch lies on a mesh of ranks: every rank has worlds of its own."""
+    """Partition specs of a batch on a mesh of ranks: every rank has different worlds."""
     return {
         name: PartitionSpec(*(AXIS if size == WORLDS else None for size in spec.shape or ()))
         for name, spec in schema.items()

@@ -1,8 +1,8 @@
-"""Complete checkpoints: a pytree's arrays by path and JSON for the rest, in one safetensors file each.
+"""Complete checkpoints in one safetensors file each: a pytree's arrays by path, and JSON for the rest.
 
-A checkpoint is written beside its final name, flushed and renamed, so that every file is whole, whenever the process or
-the machine dies. Its name gives its update, and the newest intact one is what a run resumes from; the link `latest` is
-for people. A checksum in the header covers names, types, shapes and content of the arrays.
+A checkpoint is written to a temporary name, flushed and renamed, so that every file is complete whenever the process or
+the machine dies. Its name contains its update, and a run resumes from the newest intact one; the link `latest` is a
+convenience for users.
 """
 
 import contextlib
@@ -23,10 +23,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import sync_directory, write_atomically
 from congrasp.common.io.inputs import open_file
 from congrasp.common.wire.codec import Message, decode, encode
-from congrasp.common.wire.codec import checksum as checksum_of
 
 KEPT = 3
-"""How many checkpoints of a run are kept."""
+"""Number of checkpoints kept for a run."""
 _LATEST = "latest"
 _META = "meta"
 _PATTERN = "checkpoint_*.safetensors"
@@ -35,10 +34,10 @@ _ASIDE = ".aside"
 
 
 class Checkpoints:
-    """The checkpoints of one run, the newest `KEPT` of which stay."""
+    """Checkpoints of one run, the newest `KEPT` of which are kept."""
 
     def __init__(self, directory: pathlib.Path):
-        """Uses `directory`, which is made at the first `save`."""
+        """Uses `directory`, which the first `save` creates."""
         self._directory = directory
 
     def save(self, tree: Any, meta: dict[str, Any], version: int) -> pathlib.Path:
@@ -47,16 +46,15 @@ class Checkpoints:
         Args:
           tree: a pytree of arrays and integers.
           meta: anything JSON can hold.
-          version: number of updates, which names the file.
+          version: number of updates; part of the file's name.
 
         Raises:
-          CongraspError: if the disk is full; the previous checkpoints are intact.
+          CongraspError: the disk is full; the previous checkpoints are intact.
         """
         path = self._directory / f"checkpoint_{version:09d}.safetensors"
-        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)  # as an array: a header's length is limited
+        text = np.frombuffer(json.dumps(meta).encode(), np.uint8)  # as an array, since a header's length is limited
         message = Message({**flatten(jax.device_get(tree)), _META: text}, {"version": version})
-        check = {"checksum": checksum_of(message)}
-        write_atomically(path, encode(Message(message.arrays, {**message.meta, **check})))
+        write_atomically(path, encode(message))
         link = self._directory / f".{_LATEST}.{os.getpid()}.tmp"
         try:
             link.unlink(missing_ok=True)
@@ -72,34 +70,34 @@ class Checkpoints:
         return path
 
     def files(self) -> list[pathlib.Path]:
-        """The checkpoints, intact or not, the newest first."""
+        """Files of the checkpoints, intact or not, the newest first."""
         return sorted((path for path in self._directory.glob(_PATTERN) if _update(path) >= 0), key=_update)[::-1]
 
     def newest(self) -> int:
-        """The update of the newest checkpoint, intact or not; -1 if there is none."""
+        """Update of the newest checkpoint, intact or not; -1 if there is none."""
         return max(map(_update, self.files()), default=-1)
 
     def load(
         self, template: Any, on_event: Callable[[str, str], None] = lambda level, text: None
     ) -> tuple[Any, dict[str, Any]]:
-        """The newest intact checkpoint's tree, shaped as `template` (see `restore`), and its meta data.
+        """Loads the newest intact checkpoint: its tree, shaped like `template` (see `restore`), and its metadata.
 
         Raises:
-          CongraspError: see `find`, or the checkpoint is of another shape.
+          CongraspError: see `find`; or the checkpoint has another shape.
         """
         path, arrays, meta = self.find(on_event)
         return restore(arrays, template, str(path)), meta
 
     def find(self, on_event: Callable[[str, str], None]) -> tuple[pathlib.Path, Mapping[str, Any], dict[str, Any]]:
-        """The newest intact checkpoint: its file, its arrays and its meta data.
+        """Finds the newest intact checkpoint; returns its file, arrays and metadata.
 
-        Newer ones that are damaged are renamed, so that training does not overwrite them when it comes to their update.
+        Newer damaged ones are renamed, so that training does not overwrite them when it reaches their update.
 
         Args:
-          on_event: given (level, text) for each damaged checkpoint, and for the one that is found.
+          on_event: called with (level, text) for each damaged checkpoint and for the result.
 
         Raises:
-          CongraspError: if there is none, or a damaged one cannot be renamed.
+          CongraspError: there is none, or a damaged one cannot be renamed.
         """
         damaged = []
         for path in self.files():
@@ -110,22 +108,20 @@ class Checkpoints:
                 continue
             for other, why in damaged:
                 kept = set_aside(other)
-                on_event(
-                    "warning", f"The checkpoint {other} is damaged: {why} It is left out, and kept as {kept.name}."
-                )
+                on_event("warning", f"The checkpoint {other} is damaged: {why} It is ignored, and kept as {kept.name}.")
             on_event("info", f"Resuming from the checkpoint {path}.")
             return path, arrays, meta
         if damaged:
             raise CongraspError(
                 f"No checkpoint in {self._directory} is intact; the newest, {damaged[0][0].name}, is damaged: "
                 f"{damaged[0][1]}",
-                "Start anew in another --run-dir.",
+                "Start again in another --run-dir.",
             )
-        raise CongraspError(f"There is no checkpoint in {self._directory}.", "Start anew in another --run-dir.")
+        raise CongraspError(f"There is no checkpoint in {self._directory}.", "Start again in another --run-dir.")
 
 
 def set_aside(path: pathlib.Path) -> pathlib.Path:
-    """Renames a file so that nothing overwrites it, and returns its new name.
+    """Renames a file so that it is not overwritten; returns its new name.
 
     Raises:
       CongraspError: it cannot be renamed.
@@ -139,13 +135,13 @@ def set_aside(path: pathlib.Path) -> pathlib.Path:
 
 
 def _update(path: pathlib.Path) -> int:
-    """The update that a checkpoint's name gives; -1 if it gives none."""
+    """Update in a checkpoint's file name; -1 if there is none."""
     found = _NUMBER.fullmatch(path.name)
     return int(found[1]) if found else -1
 
 
 def _read(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
-    """Arrays and meta data of a checkpoint; a CongraspError says why it is not intact."""
+    """Reads arrays and metadata of a checkpoint; raises a CongraspError with the reason if it is not intact."""
     try:
         with open_file(path) as file:
             data = file.read()
@@ -153,20 +149,18 @@ def _read(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
         raise CongraspError(f"It cannot be read: {error.strerror}.") from None
     message = decode(data, max_bytes=len(data))
     if message.meta.get("version") != _update(path):
-        raise CongraspError("Its header names another update than the file's name.")
-    if message.meta.get("checksum", "") not in ("", checksum_of(message)):  # older versions of congrasp wrote none
-        raise CongraspError("Its content does not match the header's checksum.")
+        raise CongraspError("Its header has another update than the file's name.")
     try:
         meta = json.loads(message.arrays[_META].tobytes())
     except (KeyError, ValueError):
         meta = None
     if not isinstance(meta, dict):
-        raise CongraspError("It lacks its meta data.")
+        raise CongraspError("It lacks its metadata.")
     return message.arrays, meta
 
 
 def checksum(tree: Any) -> int:
-    """CRC-32 of all that a checkpoint of the tree holds."""
+    """CRC-32 of the whole content of a checkpoint of the tree."""
     crc = 0
     for array in flatten(jax.device_get(tree)).values():
         crc = zlib.crc32(np.ascontiguousarray(array).tobytes(), crc)
@@ -174,18 +168,18 @@ def checksum(tree: Any) -> int:
 
 
 def flatten(tree: Any) -> dict[str, np.ndarray]:
-    """The leaves of a pytree as arrays, by their path with slashes."""
+    """Returns the leaves of a pytree as arrays, by their paths with slashes."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(leaf) for path, leaf in leaves}
 
 
 def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
-    """The inverse of `flatten`: a tree like `template`, whose leaves decide where each array goes.
+    """Returns a tree like `template` from arrays by path, with their types; the inverse of `flatten`.
 
-    A JAX array goes to the default device, a NumPy array stays on the host, an integer becomes one.
+    A leaf becomes a JAX array on the default device, a NumPy array, or an integer, like that of the template.
 
     Raises:
-      CongraspError: naming `source` and the first leaf that is missing or has another shape or type.
+      CongraspError: a leaf is missing or has another shape or type; the message names `source` and the first such leaf.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     restored: list[Any] = []
@@ -194,11 +188,11 @@ def restore(arrays: Mapping[str, Any], template: Any, source: str) -> Any:
         array, expected = arrays.get(name), np.asarray(leaf)
         if array is None or array.shape != expected.shape or array.dtype != expected.dtype:
             raise CongraspError(
-                f"{source} does not fit this run: '{name}' is missing or of another shape.",
-                "Resume with the configuration, and the version of congrasp, that the run was started with.",
+                f"{source} does not match this run: '{name}' is missing or has another shape.",
+                "Resume with the run's configuration and version of congrasp.",
             )
         if isinstance(leaf, jax.Array):
-            restored.append(jnp.array(array))  # not bound to a device, as after `init`: nothing compiles again
+            restored.append(jnp.array(array))  # not committed to a device, as after `init`, to avoid recompilation
         else:
             restored.append(int(array) if isinstance(leaf, int) else np.array(array))
     return jax.tree_util.tree_unflatten(structure, restored)

@@ -1,28 +1,28 @@
-"""Notices by its metrics that a policy has forgotten how to grasp, or has learnt never to touch."""
+"""Detects from its metrics that a policy has forgotten how to grasp, or avoids contact."""
 
 import collections
 
 _WINDOW = 10  # updates over which metrics are averaged
-_LEARNT = 0.3  # success from which on there is something to lose
+_LEARNT = 0.3  # success from which on a collapse can be detected
 _UNTOUCHED = 0.1  # links in contact below which the hand avoids the object
 
 
 class CollapseWatch:
-    """Counts updates in a row that look like a collapse.
+    """Counts consecutive updates that look like a collapse.
 
-    Two things count: a success, averaged over ten updates, below half of its best, once that was 30 %; and less than
-    0.1 links in contact at table removal ("never touch", the local optimum of penalties that outweigh contact).
+    There are two criteria: a success, averaged over ten updates, below half of its best, once that was 30 %; and less
+    than 0.1 links in contact at table removal (the local optimum "never touch", if penalties outweigh contact).
     """
 
     def __init__(self, patience: int):
-        """Speaks after `patience` such updates in a row; never if it is 0."""
+        """Reports after `patience` such updates in a row; never if it is 0."""
         self._patience = patience
         self._success: collections.deque[float] = collections.deque(maxlen=_WINDOW)
         self._best = 0.0
         self._fallen = self._untouched = 0
 
     def add(self, values: dict[str, float]) -> str | None:
-        """Takes an update's metrics; returns what is wrong in words, once it has been so for long enough."""
+        """Adds an update's metrics; returns a description of the collapse once it has lasted long enough."""
         success, links = (values.get(f"episode/{name}") for name in ("success", "links_at_removal"))
         if success is None or links is None or not self._patience:
             return None

@@ -1,7 +1,7 @@
-"""The learner process: rollouts in, policy bundles out, and a run directory from which it can be resumed.
+"""The learner process: consumes rollouts, publishes policy bundles, and keeps a run directory to resume from.
 
-Several ranks (`learner.distributed`) train one policy, each with its own actors. The run directory is rank 0's; the
-others take configuration, state and versions from it, and write only journals and what failed. All are at the same
+Several ranks (`learner.distributed`) train one policy, each with its own actors. The run directory belongs to rank 0.
+The others receive configuration, state and versions from it, and write only journals and failures. All are at the same
 update.
 """
 
@@ -28,7 +28,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, encode, finite
 from congrasp.learner.algorithms import make_algorithm
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
+from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
 from congrasp.learner.batch import collate, rollout_form
 from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
 from congrasp.learner.collapse import CollapseWatch
@@ -55,15 +55,15 @@ from congrasp.learner.statistics import Pace, overall, summary
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0
 _SHUTDOWN_SECONDS = 3.0
-_MOST_DROPPED = 5  # batches in a row that nothing could be learnt from, before it is no longer the batches' fault
-_COUNTERS = "counters and sequences of ranks that are gone are dropped, new ones begin with none"
+_MOST_DROPPED = 5  # unusable batches in a row after which training fails
+_COUNTERS = "counters and sequences of missing ranks are dropped, new ones start empty"
 
 Notify = Callable[[str, str], None]
 """(level, text) of an event."""
 
 
 class ReplicasDiffer(CongraspError):
-    """The ranks have not come to the same weights."""
+    """The replicas of the weights differ between ranks."""
 
 
 def run_learner(
@@ -81,26 +81,25 @@ def run_learner(
 ) -> PolicyBundle:
     """Trains until `config.updates` updates are done or `stop_event` is set; returns the last policy.
 
-    The run can be resumed in both cases, and after a crash from its last checkpoint.
+    The run can be resumed in both cases and, after a crash, from its last checkpoint.
 
     Args:
-      run_dir: made by `learner.run_directory.create_run`, if this is rank 0.
-      config: the run, the same for all ranks; when resuming, it may differ from the one that began it in what changes
-        no array.
-      transport: the learner's endpoint; it stays the caller's.
-      stop_event: ends training after the update that is under way.
-      resume: from the newest intact checkpoint (of rank 0), which any number of ranks may have written.
-      ranks: the learner's processes, where there are several.
-      audit: keep the journal in `audit/` and, where the configuration says so, accepted rollouts in `accepted/`; both
-        need rollouts on the host, so not where they stay on a device.
-      recorder: entered while the learner runs, for example one that writes the run's logs.
-      on_update: given the metrics of every update.
-      on_event: given what is worth a line.
+      run_dir: created by `learner.run_directory.create_run`, if this is rank 0.
+      config: the run, the same for all ranks; a resumed run may change settings that affect no array.
+      transport: endpoint of the learner; the caller closes it.
+      stop_event: ends training after the current update.
+      resume: resumes from the newest intact checkpoint (of rank 0), which may come from any number of ranks.
+      ranks: processes of the learner, if there are several.
+      audit: writes the journal in `audit/` and, if configured, accepted rollouts in `accepted/`. Both need rollouts on
+        the host, not on a device.
+      recorder: context entered while the learner runs, for example to write the run's logs.
+      on_update: called with the metrics of every update.
+      on_event: called with level and text of every event.
 
     Raises:
-      CongraspError: the directory is not a run's, or in use; the checkpoint does not fit; the disk is full; a thread
-        of this process died; training collapsed; another rank ended the run.
-      PhysicsError: batch after batch, a value was not finite; state and last batch are in `failure/`.
+      CongraspError: the directory is not a run directory, or in use; the checkpoint does not match; the disk is full; a
+        thread of this process died; training collapsed; another rank ended the run.
+      PhysicsError: several batches in a row had values that were not finite; state and last batch are in `failure/`.
     """
     ranks = ranks or Ranks()
     try:
@@ -123,7 +122,7 @@ def run_learner(
 
 @contextlib.contextmanager
 def _watch_threads() -> Iterator[list[str]]:
-    """Collects what killed threads of this process, so that the rest does not live on as if nothing had happened."""
+    """Collects exceptions that ended threads of this process, so that it does not continue without them."""
     deaths: list[str] = []
     previous = threading.excepthook
 
@@ -156,7 +155,7 @@ class _Learner:
         self._keys = Keys(config.name)
 
         def notify(level: str, text: str) -> None:
-            with contextlib.suppress(OSError):  # standard output may be on a disk that is full
+            with contextlib.suppress(OSError):  # standard output may be on a full disk
                 on_event(level, text)
 
         self._on_event = notify
@@ -169,7 +168,7 @@ class _Learner:
         self._saved, self._unsaved = self._state.version, False
         self._run_id, self._skipped, hubs = meta["run_id"], meta["skipped"], meta["hubs"]
         if ranks.count > 1:
-            # Before there is a hub, and so before an actor in this process captures its engine's graphs.
+            # Before the hub exists, and so before an actor in this process captures its engine's graphs.
             self._warm_up()
         name, staleness = str(ranks.rank), config.ppo.max_staleness
         log_error = functools.partial(self._event, "error")
@@ -191,17 +190,15 @@ class _Learner:
         )
         self._is_new = not hubs
         if hubs and len(hubs) != ranks.count:
-            self._event(
-                "warning", f"The checkpoint is of {len(hubs)} rank(s), this run has {ranks.count}: {_COUNTERS}."
-            )
+            self._event("warning", f"The checkpoint has {len(hubs)} rank(s), this run has {ranks.count}: {_COUNTERS}.")
 
     def _first_state(self, resume: bool) -> tuple[TrainState, dict[str, Any]]:
-        """The state to go on from and a checkpoint's meta data, rank 0's for all ranks."""
+        """Returns the initial state and a checkpoint's metadata, those of rank 0 for all ranks."""
         ranks, config = self._ranks, self._config
         initial = None
         if ranks.rank == 0 and not resume and (self._run_dir / INITIAL_FILE).exists():
             given = bundles.load(self._run_dir / INITIAL_FILE)
-            initial = Policy(given.params, given.observation, given.value, given.privileged)
+            initial = LearnedPolicy(given.params, given.observation, given.value, given.privileged)
         state = self._algorithm.init(config.seed, initial)
         meta: dict[str, Any] = {"run_id": secrets.token_hex(8), "skipped": 0, "hubs": []}
         if ranks.rank == 0:
@@ -212,8 +209,8 @@ class _Learner:
                 write_atomically(self._run_dir / CONFIG_FILE, to_json(config).encode())
             elif newest >= 0:
                 raise CongraspError(
-                    f"{self._run_dir} holds checkpoints of a run.",
-                    "Continue with --resume, or choose another --run-dir.",
+                    f"{self._run_dir} has checkpoints of a run.",
+                    "Pass --resume to continue it, or another --run-dir.",
                 )
             version, newest = state.version + meta["skipped"], newest + meta["skipped"]
             meta = {**meta, "skipped": self._skip_lost_versions(version, newest) + meta["skipped"]}
@@ -223,16 +220,16 @@ class _Learner:
         return state, meta
 
     def close(self) -> None:
-        """Notes what is left; the transport stays open."""
+        """Saves pending records; the transport stays open."""
         self._hub.close()
 
     @property
     def version(self) -> int:
-        """Of the newest policy."""
+        """Version of the newest policy."""
         return self._state.version + self._skipped
 
     def bundle(self) -> PolicyBundle:
-        """The newest policy."""
+        """Bundle of the newest policy."""
         policy = self._algorithm.policy(self._state)
         return PolicyBundle(
             spec=self._spec,
@@ -244,14 +241,14 @@ class _Learner:
         )
 
     def train(self, stop: threading.Event, deaths: list[str], on_update: Callable[[dict[str, float]], None]) -> None:
-        """Updates until the end, a stop, or a thread's death; leaves a checkpoint behind in each case."""
-        if self._is_new:  # before anything is accepted: what a kill undoes, a resume can take up
+        """Updates until the end, a stop, or a thread's death; writes a checkpoint in each case."""
+        if self._is_new:  # before any rollout is accepted, so that a resume can recover what a kill undoes
             self._save_if_possible()
         self._publish()
         if self._ranks.count == 1:
             self._warm_up()
         pace, watch = Pace(), CollapseWatch(self._config.collapse_patience)
-        # After a resume soon: rollouts of its versions are near to no checkpoint, and die with it until there is one.
+        # Soon after a resume: until there is a checkpoint, rollouts of new versions cannot be recovered.
         end, saved, due = None, -1, not self._is_new
         while self._state.version < self._config.updates and end is None:
             began = time.monotonic()
@@ -266,14 +263,14 @@ class _Learner:
             if self._ranks.rank == 0:
                 self._log("metrics", {"update": self._state.version, "version": self.version, "values": values})
             on_update({"update": float(self._state.version), "version": float(self.version), **values})
-            # What is learnt on stationary objects is expected to fall when they are let go.
+            # Success is expected to drop when objects are released after the stationary phase.
             stationary = self._config.curriculum.stationary(self.version)
             if not stationary and (collapse := watch.add(values)):
                 self._ranks.close()
                 self._event("fatal", f"Training collapsed: {collapse}.")
                 raise CongraspError(
                     f"Training collapsed: {collapse}.",
-                    "See docs/training.md; --resume starts from the last checkpoint.",
+                    "See docs/training.md. --resume continues from the last checkpoint.",
                 )
             due = due or self._state.version % self._config.checkpoint_every == 0
             if due and self._save_if_possible():
@@ -285,14 +282,18 @@ class _Learner:
             self._shut_actors_down()
         self._ranks.close()
         if deaths:
-            raise CongraspError(f"The learner stopped: {deaths[0]}.", "A checkpoint was written; use --resume.")
+            raise CongraspError(
+                f"The learner stopped: {deaths[0]}.", "A checkpoint was written. Pass --resume to continue."
+            )
         if end is not None and end[0] != self._ranks.rank and not stop.is_set():
-            raise TransportError(f"Rank {end[0]} ended the run: {end[1]}.", "A checkpoint was written; use --resume.")
+            raise TransportError(
+                f"Rank {end[0]} ended the run: {end[1]}.", "A checkpoint was written. Pass --resume to continue."
+            )
 
     def _wait(self, stop: threading.Event, deaths: list[str]) -> tuple[int, str] | None:
-        """Waits until every rank has a batch; returns the rank that ends training instead, and why.
+        """Waits until every rank has a batch; returns the rank that ends training instead, and the reason.
 
-        A long silence is an event, not an end: actors may return.
+        A long wait is an event, not an end, since actors may return.
         """
         posted, silent_since = "", time.monotonic()
         while True:
@@ -313,9 +314,9 @@ class _Learner:
                 silent_since = time.monotonic()
 
     def _update(self) -> tuple[dict[str, float], int]:
-        """One update, which all ranks make; its metrics and its environment steps."""
+        """Runs one update on all ranks; returns its metrics and its number of environment steps."""
         messages = self._hub.next_batch(self._config.ppo.rollouts_per_update, 0.0)
-        assert messages is not None, "a batch that was there cannot go away"
+        assert messages is not None, "an available batch cannot disappear"
         mine = summary(messages, self._hub.lag)
         batch = collate([message.arrays for message in messages], self._form.arrays)
         try:
@@ -332,9 +333,9 @@ class _Learner:
         )
 
     def _drop(self, batch: Mapping[str, Any], error: NonFiniteUpdate) -> TrainState:
-        """The state after a batch that nothing can be learnt from: a version on, with the same policy.
+        """Returns the state after an unusable batch: one version later, with the same policy.
 
-        Batch and state are kept in `failure/`. All ranks come to the same decision, by their common update.
+        Batch and state are written to `failure/`. All ranks decide alike, because they share the update.
         """
         self._dropped, self._dropped_in_a_row = self._dropped + 1, self._dropped_in_a_row + 1
         folder, number = self._run_dir / "failure", f"-{self._ranks.rank}" if self._ranks.count > 1 else ""
@@ -348,7 +349,7 @@ class _Learner:
         self._ranks.close()
         self._event("fatal", str(error))
         raise PhysicsError(
-            f"{error} It was the {self._dropped_in_a_row}th batch in a row.", f"State and batch are in {folder}."
+            f"{error} It was the {self._dropped_in_a_row}th such batch in a row.", f"State and batch are in {folder}."
         ) from None
 
     def _publish(self) -> None:
@@ -360,13 +361,13 @@ class _Learner:
         self._hub.publish_weights(self.bundle().to_message(), self.version)
         if self._ranks.rank:
             return
-        meta = {"version": self.version, "epoch": self._run_id, "schema": self._spec.schema}
+        meta = {"version": self.version, "run_id": self._run_id, "schema": self._spec.schema}
         self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
 
     def _skip_lost_versions(self, version: int, newest: int) -> int:
-        """Versions that were published after the checkpoint's died with the process; they are not given out again.
+        """Skips versions that were published after the checkpoint and lost with the process, so that none is reused.
 
-        `newest` is the least version that the newest checkpoint, intact or not, can be of.
+        `newest` is a lower bound of the version of the newest checkpoint, intact or not.
         """
         published = max(newest, published_version(self._run_dir))
         if published <= version:
@@ -375,21 +376,21 @@ class _Learner:
         return published + 1 - version
 
     def _warm_up(self) -> None:
-        """Compiles the update while the actors make the first rollouts."""
+        """Compiles the update while the actors produce the first rollouts."""
         batch = self._form.zeros(self._config.ppo.rollouts_per_update)
         copy = self._state._replace(optimizer=jax.tree.map(np.array, self._state.optimizer))
         with self._ranks.watchdog(), stage("compile update"):
             self._algorithm.update(copy, batch, self._ranks.mesh)
 
     def _save(self) -> None:
-        """A checkpoint, which rank 0 writes; all ranks call this, and their replicas are compared."""
+        """Writes a checkpoint on rank 0; all ranks call this, and their replicas are compared."""
         durable = self._hub.durable()
         state = checksum(self._state) if self._ranks.count > 1 else 0
         everyone = self._ranks.exchange({"hub": durable, "state": state}).meta["entries"]
         if odd := [rank for rank, entry in enumerate(everyone) if entry["state"] != everyone[0]["state"]]:
             raise ReplicasDiffer(
                 f"The weights of ranks {odd} differ from those of rank 0 after update {self._state.version}.",
-                "All ranks need the same GPUs and versions; --resume starts from the last checkpoint.",
+                "All ranks need the same GPUs and versions. --resume continues from the last checkpoint.",
             )
         failure = ""
         if self._ranks.rank == 0:
@@ -405,25 +406,25 @@ class _Learner:
         self._hub.note_saved()
 
     def _save_if_possible(self) -> bool:
-        """A checkpoint on the way; one that fails is tried again after the next update, and training goes on."""
+        """Writes a checkpoint during training; a failed one is retried after the next update."""
         try:
             self._save()
         except ReplicasDiffer:
             raise
         except CongraspError as error:
             if not self._unsaved:
-                at_stake = f"the {self._state.version - self._saved} update(s) since that of update {self._saved}"
-                text = f"{error} Training goes on, and every update tries again: until one can, a kill costs {at_stake}"
-                self._event("error", f"{text}, and those to come.")
+                at_stake = f"the {self._state.version - self._saved} update(s) since update {self._saved}"
+                text = f"{error} Training continues and retries after every update. Until then, a kill loses {at_stake}"
+                self._event("error", f"{text} and all later ones.")
             self._unsaved = True
             return False
         if self._unsaved:
-            self._event("info", f"Checkpoints can be written again: there is one of update {self._state.version}.")
+            self._event("info", f"Checkpoints can be written again; the newest is of update {self._state.version}.")
         self._unsaved = False
         return True
 
     def _shut_actors_down(self) -> None:
-        """Tells the actors that the run is finished, and waits some seconds for them to leave."""
+        """Notifies the actors that the run is finished, and waits some seconds for them to leave."""
         self._hub.finish()
         deadline = time.monotonic() + _SHUTDOWN_SECONDS
         while time.monotonic() < deadline and any(who["role"] == "actor" for who in self._hub.status()["roles"]):
@@ -439,7 +440,7 @@ class _Learner:
 
 
 def _durable(hubs: list[dict[str, Any]], rank: int) -> dict[str, Any] | None:
-    """What a checkpoint kept of this rank's hub; that of one that it does not know begins anew at its version."""
+    """Returns a checkpoint's data of this rank's hub; a new rank gets empty data at its version."""
     if not hubs or rank < len(hubs):
         return hubs[rank] if hubs else None
     return {**hubs[0], "counters": dataclasses.asdict(Counters()), "forgotten_missing": 0, "sequences": []}

@@ -1,12 +1,11 @@
 """The directory of a run.
 
-It holds `config.json`, `initial.safetensors` where training does not begin with random weights, `checkpoints/`,
+It holds `config.json`, `initial.safetensors` (unless training starts from random weights), `checkpoints/`,
 `policy.safetensors` (that of the newest checkpoint), `logs/`, `audit/` (the outcome of every rollout), `accepted/`
-(rollouts that no checkpoint holds yet), `version` (the newest version that was ever published, so that versions rise
-over a crash, too), `endpoint` (where its learner listens, while it runs), `lock`
-(held by the process of its learner) and, after an update that was not finite,
-`failure/`.
-What a resume could not read, or does not go on from, is kept beside it as `*.aside`.
+(rollouts that no checkpoint holds yet), `version` (the newest version ever published, so that versions increase across
+a crash), `endpoint` (address of its learner, while it runs), `lock` (held by the process of its learner) and, after an
+update that was not finite, `failure/`. Files that a resume could not read, or does not continue from, are renamed to
+`*.aside`.
 """
 
 import contextlib
@@ -38,29 +37,27 @@ _MAX_VERSION = 1 << 53
 _MAX_CONFIG = 1 << 20
 _MAX_ENDPOINT = 1 << 10
 CHANGEABLE = ("updates", "checkpoint_every", "write_ahead", "collapse_patience", "physics", "ppo", "distill")
-"""Fields of the configuration that a run may go on with other values of; actors that are there do not use them."""
+"""Fields of the configuration that a resumed run may change; running actors do not use them."""
 
 
 def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle | None = None) -> None:
-    """Makes a run directory.
+    """Creates a run directory.
 
     Args:
-      run_dir: where.
+      run_dir: path of the directory.
       config: the run.
-      initial: a policy to begin with instead of random weights: its networks and normalisers. Privileged inputs that
-        its critic lacks start at zero weight.
+      initial: initial policy instead of random weights: its networks and normalisers. Privileged inputs that its critic
+        lacks get zero weight.
 
     Raises:
-      CongraspError: there is a run in it already, or what is left of one, or the initial policy does not fit the run.
+      CongraspError: the directory already has a run, or remains of one; or the initial policy does not match the run.
     """
     if (run_dir / CONFIG_FILE).exists():
-        raise CongraspError(
-            f"{run_dir} holds a run already.", "Choose another --run-dir, or continue it with --resume."
-        )
+        raise CongraspError(f"{run_dir} already has a run.", "Pass another --run-dir, or --resume to continue it.")
     if remains := _remains(run_dir):
         raise CongraspError(
-            f"{run_dir} holds {remains[0].name} of a run, but no {CONFIG_FILE}.",
-            "Put that back and add --resume, or choose another --run-dir.",
+            f"{run_dir} has {remains[0].name} of a run, but no {CONFIG_FILE}.",
+            "Restore that file and pass --resume, or pass another --run-dir.",
         )
     if initial is not None:
         spec = bundles.policy_spec(config.task, config.network)
@@ -72,32 +69,32 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
 
 
 def open_run(run_dir: pathlib.Path) -> RunConfig:
-    """The configuration of a run directory; a CongraspError if it is not one, or the file is damaged."""
+    """Returns the configuration of a run directory; raises a CongraspError if it is not one, or the file is damaged."""
     path = run_dir / CONFIG_FILE
     try:
         text = read_file(path, _MAX_CONFIG)
     except OSError:
         raise CongraspError(
-            f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Name one made by 'congrasp train'."
+            f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Pass one created by 'congrasp train'."
         ) from None
     try:
         return run_config_from_json(text)
     except CongraspError as error:
-        raise CongraspError(f"{path} cannot be used: {error}") from None
+        raise CongraspError(f"{path} is not valid: {error}") from None
 
 
 @contextlib.contextmanager
 def exclusive(run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text: None) -> Iterator[None]:
-    """Keeps other processes out of a run directory while the block runs; a process that dies gives it up.
+    """Context that locks a run directory; the lock ends with the process.
 
     Args:
-      run_dir: the run's directory.
-      notify: told where the file system has no locks.
+      run_dir: directory of the run.
+      notify: called if the file system has no locks.
 
     Raises:
-      CongraspError: another process has it.
+      CongraspError: another process holds the lock.
     """
-    # A lock by `lockf` is the process's own: forked children do not inherit it.
+    # A lock by `lockf` belongs to the process: forked children do not inherit it.
     with open(run_dir / _LOCK_FILE, "a+b", 0) as file:
         try:
             fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -110,9 +107,9 @@ def exclusive(run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text
                     f"{run_dir} is in use by {holder}{f', which listens at {url}' if url else ''}.",
                     "Stop it first, or choose another --run-dir.",
                 ) from None
-            notify(f"{run_dir} is on a file system without locks: a second learner would go unnoticed.")
+            notify(f"{run_dir} is on a file system without locks: a second learner would not be detected.")
         else:
-            with contextlib.suppress(OSError):  # a disk that is full costs the number in another's error and no more
+            with contextlib.suppress(OSError):  # a full disk only removes the number from another process's error
                 file.truncate(0)
                 file.write(f"{os.getpid()}".encode())
         yield
@@ -120,7 +117,7 @@ def exclusive(run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text
 
 @contextlib.contextmanager
 def listening(run_dir: pathlib.Path, url: str) -> Iterator[None]:
-    """Keeps in a run directory where its learner listens, while the block runs; a killed learner's stays."""
+    """Context that stores the learner's address in a run directory; a killed learner's remains."""
     path = run_dir / _ENDPOINT_FILE
     write_atomically(path, url.encode())
     try:
@@ -130,7 +127,7 @@ def listening(run_dir: pathlib.Path, url: str) -> Iterator[None]:
 
 
 def learner_url(run_dir: pathlib.Path) -> str:
-    """Where the learner of a run directory listens; empty where none runs."""
+    """Address of the learner of a run directory; empty if none is running."""
     try:
         return read_file(run_dir / _ENDPOINT_FILE, _MAX_ENDPOINT).decode(errors="replace")
     except OSError:
@@ -138,10 +135,10 @@ def learner_url(run_dir: pathlib.Path) -> str:
 
 
 def has_checkpoints(run_dir: pathlib.Path) -> bool:
-    """Whether a run can go on from a checkpoint; false for one that has not come to its first.
+    """True if a run has a checkpoint to resume from; False before its first one.
 
     Raises:
-      CongraspError: the run had checkpoints, and they are gone; to begin it anew here would overwrite what is left.
+      CongraspError: the run had checkpoints that are gone; restarting it here would overwrite the rest.
     """
     if Checkpoints(run_dir / CHECKPOINTS).files():
         return True
@@ -149,34 +146,34 @@ def has_checkpoints(run_dir: pathlib.Path) -> bool:
         policy = run_dir / POLICY_FILE
         begin = f" with --initial {policy}" if policy.exists() else ""
         raise CongraspError(
-            f"{run_dir} has no checkpoint to resume from, but had one: there is {remains[0].name}.",
-            f"Start anew in another --run-dir{begin}.",
+            f"{run_dir} has no checkpoint to resume from, although {remains[0].name} shows that it had one.",
+            f"Start again in another --run-dir{begin}.",
         )
     return False
 
 
 def _remains(run_dir: pathlib.Path) -> list[pathlib.Path]:
-    """What only a run that has come to a checkpoint leaves behind."""
+    """Files that only a run with a checkpoint leaves behind."""
     found = [path for path in (run_dir / CHECKPOINTS).glob("*") if not path.name.startswith(".")]
     return sorted(found) + [path for path in [run_dir / POLICY_FILE] if path.exists()]
 
 
 def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
-    """Keeps the configuration with which a run goes on.
+    """Stores the configuration with which a run continues.
 
     Args:
-      run_dir: the run's directory.
-      config: that of `open_run`, with what is to be different from now on.
+      run_dir: directory of the run.
+      config: that of `open_run`, with changed settings.
 
     Raises:
-      CongraspError: something differs that must not, this is no run directory, or a learner works in it.
+      CongraspError: a setting differs that may not, this is not a run directory, or a learner is using it.
     """
     before = open_run(run_dir)
     for field in dataclasses.fields(config):
         if field.name not in CHANGEABLE and getattr(config, field.name) != getattr(before, field.name):
             raise CongraspError(
-                f"A run goes on with the '{field.name}' that it began with.",
-                f"Begin another run with --initial {run_dir / POLICY_FILE}.",
+                f"A run cannot change '{field.name}' when it is resumed.",
+                f"Start another run with --initial {run_dir / POLICY_FILE}.",
             )
     with exclusive(run_dir):
         if config != before:
@@ -184,10 +181,10 @@ def continue_run(run_dir: pathlib.Path, config: RunConfig) -> None:
 
 
 def note_version(run_dir: pathlib.Path, version: int) -> None:
-    """Notes the newest version that was published.
+    """Stores the newest published version.
 
-    The file is overwritten in place, which needs no space on a disk that is full, and not flushed: this must survive
-    the process, and a power cut costs no more than a version.
+    The file is overwritten in place, which needs no space on a full disk, and not flushed: it must survive the process,
+    and a power failure loses at most a version.
 
     Raises:
       CongraspError: it could not be written.
@@ -201,7 +198,7 @@ def note_version(run_dir: pathlib.Path, version: int) -> None:
 
 
 def published_version(run_dir: pathlib.Path) -> int:
-    """The newest version of which the run's folder knows: by `note_version`, the policy or the journals; -1 if none."""
+    """Newest version known to the run directory, from `version`, the policy or the journals; -1 if there is none."""
     try:
         noted = int((run_dir / _VERSION_FILE).read_text())
     except (OSError, ValueError):
@@ -212,12 +209,12 @@ def published_version(run_dir: pathlib.Path) -> int:
 
 
 def keep_policy(run_dir: pathlib.Path, version: int, on_event: Callable[[str, str], None]) -> None:
-    """Keeps a policy file that is newer than the checkpoint that a run resumes from, or that cannot be read.
+    """Renames a policy file that is newer than the checkpoint of a resume, or cannot be read.
 
     Args:
-      run_dir: the run's directory.
-      version: of the checkpoint.
-      on_event: given (level, text) if a file is kept under another name.
+      run_dir: directory of the run.
+      version: version of the checkpoint.
+      on_event: called with (level, text) if a file is renamed.
 
     Raises:
       CongraspError: it cannot be renamed.
@@ -225,12 +222,12 @@ def keep_policy(run_dir: pathlib.Path, version: int, on_event: Callable[[str, st
     path = run_dir / POLICY_FILE
     found = _policy_version(run_dir)
     if os.path.lexists(path) and (found is None or found > version):
-        what = "cannot be read" if found is None else f"is of version {found}, newer than the checkpoint"
+        what = "cannot be read" if found is None else f"has version {found}, newer than the checkpoint"
         on_event("warning", f"{path} {what}; it is kept as {set_aside(path)}.")
 
 
 def _policy_version(run_dir: pathlib.Path) -> int | None:
-    """The version of the run's policy file; None if there is none, or it is damaged."""
+    """Version of the run's policy file; None if it is missing or damaged."""
     try:
         return bundles.load(run_dir / POLICY_FILE).version
     except CongraspError:

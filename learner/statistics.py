@@ -1,4 +1,4 @@
-"""Figures about a batch of rollouts that are no part of the update: episodes, staleness and pace."""
+"""Figures of a batch of rollouts that are not part of the update: episodes, staleness and pace."""
 
 import collections
 import time
@@ -15,11 +15,11 @@ _OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optiona
 
 
 def summary(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str, Any]:
-    """What one rank tells the others of its batch, as JSON, so that `overall` finds the means over all of them.
+    """Summary of one rank's batch as JSON, from which `overall` computes means over all ranks.
 
     Args:
       messages: the rollouts of the batch.
-      lag: that of a policy version.
+      lag: returns the lag of a policy version.
     """
     sums, episodes = _episode_sums(messages)
     steps = [int(message.meta["steps"]) for message in messages]
@@ -31,10 +31,10 @@ def summary(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str,
 def overall(summaries: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Means over all episodes that ended in the batches of all ranks, their number, and the transitions' lag.
 
-    `episode/…` metrics and `term/…` sums over all of them, but errors of a constraint over those in which it was active
-    (`Constraint.among`, or the block without which an error says nothing); and `success/heading` over episodes with the
-    heading alone, `success/pose` and so on over those with that constraint active, whatever others they had. A rollout
-    in which no episode ended contributes nothing; what no episode has is absent.
+    `episode/…` metrics and `term/…` sums are means over all of them, but errors of a constraint only over episodes in
+    which it was active (`Constraint.among`, or the block without which an error is undefined). `success/heading` covers
+    episodes with only the heading; `success/pose` and so on those with that constraint active, alone or with others. A
+    rollout without a finished episode contributes nothing; a figure without any episode is absent.
     """
     totals: dict[str, list[float]] = {}
     for part in summaries:
@@ -51,7 +51,7 @@ def overall(summaries: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], int]:
-    """Sum and number of each figure's values, and the number of episodes; rollouts need not name the same figures."""
+    """Sum and number of each figure's values, and the number of episodes; rollouts may have different figures."""
     sums: dict[str, list[float]] = {}
     episodes = 0
     for message in messages:
@@ -70,7 +70,7 @@ def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], 
 
 
 def _figures(columns: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndarray]:
-    """One rollout's figures (E,), NaN for episodes that they do not concern."""
+    """Figures (E,) of one rollout, NaN for episodes to which they do not apply."""
     none = np.zeros(count)
     blocks = {block: columns.get(f"episode/mask_{block}", none) > 0 for c in _OPTIONAL for block in c.blocks}
     active = {constraint.name: constraint.among(blocks) for constraint in _OPTIONAL}
@@ -86,7 +86,7 @@ def _figures(columns: Mapping[str, np.ndarray], count: int) -> dict[str, np.ndar
 
 
 class Pace:
-    """Environment steps a second over the last updates."""
+    """Environment steps per second over the last updates."""
 
     def __init__(self, window: int = 20, clock: Callable[[], float] = time.monotonic):
         """Averages over at most `window` updates."""
@@ -94,7 +94,7 @@ class Pace:
         self._marks = collections.deque([(clock(), 0)], maxlen=window + 1)
 
     def steps_per_second(self, steps: int) -> float:
-        """The pace after `steps` more environment steps."""
+        """Pace after `steps` more environment steps."""
         now, total = self._clock(), self._marks[-1][1] + steps
         self._marks.append((now, total))
         first, before = self._marks[0]

@@ -1,4 +1,4 @@
-"""Physics engines behind one interface: the project's own are registered here; `make_physics` builds one by name."""
+"""Physics engines behind one interface: registers those of the project; `make_physics` builds one by name."""
 
 import importlib.util
 from collections.abc import Sequence
@@ -17,32 +17,32 @@ _NVIDIA = ("gpu", "cuda")
 
 
 def _make_warp(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int) -> Physics:
-    """MuJoCo Warp; has no use for threads."""
+    """Builds MuJoCo Warp, which ignores `threads`."""
     from congrasp.actors.physics.warp import WarpPhysics
 
     return WarpPhysics(hand, task, objects)
 
 
 def _make_jax(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int) -> Physics:
-    """MJX-JAX; has no use for threads."""
+    """Builds MJX-JAX, which ignores `threads`."""
     from congrasp.actors.physics.mjx import MjxPhysics
 
     return MjxPhysics(hand, task, objects)
 
 
 def _make_native(*arguments: Any) -> Physics:
-    """MuJoCo C on threads."""
+    """Builds MuJoCo C on threads."""
     from congrasp.actors.physics.native import NativePhysics
 
     return NativePhysics(*arguments)
 
 
 def _missing_warp(backend: str) -> CongraspError | None:
-    """An NVIDIA GPU, or the package."""
+    """Error if the NVIDIA GPU or the package is missing."""
     if backend not in _NVIDIA:
         return CongraspError(
-            "The 'warp' engine needs an NVIDIA GPU, and JAX sees none.",
-            "Install the 'cuda' extra and look at 'congrasp doctor', or choose --physics native.",
+            "The 'warp' engine needs an NVIDIA GPU, but JAX finds none.",
+            "Install the 'cuda' extra and check 'congrasp doctor', or pass --physics native.",
         )
     if importlib.util.find_spec("warp") is None:
         return CongraspError("The 'warp' engine is not installed.", "Run: pip install 'congrasp[cuda]'.")
@@ -57,14 +57,14 @@ ENGINES["native"] = Engine(_make_native, 64, lambda backend: backend == "cpu", t
 
 
 def resolve_physics(name: PhysicsName, backend: str = "") -> PhysicsName:
-    """The engine of a name; `auto` is `warp` on an NVIDIA GPU, `native` on a CPU and `jax` elsewhere.
+    """Returns the engine of a name; `auto` is `warp` on an NVIDIA GPU, `native` on a CPU and `jax` elsewhere.
 
     Args:
       name: `auto` or a key of `ENGINES`.
-      backend: JAX's name of the hardware; this process's own by default.
+      backend: JAX's name of the hardware; that of this process by default.
 
     Raises:
-      CongraspError: there is no such engine, or this machine lacks what it needs.
+      CongraspError: there is no such engine, or this machine does not meet its requirements.
     """
     backend = backend or jax.default_backend()
     if name == "auto":
@@ -79,7 +79,7 @@ def resolve_physics(name: PhysicsName, backend: str = "") -> PhysicsName:
 def make_physics(
     name: PhysicsName, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], *, threads: int
 ) -> Physics:
-    """An engine with a pool of objects; `threads` counts for those that step on the CPU.
+    """Builds an engine with a pool of objects; `threads` applies to those that step on the CPU.
 
     Raises:
       CongraspError: see `resolve_physics`.

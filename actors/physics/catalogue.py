@@ -1,4 +1,4 @@
-"""Any number of objects for environments of one model: a row of arrays each, whose meshes index shared meshes."""
+"""Catalogue of objects for environments of one model: a row of arrays each, with indices of shared meshes."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _BODY_FIELDS = ("body_mass", "body_inertia", "body_iquat", "body_subtreemass", "
 
 
 class Catalogue:
-    """The model that environments share, and objects as rows that fill its slots."""
+    """Model shared by the environments, and objects as rows that fill its slots."""
 
     def __init__(self, hand: Hand, task: TaskConfig, example: GraspObject, mesh_slots: int):
         """Compiles the model.
@@ -28,7 +28,7 @@ class Catalogue:
         Args:
           hand: the hand.
           task: timing and collision settings.
-          example: any object; the rows of others take its place in every environment.
+          example: any object; rows of others replace it in every environment.
           mesh_slots: most mesh pieces of an object.
         """
         spec = scene_spec(hand, task)
@@ -36,25 +36,25 @@ class Catalogue:
         meshes = [Piece("mesh", (0.0, 0.0, 0.0), vertices=_PLACEHOLDER)] * mesh_slots
         shared = dataclasses.replace(example, pieces=(*primitives, *meshes))
         body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
-        body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which the other objects may not have
+        body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which other objects may not have
         finish_spec(spec, hand)
         self.model: mujoco.MjModel = spec.compile()
         self.geoms = np.array([self.model.geom(f"object_{i}").id for i in range(len(shared.pieces))])
-        """(S,) the object's geoms: primitive slots, then mesh slots."""
+        """(S,) geoms of the object: primitive slots, then mesh slots."""
         self._primitives, self._meshes = self.geoms[: len(primitives)], self.geoms[len(primitives) :]
         self._body = self.model.body("object").id
         self._dofs = self.model.jnt_dofadr[self.model.body_jntadr[self._body]] + np.arange(6)
 
     def rows(self, objects: Sequence[GraspObject]) -> tuple[dict[str, np.ndarray], mujoco.MjModel]:
-        """Objects as rows of the fields that differ between them, and a model that holds their meshes.
+        """Converts objects to rows of the fields that differ between them, and a model that holds their meshes.
 
         Args:
-          objects: N objects of primitive and mesh pieces, mixed as they like.
+          objects: N objects of primitive and mesh pieces in any mixture.
 
         Returns:
-          Fields by their names in the model: those of geoms (N, S, ...), where `geom_dataid` is -1 in a mesh slot that
-          the object does not use; those of the body (N, ...), but `body_subtreemass` (N, 2) of world and object; and
-          `dof_invweight0` (N, 6). The meshes' fields are the second's.
+          Fields by their names in the model, and the model. Geom fields are (N, S, ...), with `geom_dataid` -1 in
+          unused mesh slots; body fields are (N, ...), but `body_subtreemass` is (N, 2) for world and object;
+          `dof_invweight0` is (N, 6). Mesh fields are in the model.
 
         Raises:
           CongraspError: an object has more pieces than slots.
@@ -63,8 +63,8 @@ class Catalogue:
             count = sum(piece.kind == "mesh" for piece in obj.pieces)
             if count > len(self._meshes):
                 raise CongraspError(
-                    f"The object '{obj.name}' has {count} mesh pieces, and the environments have room for"
-                    f" {len(self._meshes)}.",
+                    f"The object '{obj.name}' has {count} mesh pieces, but the environments have only "
+                    f"{len(self._meshes)} slots.",
                     "Import it with fewer pieces.",
                 )
         meshes = _compile_meshes(objects)
@@ -82,14 +82,14 @@ class Catalogue:
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}, meshes
 
     def _fill_meshes(self, meshes: mujoco.MjModel, obj: GraspObject, first: int) -> int:
-        """Writes an object's mesh pieces, which begin at mesh `first`, into mesh slots; the mesh after its last."""
+        """Writes an object's mesh pieces, from mesh `first` on, into mesh slots; returns the next mesh."""
         count = sum(piece.kind == "mesh" for piece in obj.pieces)
         for name in _SLOT_FIELDS:
             getattr(self.model, name)[self._meshes[:count]] = getattr(meshes, name)[first : first + count]
         return first + count
 
     def _row(self) -> dict[str, np.ndarray]:
-        """The present object's values of the fields that differ between objects."""
+        """Values of the current object in the fields that differ between objects."""
         model, body = self.model, self._body
         row = {name: getattr(model, name)[self.geoms].copy() for name in _SLOT_FIELDS}
         row |= {name: getattr(model, name)[body].copy() for name in _BODY_FIELDS}
@@ -99,7 +99,7 @@ class Catalogue:
 
 
 def _compile_meshes(objects: Sequence[GraspObject]) -> mujoco.MjModel:
-    """A geom with a mesh of its own for each mesh piece of the objects, one after the other."""
+    """Compiles a model with a geom and a mesh for each mesh piece of the objects, in order."""
     spec = mujoco.MjSpec()
     for i, piece in enumerate(piece for obj in objects for piece in obj.pieces if piece.kind == "mesh"):
         spec.add_mesh(name=str(i), uservert=np.asarray(piece.vertices, np.float32).ravel())

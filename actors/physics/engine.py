@@ -1,7 +1,7 @@
-"""What every physics engine offers: a batch of environments with one hand and one object each.
+"""Interface of physics engines: a batch of environments with one hand and one object each.
 
 `warp` and `jax` are pure functions over pytrees that are traced into a compiled rollout; `native` steps MuJoCo C on
-threads and keeps its state in place. Both go through the same three calls.
+threads and mutates its state. Both use the same three calls.
 """
 
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ from congrasp.common.task.types import Array
 
 
 class ResetState(NamedTuple):
-    """What an episode starts from, for a batch of environments B; world frame."""
+    """Initial state of episodes for a batch of B environments; world frame."""
 
     object_index: Array
     """(B,) int, index into the engine's objects."""
     mass_scale: Array
-    """(B,) factor of the object's mass and inertia."""
+    """(B,) factor on the object's mass and inertia."""
     friction: Array
     """(B,) sliding friction of the object's geoms."""
     gain_scale: Array
-    """(B,) factor of both gains of the finger motors' servos; their torque limits stay."""
+    """(B,) factor on both gains of the finger motors' servos; their torque limits are unchanged."""
     base_position: Array
-    """(B, 3) initial wrist position: the wrist joints are zero there."""
+    """(B, 3) initial wrist position, where the wrist joints are zero."""
     base_quaternion: Array
     """(B, 4)."""
     u_velocity: Array
@@ -38,7 +38,7 @@ class ResetState(NamedTuple):
     object_quaternion: Array
     """(B, 4)."""
     stationary: Array
-    """(B,) bool: the object is welded to where it is."""
+    """(B,) bool: the object is welded to its position."""
 
 
 class PhysicsState(NamedTuple):
@@ -56,10 +56,10 @@ class PhysicsState(NamedTuple):
     contact_position: Array
     contact_found: Array
     diverged: Array
-    """(B,) bool: the environment diverged in this step (`has_diverged`) and was put back to its start."""
+    """(B,) bool: the environment diverged in this step (`has_diverged`) and was reset to its start."""
     occupancy: Array
-    """(2,) contacts and constraint rows in the step's fullest substep, as shares of what the engine has room for: what
-    is beyond 1 was left out of the simulation. Zero where room is made as it is needed."""
+    """(2,) contacts and constraint rows in the step's fullest substep, as shares of the engine's capacity: the excess
+    over 1 was dropped from the simulation. Zero for an engine that allocates as needed."""
 
 
 class Physics(Protocol):
@@ -67,36 +67,36 @@ class Physics(Protocol):
 
     name: str
     compiled: bool
-    """Whether the calls can be traced by JAX."""
+    """True if JAX can trace the calls."""
 
     def start(self, reset_state: ResetState) -> Any:
-        """State of fresh environments."""
+        """Returns the state of environments at the start of their episodes."""
 
     def reset(self, state: Any, mask: Array, reset_state: ResetState) -> Any:
-        """Environments where mask (B,) is true start anew from `reset_state`; the others go on."""
+        """Restarts environments where mask (B,) is true from `reset_state`; the others continue."""
 
     def step(self, state: Any, target: Array, table: Array, force: Array | None = None) -> tuple[Any, PhysicsState]:
-        """One control step.
+        """Simulates one control step.
 
         Args:
           state: the environments.
           target: (B, 6 + M) targets of the wrist's joints and of the fingers' motors.
-          table: (B,) bool, where the table stands.
-          force: (B, 3) on the object's centre of mass throughout the step, world frame, N; none by default.
+          table: (B,) bool, True where the table is present.
+          force: (B, 3) force on the object's centre of mass throughout the step, world frame, N; none by default.
         """
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> Any:
-        """Other objects, as many as before, for the environments that start anew from now on; present ones go on."""
+        """Replaces the objects by as many others for environments that restart later; current episodes continue."""
 
     def read(self, state: Any) -> PhysicsState:
-        """The environments as they are, without contacts after a reset."""
+        """Returns the current state of the environments, without contacts after a reset."""
 
     def close(self) -> None:
-        """Releases threads and memory; safe to call twice."""
+        """Releases threads and memory; may be called twice."""
 
 
 def where_environments(mask: Array, new: Any, old: Any) -> Any:
-    """Arrays (B, ...) of `new` in the masked environments (B,), those of `old` elsewhere, for any pytree."""
+    """Selects arrays (B, ...) of `new` in the masked environments (B,), those of `old` elsewhere, for any pytree."""
 
     def pick(a: Array, b: Array) -> Array:
         return jnp.where(mask.reshape(-1, *([1] * (a.ndim - 1))), a, b)

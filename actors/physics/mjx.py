@@ -1,4 +1,4 @@
-"""MJX in its own implementation, which XLA compiles for any device.
+"""MJX in JAX, which XLA compiles for any device.
 
 The state is a pytree and every call can be traced, so that a whole rollout compiles into one program.
 """
@@ -26,14 +26,14 @@ from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
 
 class MjxState(NamedTuple):
-    """A batch of environments and what they draw from."""
+    """A batch of environments and its pool of objects."""
 
     data: Any
     """Batched `mjx.Data`."""
     leaves: dict[str, Array]
     """Fields of the model of each environment (B, ...)."""
     qpos_start: Array
-    """(B, nq), what a diverged environment is put back to."""
+    """(B, nq) initial positions, to which a diverged environment is reset."""
     pool: dict[str, Array]
     """Fields of the model for each object (N, ...); see `actors.physics.slots.LEAVES`."""
 
@@ -45,34 +45,34 @@ class MjxPhysics:
     compiled = True
 
     def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]):
-        """Puts the pool's model on the device.
+        """Transfers the pool's model to the device.
 
         Args:
           hand: the hand.
           task: timing and collision settings.
-          objects: the pool that `ResetState.object_index` points into.
+          objects: the pool indexed by `ResetState.object_index`.
 
         Raises:
-          CongraspError: the hand collides by other shapes than capsules, of which MJX lacks some pairs.
+          CongraspError: the hand has collision shapes other than capsules, for which MJX lacks some pairs.
         """
         if any(link.solids for link in hand.links):
             raise CongraspError(
-                f"The engine jax collides capsules alone, and '{hand.name}' has solids of its own.",
-                "Choose native or warp; or, for a hand of your own, import it without --collision own.",
+                f"The engine jax supports capsules only, but '{hand.name}' has solids.",
+                "Use native or warp, or import a custom hand without --collision own.",
             )
         self._task = task
         self._pool = pool = Pool(hand, task, objects)
         self._where = addresses(pool.model, hand)
         self._links = np.array([pool.model.body(link.name).id for link in hand.links])
         self._nq, self._nv, self._nu = pool.model.nq, pool.model.nv, pool.model.nu
-        # MJX knows no elliptic cones without friction: links get what the hand's own sliding friction is, a tenth.
+        # MJX has no elliptic cones without friction: links get the hand's sliding friction, a tenth.
         pool.model.geom_condim[:] = CONTACT.condim
-        # MJX has no contact sensor between bodies; its contacts are read from the contact list instead.
+        # MJX has no contact sensor between bodies; contacts are read from the contact list instead.
         pool.model.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
         pool.model.sensor_objtype[:] = mujoco.mjtObj.mjOBJ_UNKNOWN
         self._host_model = pool.model
         self._body_of_geom = np.array(pool.model.geom_bodyid)
-        self._device = jax.local_devices()[0]  # MJX takes the first one of all ranks unless it is told
+        self._device = jax.local_devices()[0]  # by default MJX uses the first device of all ranks
         self._model = mjx.put_model(pool.model, device=self._device, impl="jax")
         self._objects = self._leaves(objects)
         self._geoms = np.flatnonzero(pool.model.geom_bodyid == self._where.object_body)
@@ -85,18 +85,18 @@ class MjxPhysics:
         self._object_body = self._where.object_body
 
     def start(self, reset_state: ResetState) -> MjxState:
-        """Fresh environments; see `Physics.start`."""
+        """Starts environments; see `Physics.start`."""
         batch = reset_state.object_index.shape[0]
         data = mjx.make_data(self._host_model, device=self._device, impl="jax")
         data = jax.vmap(lambda q: data.replace(qpos=q))(jnp.zeros((batch, self._nq)))
         return self._place(data, self._objects, reset_state)
 
     def replace_objects(self, state: MjxState, objects: Sequence[GraspObject]) -> MjxState:
-        """Other objects, as many as before and without meshes, for the episodes that start from now on."""
+        """Replaces the objects by as many others without meshes, for episodes that start from now on."""
         return state._replace(pool=self._leaves(objects))
 
     def reset(self, state: MjxState, mask: Array, reset_state: ResetState) -> MjxState:
-        """Starts the masked environments anew; see `Physics.reset`."""
+        """Restarts the masked environments; see `Physics.reset`."""
         fresh = self._place(state.data, state.pool, reset_state)
         names = ("qpos", "qvel", "ctrl", "qacc_warmstart", "mocap_pos", "mocap_quat", "eq_active", "time")
         started, going = (
@@ -109,7 +109,7 @@ class MjxPhysics:
     def step(
         self, state: MjxState, target: Array, table: Array, force: Array | None = None
     ) -> tuple[MjxState, PhysicsState]:
-        """One control step; see `Physics.step`."""
+        """Simulates one control step; see `Physics.step`."""
         where = self._where
         height = jnp.where(table, 0.0, TABLE_AWAY[2])
         data = state.data.replace(ctrl=target, mocap_pos=state.data.mocap_pos.at[:, where.table_mocap, 2].set(height))
@@ -133,14 +133,14 @@ class MjxPhysics:
         return state, physics_state(jnp, where, data.qpos, data.qvel, sensors, diverged[:, 0], jnp.zeros(2))
 
     def read(self, state: MjxState) -> PhysicsState:
-        """The environments as they are, without contacts; see `Physics.read`."""
+        """Returns the current state of the environments, without contacts; see `Physics.read`."""
         data = state.data
         batch = data.qpos.shape[0]
         none = jnp.zeros((batch, len(self._links) * CONTACTS_PER_LINK * SENSOR_WIDTH))
         return physics_state(jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Does nothing: there is nothing to release."""
 
     def _leaves(self, objects: Sequence[GraspObject]) -> dict[str, Array]:
         """Fields (N, ...) of the model for each object, on the device."""
@@ -150,7 +150,7 @@ class MjxPhysics:
         }
 
     def _place(self, data: Any, pool: dict[str, Array], reset_state: ResetState) -> MjxState:
-        """Environments at their start, with the fields of their objects from the rows `pool` (N, ...)."""
+        """Places environments at their start, with the fields of their objects from the rows `pool` (N, ...)."""
         where, batch = self._where, reset_state.object_index.shape[0]
         leaves = {name: value[reset_state.object_index] for name, value in pool.items()}
         for name, power in MASS_POWERS.items():
@@ -180,19 +180,19 @@ class MjxPhysics:
         return MjxState(data, leaves, qpos, pool)
 
     def _contacts(self, data: Any) -> Array:
-        """(B, L * C * 13) in the layout of the contact sensors."""
+        """Contacts (B, L * C * 13) in the layout of the contact sensors."""
         strongest = functools.partial(_strongest_contacts, self._body_of_geom, self._links, self._object_body)
         return jax.vmap(strongest)(data)
 
 
 def _strongest_contacts(body_of_geom: np.ndarray, links: np.ndarray, object_body: int, data: Any) -> Array:
-    """The contact sensors' values from MJX-JAX's contact list, for one environment."""
+    """Values of the contact sensors from MJX-JAX's contact list, for one environment."""
     contact = data._impl.contact
     body = jnp.asarray(body_of_geom)[contact.geom]
     index = np.asarray(contact.efc_address)
     # An elliptic contact of dimension 3 has a row for the normal and one for each tangent.
     force = jnp.where((index >= 0)[:, None], data._impl.efc_force[index[:, None] + np.arange(3)], 0.0)
-    # Normals point from the first geom to the second; the sensors want them from the link to the object.
+    # Normals point from the first geom to the second; the sensors need them from the link to the object.
     sign = jnp.where(body[:, 1] == object_body, 1.0, -1.0)[:, None]
     found = (contact.dist < contact.includemargin).astype(jnp.float32)[:, None]
     local = jnp.concatenate([force[:, :2], force[:, 2:] * sign], -1)

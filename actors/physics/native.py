@@ -20,21 +20,21 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 
-_ENVIRONMENT = 860_000  # bytes of an environment that has been stepped: model, data and their stack
+_ENVIRONMENT = 860_000  # bytes of a stepped environment: model, data and their stack
 
 
 class Scene:
-    """One object's compiled scene, and instances of it that no environment uses now."""
+    """Compiled scene of one object, and its unused instances."""
 
     def __init__(self, model: mujoco.MjModel):
-        """Nothing is copied yet."""
-        # MuJoCo would put a diverged environment back by itself, to a pose that is no episode's start, and say nothing.
+        """Wraps a model; nothing is copied yet."""
+        # MuJoCo would silently reset a diverged environment to a pose that is not the episode's start.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model = model
         self.spare: list[EnvInstance] = []
 
     def take(self) -> "EnvInstance":
-        """An instance whose data are as after a reset, made only if no spare one is left."""
+        """Returns an instance in the state after a reset; creates one only if no spare one is left."""
         if not self.spare:
             return EnvInstance(self.model)
         instance = self.spare.pop()
@@ -43,10 +43,10 @@ class Scene:
 
 
 class EnvInstance:
-    """One environment: its own model (base pose, mass, friction, gains differ) and data, with views that stay valid."""
+    """One environment: a model (base pose, mass, friction and gains differ) and data, with persistent views."""
 
     def __init__(self, model: mujoco.MjModel):
-        """A copy of a scene's model."""
+        """Copies the model of a scene."""
         self.model = copy.copy(model)
         self.data = mujoco.MjData(self.model)
         self.ctrl, self.qpos, self.qvel = self.data.ctrl, self.data.qpos, self.data.qvel
@@ -54,43 +54,43 @@ class EnvInstance:
 
 
 class NativePhysics:
-    """A batch of environments in MuJoCo C. Its state is the object itself; calls mutate it."""
+    """A batch of environments in MuJoCo C. Its state is this object; calls mutate it."""
 
     name = "native"
     compiled = False
 
     def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int):
-        """Objects are compiled on first use.
+        """Creates the engine; objects are compiled on first use.
 
         Args:
           hand: the hand.
           task: timing and collision settings.
-          objects: the pool that `ResetState.object_index` points into.
+          objects: the pool indexed by `ResetState.object_index`.
           threads: threads that step environments in parallel.
         """
-        # MuJoCo would write every warning to a file in the working directory; `diverged` sees what they speak of.
+        # MuJoCo would write every warning to a file in the working directory; `diverged` detects their causes.
         mujoco.set_mju_user_warning(lambda text: None)
         self._hand, self._task, self._objects = hand, task, objects
         self.threads = max(1, threads)
         self._pool = concurrent.futures.ThreadPoolExecutor(self.threads, thread_name_prefix="physics")
         self._compiled: dict[int, Scene] = {}
-        self.scenes: list[Scene] = []  # of each environment
+        self.scenes: list[Scene] = []  # state of each environment
         self.instances: list[EnvInstance] = []
         self._where = addresses(self._scene(0).model, hand)
         self._physics_state = jax.jit(functools.partial(physics_state, jnp, self._where))
 
     def start(self, reset_state: ResetState) -> "NativePhysics":
-        """Fresh environments; see `Physics.start`.
+        """Starts environments; see `Physics.start`.
 
         Raises:
-          CongraspError: they would not fit into the memory that is free.
+          CongraspError: they would not fit into free memory.
         """
         batch = len(np.asarray(reset_state.object_index))
         if (free := psutil.virtual_memory().available) < batch * _ENVIRONMENT:
             raise CongraspError(
-                f"{batch:,} environments of MuJoCo C need {batch * _ENVIRONMENT / 1e9:.0f} GB of memory, and "
+                f"{batch:,} environments of MuJoCo C need {batch * _ENVIRONMENT / 1e9:.0f} GB of memory, but "
                 f"{free / 1e9:.0f} GB are free.",
-                "Start the run with fewer --environments, or act on a GPU.",
+                "Pass a smaller --environments, or run the actor on a GPU.",
             )
         self.scenes = [self._scene(int(index)) for index in np.asarray(reset_state.object_index)]
         self.instances = [scene.take() for scene in self.scenes]
@@ -103,7 +103,7 @@ class NativePhysics:
         return self.reset(self, np.ones(batch, bool), reset_state)
 
     def reset(self, state: Any, mask: Any, reset_state: ResetState) -> "NativePhysics":
-        """Starts the masked environments anew; see `Physics.reset`."""
+        """Restarts the masked environments; see `Physics.reset`."""
         reset_state = ResetState(*(np.asarray(leaf) for leaf in reset_state))
         for i in np.flatnonzero(np.asarray(mask)):
             self._start_instance(int(i), reset_state)
@@ -112,13 +112,13 @@ class NativePhysics:
     def step(
         self, state: Any, target: Any, table: Any, force: Any | None = None
     ) -> tuple["NativePhysics", PhysicsState]:
-        """One control step; see `Physics.step`. Diverged environments are put back to their start and marked."""
+        """Simulates one control step; see `Physics.step`. Resets and flags diverged environments."""
         target, table = np.asarray(target), np.asarray(table)
         self.place_tables(table)
         if force is not None:
             for instance, push in zip(self.instances, np.asarray(force), strict=True):
                 instance.data.xfrc_applied[self._where.object_body, :3] = push
-        # Threads take one after another from one iterator: contacts make some environments slower than others.
+        # Threads take environments from one shared iterator, since contacts make some slower than others.
         environments = iter(range(len(self.instances)))
         list(self._pool.map(self._step_instances, [environments] * self.threads, [target] * self.threads))
         diverged = has_diverged(np, self._qpos, self._qvel)
@@ -127,33 +127,33 @@ class NativePhysics:
         return self, self._current_state(diverged)
 
     def place_tables(self, table: np.ndarray) -> None:
-        """Puts the tables (B,) where they are true, and takes the others away."""
+        """Places the tables where `table` (B,) is true, and removes the others."""
         for i in np.flatnonzero(table != self._table):
             self.instances[i].data.mocap_pos[self._where.table_mocap] = (0.0, 0.0, 0.0) if table[i] else TABLE_AWAY
         self._table = table.copy()
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> "NativePhysics":
-        """Other objects; see `Physics.replace_objects`."""
+        """Replaces the objects; see `Physics.replace_objects`."""
         self._objects = objects
         self._compiled.clear()
         return self
 
     def read(self, state: Any) -> PhysicsState:
-        """The environments as they are; see `Physics.read`."""
+        """Returns the current state of the environments; see `Physics.read`."""
         return self._current_state(np.zeros(len(self.instances), bool))
 
     def close(self) -> None:
-        """Ends the threads."""
+        """Stops the threads."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _scene(self, index: int) -> Scene:
-        """The compiled scene of an object, compiled on first use."""
+        """Returns the compiled scene of an object, compiling it on first use."""
         if index not in self._compiled:
             self._compiled[index] = Scene(compile_scene(self._hand, self._task, self._objects[index]))
         return self._compiled[index]
 
     def _start_instance(self, i: int, reset_state: ResetState) -> None:
-        """Puts environment i to row i of its reset states, in an instance of its object's scene."""
+        """Places environment i at row i of its reset states, in an instance of its object's scene."""
         where, scene = self._where, self._scene(int(reset_state.object_index[i]))
         self.scenes[i].spare.append(self.instances[i])
         self.scenes[i], instance = scene, scene.take()
@@ -181,7 +181,7 @@ class NativePhysics:
         self._copy_out(i)
 
     def _restore(self, i: int) -> None:
-        """Puts a diverged environment back to its start."""
+        """Resets a diverged environment to its start."""
         model, data = self.instances[i].model, self.instances[i].data
         mocap = data.mocap_pos.copy(), data.mocap_quat.copy()
         weld = int(data.eq_active[self._where.weld])
@@ -197,7 +197,7 @@ class NativePhysics:
         self._qpos[i], self._qvel[i], self._sensors[i] = instance.qpos, instance.qvel, instance.sensordata
 
     def _step_instances(self, environments: Iterator[int], target: np.ndarray) -> None:
-        """One control step of the environments that the iterator, which threads share, still has."""
+        """Steps environments from a shared iterator until it is exhausted; runs in each thread."""
         substeps = self._task.substeps
         with np.errstate(over="ignore"):  # a diverged environment's values may be too large for float32
             for i in environments:
@@ -207,7 +207,7 @@ class NativePhysics:
                 self._copy_out(i)
 
     def _current_state(self, diverged: np.ndarray) -> PhysicsState:
-        """The physics state from the batch's arrays; `diverged` (B,) is passed through."""
+        """Returns the physics state from the batch's arrays; `diverged` (B,) is passed through."""
         # Copies: the next step writes into the buffers while JAX may still read.
         return self._physics_state(
             self._qpos.copy(), self._qvel.copy(), self._sensors.copy(), diverged, np.zeros(2, np.float32)

@@ -1,4 +1,4 @@
-"""From a `ResetState` to raw `qpos`, and from raw arrays to a `PhysicsState`; NumPy or JAX."""
+"""Conversions from a `ResetState` to raw `qpos`, and from raw arrays to a `PhysicsState`; NumPy or JAX."""
 
 import types
 from typing import Any
@@ -12,7 +12,7 @@ from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
 
 def initial_qpos(where: Addresses, nq: int, reset_state: ResetState) -> Array:
-    """(B, nq) of environments that start, as a JAX array: the wrist's joints are zero there."""
+    """Initial qpos (B, nq) as a JAX array; the wrist joints are zero."""
     qpos = jnp.zeros((len(reset_state.q), nq))
     qpos = qpos.at[:, where.finger_qpos].set(reset_state.q)
     return qpos.at[:, where.object_qpos].set(
@@ -21,7 +21,7 @@ def initial_qpos(where: Addresses, nq: int, reset_state: ResetState) -> Array:
 
 
 def initial_qvel(where: Addresses, nv: int, reset_state: ResetState) -> Array:
-    """(B, nv) of environments that start, as a JAX array: the wrist alone moves."""
+    """Initial qvel (B, nv) as a JAX array; only the wrist moves."""
     return jnp.zeros((len(reset_state.q), nv)).at[:, where.wrist_qvel].set(reset_state.u_velocity)
 
 
@@ -40,10 +40,10 @@ def physics_state(
       xp: numpy or jax.numpy.
       where: indices of the compiled scene.
       qpos: generalised positions.
-      qvel: generalised velocities; the free joint's angular part is in the object frame and is turned to the world.
+      qvel: generalised velocities; the free joint's angular part is converted from the object frame to the world frame.
       sensordata: contact sensors of all links, strongest contacts first.
-      diverged: (B,) bool, passed through.
-      occupancy: (2,), passed through.
+      diverged: (B,) bool, returned unchanged.
+      occupancy: (2,), returned unchanged.
     """
     batch = qpos.shape[0]
     contacts = sensordata.reshape(batch, -1, CONTACTS_PER_LINK, SENSOR_WIDTH)

@@ -1,4 +1,4 @@
-"""The MuJoCo model of one scene: hand, object, table, the anchor that holds a stationary object, contact sensors."""
+"""MuJoCo model of one scene: hand, object, table, the anchor of a stationary object, contact sensors."""
 
 import dataclasses
 
@@ -13,13 +13,13 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.types import CONTACTS_PER_LINK
 
 OBJECT_CONTYPE = 2
-"""Collision bit of the object; the table answers to it."""
+"""Collision bit of the object, which the table collides with."""
 TABLE_AWAY = (0.0, 0.0, -1000.0)
-"""Where the table is when it is removed: a kilometre down, so that nothing reaches it again."""
+"""Position of a removed table: a kilometre down, out of reach."""
 GAINS = ("actuator_gainprm", "actuator_biasprm")
-"""Fields of a model that hold a position servo's gains, and nothing else but zeros."""
+"""Fields of a model that hold only a position servo's gains and zeros."""
 MASS_POWERS = {"body_mass": 1, "body_inertia": 1, "body_subtreemass": 1, "body_invweight0": -1, "dof_invweight0": -1}
-"""Fields of a model that change with the power of a body's mass, in the rows of the body or of its free joint."""
+"""Fields of a model that scale with a power of a body's mass, in the rows of the body or of its free joint."""
 SENSOR_WIDTH = 13
 """Numbers of one contact: found, force (3, contact frame), position (3), normal (3), tangent (3)."""
 _CONTACT_FIELDS = (
@@ -34,7 +34,7 @@ _STRONGEST = 2  # reduce="maxforce"
 
 @dataclasses.dataclass(frozen=True)
 class Addresses:
-    """Where a compiled scene keeps what the task reads and writes."""
+    """Addresses in a compiled scene that the task reads and writes."""
 
     wrist_qpos: np.ndarray
     finger_qpos: np.ndarray
@@ -48,17 +48,18 @@ class Addresses:
     anchor_mocap: int
     weld: int
     motors: np.ndarray
-    """Actuators of the fingers: gainprm[0] * target + biasprm[1] * angle + biasprm[2] * speed is a servo's torque."""
+    """Actuators of the fingers; servo torque: gainprm[0] * target + biasprm[1] * angle + biasprm[2] * speed."""
 
 
 def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
-    """Hand, table, anchor and options, without an object."""
+    """Returns hand, table, anchor and options, without an object."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep = task.control_dt / task.substeps
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # Held objects creep out of every grasp within seconds on pyramidal friction cones, and on elliptic ones unless
-    # friction is harder than normal forces and the solver converges: 6 iterations, or 12 of its line search, are few.
+    # Held objects creep out of every grasp within seconds with pyramidal friction cones. With elliptic ones they do
+    # so unless friction is harder than normal forces and the solver converges: 6 iterations, or 12 of its line search,
+    # are too few.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
@@ -77,7 +78,7 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     table = spec.worldbody.add_body(name="table", mocap=True)
     table.add_geom(
         name="table",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,  # MJX-JAX collides a cylinder with a plane, but not with a box
+        type=mujoco.mjtGeom.mjGEOM_PLANE,  # MJX-JAX supports collisions of a cylinder with a plane, but not with a box
         size=(0.6, 0.6, 0.05),
         contype=0,
         conaffinity=OBJECT_CONTYPE | (HAND_CONTYPE if task.hand_table_collision else 0),
@@ -90,12 +91,12 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
 
 
 def object_contact(task: TaskConfig) -> ContactSettings:
-    """Contact settings of the task's objects."""
+    """Contact settings for the task's objects."""
     return dataclasses.replace(CONTACT, free_damping=task.object_damping)
 
 
 def finish_spec(spec: mujoco.MjSpec, hand: Hand) -> None:
-    """The weld of the stationary phase and the contact sensors; the object is in its place already."""
+    """Adds the weld of the stationary phase and the contact sensors to a spec that contains the object."""
     spec.add_equality(
         name="hold",
         type=mujoco.mjtEq.mjEQ_WELD,
@@ -120,7 +121,7 @@ def finish_spec(spec: mujoco.MjSpec, hand: Hand) -> None:
 
 
 def compile_scene(hand: Hand, task: TaskConfig, obj: GraspObject) -> mujoco.MjModel:
-    """The scene with one object, as `native` uses it."""
+    """Compiles the scene with one object, for `native`."""
     spec = scene_spec(hand, task)
     add_object(spec, obj, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
     finish_spec(spec, hand)
@@ -128,7 +129,7 @@ def compile_scene(hand: Hand, task: TaskConfig, obj: GraspObject) -> mujoco.MjMo
 
 
 def addresses(model: mujoco.MjModel, hand: Hand) -> Addresses:
-    """Indices by name, in the order of u, q and the object's free joint."""
+    """Returns the addresses, in the order of u, q and the object's free joint."""
 
     def joint(name: str) -> tuple[int, int]:
         index = model.joint(name).id

@@ -1,8 +1,8 @@
-"""One model for a whole pool of objects: what differs between objects becomes arrays batched over environments.
+"""One model for a whole pool of objects: fields that differ between objects become arrays batched over environments.
 
-Primitive pieces of every object share a fixed number of geom slots, whose sizes and poses are swapped; a slot that an
-object does not use shrinks to 0.4 mm inside it. Mesh pieces cannot be swapped in a `Pool`: each mesh object owns its
-geoms, and those of the other objects get a margin that no contact is deep enough for.
+Primitive pieces of all objects share a fixed number of geom slots, whose sizes and poses are swapped; an unused slot
+shrinks to 0.4 mm inside the object. Mesh pieces of a `Pool` cannot be swapped: each mesh object has separate geoms, and
+those of other objects get a margin that no contact can reach.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from congrasp.common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
 
 _UNUSED = 0.0004
 _NO_CONTACT = -1000.0
-"""Margin (m) of other objects' meshes: they would have to be a kilometre deep in something to touch it."""
+"""Margin (m) of other objects' meshes: contact would need a penetration of a kilometre."""
 
 LEAVES = (
     "geom_size",
@@ -40,7 +40,7 @@ LEAVES = (
 
 
 class Pool:
-    """The shared model of a pool of objects, and what differs between them."""
+    """Model shared by a pool of objects, and the fields that differ between them."""
 
     def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]):
         """Compiles the model.
@@ -60,7 +60,7 @@ class Pool:
             self._owners += [n] * len(meshes)
         shared = dataclasses.replace(objects[0], pieces=tuple(pieces))
         body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
-        body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which the other objects may not have
+        body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which other objects may not have
         finish_spec(spec, hand)
         self.model: mujoco.MjModel = spec.compile()
         geoms = np.array([self.model.geom(f"object_{i}").id for i in range(len(pieces))])
@@ -70,10 +70,10 @@ class Pool:
         """Fields (N, ...) of the model for each object, by the names in `LEAVES`.
 
         Args:
-          objects: those of the pool, or as many others without meshes.
+          objects: the pool, or as many others without meshes.
 
         Raises:
-          CongraspError: a mesh object that is not of the pool, or more pieces than slots.
+          CongraspError: a mesh object is not in the pool, or there are more pieces than slots.
         """
         base = {name: getattr(self.model, name).copy() for name in LEAVES}
         data = mujoco.MjData(self.model)
@@ -85,7 +85,7 @@ class Pool:
     def _leaves(
         self, base: dict[str, np.ndarray], data: mujoco.MjData, obj: GraspObject, index: int
     ) -> dict[str, np.ndarray]:
-        """Leaves of one object: written into the model, completed by MuJoCo, and copied out."""
+        """Returns the leaves of one object: written into the model, completed by MuJoCo, and copied out."""
         model = self.model
         for name, value in base.items():
             getattr(model, name)[:] = value
@@ -103,7 +103,7 @@ class Pool:
 
 
 def empty_slots() -> list[Piece]:
-    """The primitive slots of an environment that has no object in them."""
+    """Primitive slots of an environment without an object."""
     return [Piece(kind, _shrunk(kind)) for kind, count in PRIMITIVE_SLOTS.items() for _ in range(count)]  # type: ignore[arg-type]
 
 
@@ -113,10 +113,10 @@ def fill_primitives(model: mujoco.MjModel, slots: np.ndarray, obj: GraspObject) 
     Args:
       model: the model, changed in place.
       slots: the geoms of `empty_slots`.
-      obj: the object; its mesh pieces are left out.
+      obj: the object; its mesh pieces are ignored.
 
     Raises:
-      CongraspError: more pieces of a kind than slots.
+      CongraspError: there are more pieces of a kind than slots.
     """
     free = {kind: [g for g in slots if model.geom_type[g] == GEOM_TYPES[kind]] for kind in PRIMITIVE_SLOTS}
     for piece in obj.pieces:
@@ -125,7 +125,7 @@ def fill_primitives(model: mujoco.MjModel, slots: np.ndarray, obj: GraspObject) 
         if not free[piece.kind]:
             raise CongraspError(
                 f"The object '{obj.name}' has more than {PRIMITIVE_SLOTS[piece.kind]} {piece.kind} pieces.",
-                "Make it of fewer pieces, or import it as a mesh.",
+                "Use fewer pieces, or import it as a mesh.",
             )
         geom = free[piece.kind].pop(0)
         model.geom_size[geom] = piece.size
@@ -136,7 +136,7 @@ def fill_primitives(model: mujoco.MjModel, slots: np.ndarray, obj: GraspObject) 
 
 
 def fill_body(model: mujoco.MjModel, data: mujoco.MjData, obj: GraspObject) -> None:
-    """Writes mass and inertia into the body `object`, and what MuJoCo derives from them.
+    """Writes mass and inertia into the body `object`, and the quantities that MuJoCo derives from them.
 
     Args:
       model: the model, changed in place.
@@ -157,7 +157,7 @@ def _shrunk(kind: str) -> tuple[float, float, float]:
 
 
 def _half_extent(piece: Piece) -> tuple[float, float, float]:
-    """Half the edges of a primitive's bounding box in its own frame, m."""
+    """Half extents of a primitive's bounding box in its frame, m."""
     a, b, c = piece.size
     if piece.kind == "cylinder":
         return a, a, b
@@ -165,7 +165,7 @@ def _half_extent(piece: Piece) -> tuple[float, float, float]:
 
 
 def _bounding_radius(piece: Piece) -> float:
-    """Radius of the sphere around its centre that holds a primitive, m."""
+    """Radius of the bounding sphere around a primitive's centre, m."""
     a, b, c = piece.size
     if piece.kind == "box":
         return float(np.linalg.norm(piece.size))

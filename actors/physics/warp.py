@@ -1,6 +1,6 @@
-"""MuJoCo Warp, called once a control step: NVIDIA kernels that give each environment an object and meshes of its own.
+"""MuJoCo Warp, called once per control step: NVIDIA kernels with different objects and meshes in each environment.
 
-The kernels are those that mujoco-mjx carries (`mujoco.mjx.third_party.mujoco_warp`); they also run on a CPU, for tests.
+The kernels are those shipped with mujoco-mjx (`mujoco.mjx.third_party.mujoco_warp`); they also run on a CPU, for tests.
 The state is a small pytree and every call can be traced, so that a whole rollout compiles into one program.
 """
 
@@ -23,31 +23,31 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
-wp.config.log_level = wp.LOG_WARNING  # not a line for each of some 50 modules that are loaded
+wp.config.log_level = wp.LOG_WARNING  # no log line for each of some 50 loaded modules
 
 
 class WarpState(NamedTuple):
-    """All that a control step of a batch of environments depends on."""
+    """State on which a control step of a batch of environments depends."""
 
     qpos: Array
     """(B, nq)."""
     qvel: Array
     """(B, nv)."""
     qacc_warmstart: Array
-    """(B, nv), where the solver begins."""
+    """(B, nv) warm start of the solver."""
     reset_state: ResetState
-    """What the environments started from; `object_index` is a row of the engine's catalogue."""
+    """Initial states of the episodes; `object_index` is a row of the engine's catalogue."""
 
 
-_LEAST_SLOTS = 8  # mesh pieces: room for other objects than those of the first pool
+_LEAST_SLOTS = 8  # mesh pieces: capacity for objects other than those of the first pool
 
 
 class WarpPhysics:
     """A batch of environments in MuJoCo Warp.
 
-    The compiled calls see objects only as row numbers. So any number of objects, primitives and meshes mixed, costs
-    the same in a step, and `replace_objects` compiles nothing: neither the number of objects nor the size of their
-    meshes is part of a program. No object may have more pieces of a kind than there are slots (`PRIMITIVE_SLOTS`,
+    The compiled calls refer to objects by row number only. A step therefore costs the same for any number of objects,
+    primitives and meshes mixed, and `replace_objects` compiles nothing: neither the number of objects nor the size of
+    their meshes is part of a program. No object may have more pieces of a kind than there are slots (`PRIMITIVE_SLOTS`,
     `mesh_slots`).
     """
 
@@ -55,13 +55,13 @@ class WarpPhysics:
     compiled = True
 
     def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], mesh_slots: int | None = None):
-        """Puts the objects on the device.
+        """Transfers the objects to the device.
 
         Args:
           hand: the hand.
           task: timing and collision settings.
-          objects: the pool that `ResetState.object_index` points into.
-          mesh_slots: most mesh pieces of an object, 0 for primitives alone; by default those of this pool, or 8.
+          objects: the pool indexed by `ResetState.object_index`.
+          mesh_slots: most mesh pieces of an object, 0 for primitives only; by default those of this pool, or 8.
 
         Raises:
           CongraspError: an object has more pieces than slots.
@@ -72,8 +72,8 @@ class WarpPhysics:
             mesh_slots = max(most, _LEAST_SLOTS)
         self._catalogue = Catalogue(hand, task, objects[0], mesh_slots)
         model = self._catalogue.model
-        # Measured: more iterations of either kind hold no more grasps there. Dense Jacobians cost elliptic cones
-        # twice the whole solver's time.
+        # Measured: more iterations of either kind hold no more grasps. Dense Jacobians double the solver's time with
+        # elliptic cones.
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
         model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 4, 10, 1e-5
         self._where = addresses(model, hand)
@@ -84,7 +84,7 @@ class WarpPhysics:
         self._load(objects)
 
     def start(self, reset_state: ResetState) -> WarpState:
-        """Fresh environments; see `Physics.start`."""
+        """Starts environments; see `Physics.start`."""
         batch = reset_state.object_index.shape[0]
         if batch not in self._buffers:
             model, geoms = self._catalogue.model, self._catalogue.geoms
@@ -94,13 +94,13 @@ class WarpPhysics:
         return self._fresh(reset_state)
 
     def reset(self, state: WarpState, mask: Array, reset_state: ResetState) -> WarpState:
-        """Starts the masked environments anew; see `Physics.reset`."""
+        """Restarts the masked environments; see `Physics.reset`."""
         return where_environments(mask, self._fresh(reset_state), state)
 
     def step(
         self, state: WarpState, target: Array, table: Array, force: Array | None = None
     ) -> tuple[WarpState, PhysicsState]:
-        """One control step; see `Physics.step`."""
+        """Simulates one control step; see `Physics.step`."""
         reset_state, batch = state.reset_state, state.qpos.shape[0]
         force = jnp.zeros((batch, 3)) if force is None else force.astype(jnp.float32)
         handle, buffers = self._buffers[batch]
@@ -131,13 +131,13 @@ class WarpPhysics:
         return state, physics_state(jnp, self._where, state.qpos, state.qvel, sensors, diverged, occupancy)
 
     def replace_objects(self, state: WarpState, objects: Sequence[GraspObject]) -> WarpState:
-        """Other objects, primitives or meshes, for the environments that start anew from now on; not to be traced.
+        """Replaces the objects for environments that restart from now on; must not be traced.
 
-        The objects of environments that go on are kept behind the new ones until the next call. Waits for the step that
-        `state` comes from; no other may be under way, and no other state is valid afterwards.
+        Objects of continuing episodes are kept after the new ones until the next call. Waits for the step that produced
+        `state`; no other may be in progress, and no other state is valid afterwards.
 
         Args:
-          state: of the environments that go on.
+          state: current state of the environments.
           objects: the new pool, of any size.
 
         Raises:
@@ -151,24 +151,24 @@ class WarpPhysics:
         return state._replace(reset_state=state.reset_state._replace(object_index=moved))
 
     def read(self, state: WarpState) -> PhysicsState:
-        """The environments as they are, without contacts; see `Physics.read`."""
+        """Returns the current state of the environments, without contacts; see `Physics.read`."""
         batch = state.qpos.shape[0]
         none = jnp.zeros((batch, self._sensors))
         return physics_state(jnp, self._where, state.qpos, state.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
 
     def repeat(self, batch: int, steps: int) -> None:
-        """Control steps of a batch that was stepped before, from there and with its targets; no state sees them.
+        """Repeats control steps of a batch from its last state and targets; no state observes them.
 
-        Nothing but MuJoCo Warp's kernels runs, without JAX: what a benchmark compares with.
+        Runs only MuJoCo Warp's kernels, without JAX, as a reference for benchmarks.
         """
         self._buffers[batch][1].repeat(steps)
 
     def close(self) -> None:
-        """Releases the environments' memory."""
+        """Releases the memory of the environments."""
         self._buffers.clear()
 
     def _load(self, objects: Sequence[GraspObject]) -> None:
-        """Puts objects on the device, and every batch's buffers on them."""
+        """Transfers objects to the device, and points every batch's buffers to them."""
         rows, meshes = self._catalogue.rows(objects)
         self._objects = objects
         self._loaded = objects_on(self._device, rows), meshes_on(self._device, meshes)
@@ -177,7 +177,7 @@ class WarpPhysics:
             buffers.fill(*self._loaded)
 
     def _fresh(self, reset_state: ResetState) -> WarpState:
-        """The state of environments that start now; types as the compiled calls expect them."""
+        """Returns the state of environments that start now, with the types that the compiled calls expect."""
         index, stationary = jnp.asarray(reset_state.object_index, jnp.int32), jnp.asarray(reset_state.stationary, bool)
         reset_state = ResetState(*(jnp.asarray(leaf, jnp.float32) for leaf in reset_state))
         reset_state = reset_state._replace(object_index=index, stationary=stationary)

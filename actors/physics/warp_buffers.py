@@ -1,8 +1,8 @@
-"""Environments in memory of Warp: what they share, what their objects fill, and one control step of all of them.
+"""Environments in Warp's memory: shared model, fields of their objects, and one control step of all of them.
 
-`control_step` is what JAX sees: a pure function of small arrays. Model and data stay in buffers that are allocated once
-for a batch, so that their addresses never change and one CUDA graph of a control step serves every program that calls
-it, wherever JAX puts its own arrays.
+`control_step` is the interface to JAX: a pure function of small arrays. Model and data stay in buffers allocated once
+per batch, so that their addresses never change and one CUDA graph of a control step serves every program that calls it,
+wherever JAX places its arrays.
 """
 
 import dataclasses
@@ -21,13 +21,13 @@ from congrasp.actors.physics.scene import TABLE_AWAY, Addresses
 from congrasp.actors.physics.warp_kernels import DATA_LEAVES, MODEL_LEAVES, OBJECT_FIELDS, Leaves, Objects, count, place
 
 CONTACTS_PER_ENVIRONMENT = 40
-"""Contacts that the shared list holds for each environment on average."""
+"""Average capacity of the shared contact list for each environment."""
 CONSTRAINTS_PER_ENVIRONMENT = 320
-"""Constraint rows of each environment."""
+"""Capacity of constraint rows for each environment."""
 
 
 class WarpBuffers:
-    """The buffers of a batch of environments on one device."""
+    """Buffers of a batch of environments on one device."""
 
     def __init__(
         self,
@@ -38,22 +38,22 @@ class WarpBuffers:
         batch: int,
         device: wp.Device,
     ):
-        """Allocates them.
+        """Allocates the buffers.
 
         Args:
-          model: what the environments share.
+          model: model shared by the environments.
           where: indices of the model.
           geoms: (S,) geoms of the object's slots.
           substeps: physics steps of a control step.
-          batch: B, number of environments.
-          device: where the buffers are.
+          batch: number B of environments.
+          device: device of the buffers.
         """
         self._substeps, self._device = substeps, device
         self._graph: wp.Graph | None = None
         self.limits = np.array([CONTACTS_PER_ENVIRONMENT * batch, CONSTRAINTS_PER_ENVIRONMENT], np.float32)
-        """(2,) contacts and constraint rows that there is room for."""
+        """(2,) capacities of contacts and constraint rows."""
         with wp.ScopedDevice(device):
-            # A single row would mean that the field is shared, and meshes are then never absent.
+            # A single row would mark the field as shared, and meshes could then never be absent.
             self._model = mujoco_warp.put_model(model, dict.fromkeys(MODEL_LEAVES, max(batch, 2)))
             self._data = mujoco_warp.make_data(
                 model, batch, naconmax=CONTACTS_PER_ENVIRONMENT * batch, njmax=CONSTRAINTS_PER_ENVIRONMENT
@@ -80,7 +80,7 @@ class WarpBuffers:
         self._blind = self._sensing | mujoco_warp.DisableBit.SENSOR
 
     def fill(self, objects: Objects, meshes: dict[str, Any]) -> None:
-        """Takes what environments are filled from: rows, and the fields of the model that hold their meshes."""
+        """Sets the sources of the environments' fields: rows, and the fields of the model with their meshes."""
         self._objects, self._graph = objects, None
         for name, value in meshes.items():
             setattr(self._model, name, value)
@@ -95,7 +95,7 @@ class WarpBuffers:
         sensordata: Any,
         occupancy: Any,
     ) -> None:
-        """Steps all environments on the current stream; the first three arrays are changed, the last two written."""
+        """Steps all environments on the current stream; modifies the first three arrays and writes the last two."""
         data = self._data
         state = (data.qpos, qpos), (data.qvel, qvel), (data.qacc_warmstart, qacc_warmstart)
         for mine, given in (*state, (data.ctrl, ctrl)):
@@ -107,7 +107,7 @@ class WarpBuffers:
             wp.copy(given, mine)
 
     def repeat(self, steps: int) -> None:
-        """Control steps from where the last one ended, by nothing but Warp, and waits for them; for benchmarks."""
+        """Repeats control steps from the last state with Warp only, and waits for them; for benchmarks."""
         with wp.ScopedDevice(self._device):
             for _ in range(steps):
                 self._launch()
@@ -129,7 +129,7 @@ class WarpBuffers:
         return capture.graph
 
     def _substep_all(self) -> None:
-        """The physics steps of a control step; contacts are sensed in the last one."""
+        """Runs the physics steps of a control step; contacts are read in the last one."""
         model, data = self._model, self._data
         for left in reversed(range(self._substeps)):
             model.opt.disableflags = self._blind if left else self._sensing
@@ -139,7 +139,7 @@ class WarpBuffers:
 
 
 def objects_on(device: wp.Device, rows: dict[str, np.ndarray]) -> Objects:
-    """The rows of a catalogue on a device."""
+    """Transfers the rows of a catalogue to a device."""
     objects = Objects()
     for name, dtype in OBJECT_FIELDS.items():
         value = rows[name].reshape(len(rows[name]), -1, 2, 3) if name == "geom_aabb" else rows[name]
@@ -148,7 +148,7 @@ def objects_on(device: wp.Device, rows: dict[str, np.ndarray]) -> Objects:
 
 
 def meshes_on(device: wp.Device, model: mujoco.MjModel) -> dict[str, Any]:
-    """What Warp's model holds of meshes, by the fields' names, on a device."""
+    """Transfers the mesh fields of a model to a device, by name."""
     values: dict[str, Any] = {name: getattr(model, name) for name in ("nmesh", "npolygonmax", "nmeshdegmax")}
     for field in dataclasses.fields(mujoco_warp.Model):
         if field.name.startswith("mesh_"):
@@ -162,7 +162,7 @@ _handles = itertools.count()
 
 
 def register(buffers: WarpBuffers) -> int:
-    """A number by which `control_step` finds these environments for as long as someone holds them."""
+    """Registers the buffers; `control_step` finds them by the returned handle while they are referenced."""
     handle = next(_handles)
     _buffers[handle] = buffers
     return handle
@@ -188,7 +188,7 @@ def _control_step(
     sensordata: wp.array2d[float],
     occupancy: wp.array[int],
 ) -> None:
-    """What JAX calls: finds the buffers by their handle and steps them; arrays as in `WarpPhysics.step`."""
+    """Target of the JAX call: finds the buffers by their handle and steps them; arrays as in `WarpPhysics.step`."""
     placed = [table, force, row, mass_scale, friction, gain_scale, base_position, base_quaternion]
     placed += [anchor_position, anchor_quaternion, stationary]
     _buffers[handle].control_step(qpos, qvel, qacc_warmstart, ctrl, placed, sensordata, occupancy)
@@ -197,7 +197,7 @@ def _control_step(
 control_step = jax_callable(
     _control_step,
     num_outputs=5,
-    # `WarpBuffers` captures a graph of its own: Warp's would be of JAX's buffers, and made anew wherever those move to.
+    # `WarpBuffers` captures a separate graph: Warp's would use JAX's buffers, and be recaptured wherever those move.
     graph_mode=JaxCallableGraphMode.NONE,
     vmap_method=None,
     in_out_argnames=["qpos", "qvel", "qacc_warmstart"],

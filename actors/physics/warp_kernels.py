@@ -1,7 +1,6 @@
-"""Kernels of our own beside MuJoCo Warp's: what fills the environments, and what counts how full their buffers are."""
+"""Additional kernels for MuJoCo Warp: they fill the environments and measure the occupancy of their buffers."""
 
-# mypy: ignore-errors
-# (Kernels are a language of their own in Python's syntax, which Warp's compiler checks.)
+# mypy: ignore-errors (Kernels are a language with Python's syntax, checked by Warp's compiler.)
 
 import warp as wp
 from mujoco.mjx.third_party.mujoco_warp._src.types import vec10f
@@ -27,7 +26,7 @@ class Objects:
 
 @wp.struct
 class Leaves:
-    """Fields of model and data that differ between environments (B, ...), and where the object is in them."""
+    """Fields of model and data that differ between environments (B, ...), and addresses of the object in them."""
 
     geom_size: wp.array2d[wp.vec3]
     geom_pos: wp.array2d[wp.vec3]
@@ -63,7 +62,7 @@ class Leaves:
 
 
 OBJECT_FIELDS = {name: field.type.dtype for name, field in Objects.vars.items()}
-"""Fields of `Objects` and the types of their elements."""
+"""Fields of `Objects` and their element types."""
 MODEL_LEAVES = [name for name in Leaves.vars if name.startswith(("geom_", "body_", "dof_", "actuator_"))]
 DATA_LEAVES = [name for name in Leaves.vars if name.startswith(("mocap_", "eq_", "xfrc_"))]
 
@@ -134,7 +133,7 @@ def place(
 
 @wp.kernel
 def count(ncollision: wp.array[int], nacon: wp.array[int], nefc: wp.array[int], occupancy: wp.array[int]) -> None:
-    """Keeps the most contacts of all environments, and the most constraint rows of any; also what had no room."""
+    """Records the most contacts of all environments and the most constraint rows of any, including dropped ones."""
     env = wp.tid()
     wp.atomic_max(occupancy, 1, nefc[env])
     if env == 0:

@@ -36,7 +36,7 @@ from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, TAUGHT
 _TICKET_SECONDS = 1.0
 _FLUSH_SECONDS = 2.0
 _SAVE_SECONDS = 60.0
-"""Between two files of the references that the policy's grasps became."""
+"""Seconds between two writes of the reference poses from the policy's grasps."""
 
 
 def run_actor(
@@ -59,12 +59,12 @@ def run_actor(
       run: name of the run.
       actor: this actor's name, unique in the run; it also decides on its objects and random numbers.
       stop: ends the actor between two rollouts.
-      physics: engine, where it is not to be the run's.
+      physics: engine; that of the run by default.
       threads: threads of the `native` engine.
       patience: seconds without a learner after which the actor gives up.
-      on_rollout: given the metrics of every rollout, its version among them.
+      on_rollout: called with the metrics of every rollout, including its version.
       journal: see `ActorLink`.
-      references: file by which a later start goes on with the reference poses that were the policy's own grasps.
+      references: file that preserves the reference poses from the policy's grasps across restarts.
 
     Raises:
       CongraspError: the learner is gone, or refuses this actor's rollouts.
@@ -86,7 +86,7 @@ def run_actor(
 
 
 def first_environments(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:
-    """The arrays of the first `count` environments of a rollout."""
+    """Returns the arrays of the first `count` environments of a rollout."""
     return {
         name: np.asarray(array[(slice(None),) * RECORDABLE[name].worlds_axis + (slice(count),)])
         for name, array in arrays.items()
@@ -110,7 +110,7 @@ class _Actor:
         if unknown := set(arrays) - RECORDABLE.keys():
             raise CongraspError(
                 f"The learner's algorithm needs arrays that actors do not record: {', '.join(sorted(unknown))}.",
-                "Start the actor with the version of congrasp that the learner has.",
+                "Start the actor with the learner's version of congrasp.",
             )
         self._config, self._arrays, self._link, self._transport = config, arrays, link, transport
         self._hand = get_hand(config.task.hand)
@@ -131,7 +131,7 @@ class _Actor:
                 bank,
                 functools.partial(sample_action, self._spec.layout),
                 batch=config.environments,
-                # Another incarnation must not repeat the episodes of the one that it replaces.
+                # Another incarnation must not repeat the episodes of the one it replaces.
                 seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
                 half_precision=config.half_observations,
                 staggered=True,
@@ -145,7 +145,7 @@ class _Actor:
         self._follower = Follower()
 
     def act(self, stop: threading.Event) -> None:
-        """Rollouts until `stop` is set or the run ends."""
+        """Produces rollouts until `stop` is set or the run ends."""
         try:
             self._warm_up(stop)
             asked = time.monotonic()
@@ -167,13 +167,13 @@ class _Actor:
             self._physics.close()
 
     def _failure_weights(self, bank: ConstraintBank) -> FailureWeights | None:
-        """Counts for the present objects, where the run draws them by failure."""
+        """Returns counters of the current objects, if the run draws objects by failure."""
         if not self._config.objects.by_failure:
             return None
         return FailureWeights(np.asarray(bank.weight), [obj.family for obj in self._objects])
 
     def _renew_objects(self) -> None:
-        """Other objects in the place of all, and fresh episodes with them."""
+        """Replaces all objects, and starts new episodes with them."""
         self._number += 1
         self._objects, bank = training_set(self._hand, self._config, self._number)
         self._worker.replace_objects(self._objects, bank)
@@ -182,11 +182,11 @@ class _Actor:
         self._failures = self._failure_weights(bank)
 
     def _warm_up(self, stop: threading.Event) -> None:
-        """Compiles before the first ticket is asked for, whose rollout would be too old by the time that it is made."""
+        """Compiles before the first ticket is requested, so that its rollout is not stale when it is finished."""
         while not self._refresh():
             if stop.is_set():
                 return
-            if ticket := self._link.acquire_ticket(_TICKET_SECONDS):  # waits for the learner, but not for ever
+            if ticket := self._link.acquire_ticket(_TICKET_SECONDS):  # waits for the learner, but not indefinitely
                 self._link.give_back(ticket)
         assert self._bundle is not None
         self._configure(self._bundle.version)
@@ -195,7 +195,7 @@ class _Actor:
             if self._physics.compiled:
                 self._worker.compile(parameters, steps)
                 return
-            for _ in range(2):  # the second time, environments have been restarted, which is traced apart
+            for _ in range(2):  # the second time, after a restart of environments, which is traced separately
                 self._worker.collect(parameters, steps)
                 self._worker.restart()
 
@@ -207,7 +207,7 @@ class _Actor:
         )
 
     def _refresh(self) -> bool:
-        """Takes the newest policy; whether there is one at all."""
+        """Fetches the newest policy; returns True if there is any."""
         message = self._link.weights(-1 if self._bundle is None else self._bundle.version)
         if message is not None:
             bundle = PolicyBundle.from_message(message, "of the learner")
@@ -216,7 +216,7 @@ class _Actor:
         return self._bundle is not None
 
     def _rollout(self, bundle: PolicyBundle, ticket: Ticket, since: "_Since") -> None:
-        """Makes a rollout under a ticket and hands it over, with metrics and logs."""
+        """Produces a rollout under a ticket and uploads it, with metrics and logs."""
         config, before = self._config, self._worker.state
         began = time.monotonic()
         self._configure(bundle.version)
@@ -262,7 +262,7 @@ class _Actor:
             self._renew_objects()
 
     def _sampled(self, bundle: PolicyBundle, arrays: dict[str, Array]) -> Message:
-        """A rollout's first environments, with what a reader needs to take the arrays apart."""
+        """Returns a rollout's first environments, with the metadata that a reader needs to parse the arrays."""
         meta = {
             "time": time.time(),
             "version": bundle.version,
@@ -276,7 +276,7 @@ class _Actor:
         return Message(first_environments(arrays, self._config.log_rollout_worlds or self._config.environments), meta)
 
     def _publish_episode(self, bundle: PolicyBundle, rollout: Rollout, episode: Followed) -> None:
-        """Environment 0's episode."""
+        """Publishes the episode of environment 0."""
         episodes = dict(zip(episode_fields(self._config.task), np.asarray(rollout.episodes)[0], strict=True))
         metrics = {name.removeprefix("episode/"): float(v) for name, v in episodes.items() if "episode/" in name}
         obj = self._objects[episode.object_index]
@@ -294,7 +294,7 @@ class _Actor:
 
     def _publish(self, kind: str, message: Message) -> None:
         """Publishes a message for logs under this actor's name."""
-        # JSON has no NaN: one such number would cost the whole message.
+        # JSON has no NaN: one such number would make the whole message invalid.
         message = Message(message.arrays, finite(message.meta))
         self._transport.publish(self._link.keys.log(kind, "actor", self._link.actor), message)
 
@@ -303,13 +303,13 @@ class _Since(NamedTuple):
     """Times of one rollout, on the monotonic clock."""
 
     asked: float
-    """The actor began to ask for a ticket."""
+    """Time at which the actor requested a ticket."""
     granted: float
-    """It had one, and goes on to take the newest weights."""
+    """Time at which it received one and continued with the newest weights."""
 
 
 def buffer_occupancy(occupancy: np.ndarray) -> dict[str, float]:
-    """Metrics of `Rollout.occupancy`: steps in which the engine had no room for contacts or rows, and the fullest."""
+    """Metrics of `Rollout.occupancy`: steps in which the engine exceeded its contacts or rows, and the fullest."""
     contacts, rows = occupancy.max(0)
     return {
         "overflow": float((occupancy > 1.0).any(-1).sum()),
@@ -319,6 +319,6 @@ def buffer_occupancy(occupancy: np.ndarray) -> dict[str, float]:
 
 
 def countable(episodes: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
-    """The episodes whose metrics (E,) are all finite numbers, and how many are not: the learner takes no others."""
+    """Returns the episodes with finite metrics (E,), and the number of others, which the learner would reject."""
     fine = np.isfinite(np.stack(list(episodes.values()))).all(0)
     return {name: values[fine] for name, values in episodes.items()}, int((~fine).sum())

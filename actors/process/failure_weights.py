@@ -1,13 +1,13 @@
-"""How often the objects of an actor are drawn, by how often its episodes fail with them."""
+"""Sampling weights of an actor's objects, from the failure rates of its episodes."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 _MEMORY = 50.0
-"""Episodes of each object, on average, after which an outcome counts e times less."""
+"""Average number of episodes of each object after which an outcome's weight decays by a factor e."""
 _PRIOR = 5.0
-"""Episodes that the rate of the larger group counts for, beside an object's or a family's own."""
+"""Number of episodes for which the rate of the larger group counts, in addition to those of the object or family."""
 _BOUND = 2.0
 """Largest factor on an object's weight, and the inverse of the smallest one."""
 
@@ -15,17 +15,18 @@ _BOUND = 2.0
 class FailureWeights:
     """Counts of the episodes of N objects, and the sampling weights that follow from them.
 
-    With n episodes of an object of which f failed, both forgotten exponentially, its failure rate is estimated as
-    p = (f + k p_family) / (n + k), k = 5, where the family's rate leans in the same way on that of all objects, m. The
-    weight is (p + m) / 2m, between a half and two: an object that fails as often as the others is drawn as before.
+    With n episodes of an object of which f failed, both forgotten exponentially, its failure rate is estimated as p =
+    (f + k p_family) / (n + k), k = 5, where the family's rate is regularised in the same way towards that of all
+    objects, m. The weight is (p + m) / 2m, between a half and two: an object that fails as often as the others keeps
+    its weight.
     """
 
     def __init__(self, weight: np.ndarray, families: Sequence[str]):
-        """Nothing has failed yet.
+        """Starts without episodes.
 
         Args:
-          weight: (N,) weights while every object fails alike.
-          families: of the N objects.
+          weight: (N,) weights while all objects have the same failure rate.
+          families: families of the N objects.
         """
         self._weight = np.asarray(weight, float)
         self._families, self._family = np.unique(np.asarray(families), return_inverse=True)
@@ -33,7 +34,7 @@ class FailureWeights:
         self._failures = np.zeros(len(self._weight))
 
     def add(self, objects: np.ndarray, success: np.ndarray) -> None:
-        """Counts E episodes with these objects (E,) int, and whether they succeeded (E,)."""
+        """Counts E episodes with these objects (E,) int, and their success (E,)."""
         kept = np.exp(-len(objects) / (_MEMORY * len(self._weight)))
         for total, outcome in ((self._episodes, np.ones(len(objects))), (self._failures, 1.0 - np.asarray(success))):
             total *= kept
@@ -50,12 +51,12 @@ class FailureWeights:
 
     @property
     def weights(self) -> np.ndarray:
-        """(N,) float32."""
+        """Weights (N,) float32."""
         return (self._weight * self._factors).astype(np.float32)
 
     @property
     def _factors(self) -> np.ndarray:
-        """(N,) factors on the weights."""
+        """Factors (N,) on the weights."""
         mean = self._rate
         if mean == 0.0:
             return np.ones(len(self._weight))
@@ -64,7 +65,7 @@ class FailureWeights:
 
     @property
     def _family_rates(self) -> np.ndarray:
-        """(families,) failure rates; zero before any episode."""
+        """Failure rates (families,); zero before any episode."""
         episodes, failures = (np.bincount(self._family, total) for total in (self._episodes, self._failures))
         return (failures + _PRIOR * self._rate) / (episodes + _PRIOR)
 

@@ -1,8 +1,8 @@
-"""The actor's end of the link: configuration, tickets, weights, and rollouts that arrive exactly once.
+"""Actor side of the link: configuration, tickets, weights, and exactly-once delivery of rollouts.
 
-A rollout gets its identity (actor, incarnation, sequence) when it is handed over, and is sent under that identity until
-the learner has answered it, across restarts of the learner (`uploads`). Sending happens in the background, so that the
-next rollout is made meanwhile; at most `window` rollouts are on their way, further ones wait in `upload`.
+`upload` assigns a rollout its identity (actor, incarnation, sequence), under which it is sent until the learner
+replies, across restarts of the learner (`uploads`). Sending happens in the background, while the next rollout is
+produced; at most `window` rollouts are in transit, further ones wait in `upload`.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ _POLL = 0.2
 
 
 class RunRestarted(CongraspError):
-    """The learner began another training: read the configuration anew and start over."""
+    """The learner started another training: read the configuration again and start over."""
 
 
 class RunFinished(CongraspError):
@@ -31,24 +31,24 @@ class RunFinished(CongraspError):
 
 
 class RunInfo(NamedTuple):
-    """What an actor must know of a run."""
+    """Properties of a run that an actor needs."""
 
     config: str
     """The run's configuration as JSON text."""
     run_id: str
     """Identifies the training."""
     schema: str
-    """Policy schema that rollouts must have."""
+    """Required policy schema of rollouts."""
     arrays: tuple[str, ...]
-    """Names of the arrays that rollouts must have (`common.wire.schema.RECORDABLE`)."""
+    """Names of the required arrays of rollouts (`common.wire.schema.RECORDABLE`)."""
 
 
 class Ticket(NamedTuple):
-    """Permission to make one rollout."""
+    """Permission to produce one rollout."""
 
     id: str
     version: int
-    """The learner's policy version when it was granted."""
+    """Policy version of the learner when it was granted."""
 
 
 class ActorLink:
@@ -86,7 +86,7 @@ class ActorLink:
         self._timeout = request_timeout
         self._patience = Patience(patience)  # which the thread that follows announcements reads often
         self._info: RunInfo | None = None
-        self._learner = (-1, "")  # version and session that the learner showed last
+        self._learner = (-1, "")  # version and session last reported by the learner
         self._held_session = ""
         self._finished = False
         self._answered = self._patience.now()
@@ -117,16 +117,16 @@ class ActorLink:
           TransportError: the learner did not answer within `timeout` seconds.
         """
         reply = self._ask(self.keys.config, {}, self._patience.now() + timeout)
-        config, run_id, schema = (str(reply.meta[name]) for name in ("config", "epoch", "schema"))
+        config, run_id, schema = (str(reply.meta[name]) for name in ("config", "run_id", "schema"))
         self._info = RunInfo(config, run_id, schema, tuple(reply.meta["arrays"]))
         self._note(reply.meta)
         self._uploads.start_over()
         return self._info
 
     def acquire_ticket(self, timeout: float) -> Ticket | None:
-        """Waits for permission to make a rollout; None if there is none within `timeout` seconds.
+        """Waits for permission to produce a rollout; returns None if there is none within `timeout` seconds.
 
-        A learner that is away counts as one that grants nothing.
+        An unreachable learner grants nothing.
 
         Raises:
           RunRestarted, RunFinished: see there.
@@ -160,9 +160,9 @@ class ActorLink:
             self._transport.query(self._ticket_key, request, timeout=self._timeout)
 
     def weights(self, newer_than: int) -> Message | None:
-        """The latest policy bundle, or None if it is the one that the caller has or the learner is away.
+        """Returns the latest policy bundle, or None if the caller has it already or the learner is unreachable.
 
-        Costs no request as long as the learner has shown no other version.
+        Sends no request unless the learner has announced another version.
 
         Args:
           newer_than: the version that the caller has; -1 for none.
@@ -174,7 +174,7 @@ class ActorLink:
         if newer_than >= 0 and (newer_than, self._held_session) == self._learner:
             return None
         session = self._learner[1]
-        request = Message(meta={"newer_than": newer_than, "life": self._held_session})
+        request = Message(meta={"newer_than": newer_than, "session_id": self._held_session})
         try:
             reply = self._transport.query(self._weights_key, request, timeout=self._timeout)
         except TransportError:
@@ -183,18 +183,18 @@ class ActorLink:
             self._note(reply.meta)
             self._check()
             return None
-        if self._info and reply.meta.get("epoch") != self._info.run_id:
-            self._uploads.failure = _restarted(self._info.run_id, reply.meta.get("epoch"))
+        if self._info and reply.meta.get("run_id") != self._info.run_id:
+            self._uploads.failure = _restarted(self._info.run_id, reply.meta.get("run_id"))
         self._check()
         self._held_session = session
         return reply
 
     def upload(self, rollout: Message, ticket: Ticket) -> "Future[Outcome]":
-        """Hands a rollout over, to be sent in the background; waits while `window` others are on their way.
+        """Queues a rollout for sending in the background; waits while `window` others are in transit.
 
         Args:
-          rollout: arrays and meta entries `version`, `schema` and `steps`; the link adds who made it.
-          ticket: what it was made under.
+          rollout: arrays and meta entries `version`, `schema` and `steps`; the link adds the identity.
+          ticket: ticket of the rollout.
 
         Returns:
           Its outcome, once the learner has answered.
@@ -213,7 +213,7 @@ class ActorLink:
             **rollout.meta,
             **self._identity(ticket.id),
             "sequence": next(self._sequence),
-            "epoch": self._info.run_id,
+            "run_id": self._info.run_id,
         }
         message = SharedMessage(rollout.arrays, meta)
         if self._journal is not None:
@@ -225,7 +225,7 @@ class ActorLink:
         return self._uploads.wait(timeout)
 
     def close(self) -> None:
-        """Stops sending; what has no outcome yet is given up. The transport stays open."""
+        """Stops sending; rollouts without an outcome are abandoned. The transport stays open."""
         self._uploads.close()
         self._announcements.close()
 
@@ -236,11 +236,11 @@ class ActorLink:
         self.close()
 
     def _identity(self, ticket: str) -> dict[str, Any]:
-        """Who asks, and by which ticket: meta entries of the actor's requests."""
+        """Identity and ticket, as metadata entries of the actor's requests."""
         return {"actor": self.actor, "incarnation": self.incarnation, "ticket": ticket}
 
     def _check(self) -> None:
-        """Raises what stops the link: a failure of the uploads, the end of the run, or its own closing."""
+        """Raises the error that stops the link: a failure of the uploads, the end of the run, or its closing."""
         if self._uploads.failure:
             raise self._uploads.failure
         if self._finished:
@@ -251,25 +251,25 @@ class ActorLink:
     def _note(self, meta: Any) -> None:
         """Takes in the learner's state, which comes with every answer and announcement."""
         self._answered = self._patience.now()
-        self._learner = int(meta["version"]), str(meta["life"])
+        self._learner = int(meta["version"]), str(meta["session_id"])
         self._finished = bool(meta["finished"])
-        if self._info and meta["epoch"] != self._info.run_id:
-            self._uploads.failure = _restarted(self._info.run_id, meta["epoch"])
+        if self._info and meta["run_id"] != self._info.run_id:
+            self._uploads.failure = _restarted(self._info.run_id, meta["run_id"])
 
     def _follow(self) -> None:
-        """Takes announcements in as they come, whatever the caller is doing meanwhile."""
+        """Receives announcements in the background."""
         while not self._closed.is_set():
             self._patience.now()
             received = self._announcements.receive(_POLL)
             if received is None:
                 self._closed.wait(0.01)  # a closed transport does not wait
                 continue
-            with contextlib.suppress(KeyError, TypeError, ValueError):  # from nobody who speaks this language
+            with contextlib.suppress(KeyError, TypeError, ValueError):  # invalid message
                 self._note(received[1].meta)
                 self._news.set()
 
     def _ask(self, key: str, meta: dict[str, Any], deadline: float) -> Message:
-        """Asks until there is an answer; a refusal is one."""
+        """Sends a request until there is a reply, which may be a refusal."""
         delays = backoff()
         while True:
             rest = max(0.05, deadline - self._patience.now())
@@ -289,5 +289,7 @@ class ActorLink:
 
 
 def _restarted(before: str, now: Any) -> RunRestarted:
-    """The error of a run id that is another than before."""
-    return RunRestarted(f"The learner began another training (run id {now} after {before}).", "The actor starts over.")
+    """Error for a changed run id."""
+    return RunRestarted(
+        f"The learner started another training (run id {now} after {before}).", "The actor starts over."
+    )

@@ -1,7 +1,8 @@
-"""The reference poses that an actor took from the policy's own grasps, kept in a file over restarts.
+"""Reference poses from the policy's grasps, stored in a file across restarts of the actor.
 
-`actors.harvest` fills them in over hundreds of updates. An actor that begins again without them asks for less: a run on
-one H200 that was resumed at update 993 fell from 68 to 60 % of reference poses held, and took 250 updates to come back.
+`actors.harvest` collects them over hundreds of updates. Without them, the goals of a restarted actor are less feasible:
+a run on one H200 that was resumed at update 993 fell from 68 to 60 % of reference poses held, and took 250 updates to
+recover.
 """
 
 import contextlib
@@ -20,12 +21,12 @@ from congrasp.common.wire.codec import Message, encode
 
 
 def references_file(run_dir: pathlib.Path, actor: str) -> pathlib.Path:
-    """Where a run directory keeps those of an actor of its own."""
+    """Path of an actor's references in a run directory."""
     return run_dir / "references" / f"{actor}.safetensors"
 
 
 def save_references(path: pathlib.Path, bank: ConstraintBank) -> None:
-    """Writes the bank's references; a disk that is full costs the next start its references and no more."""
+    """Writes the bank's references; a full disk is ignored, and the next start lacks them."""
     arrays = {name: np.asarray(getattr(bank, name)) for name in RENEWED}
     with contextlib.suppress(CongraspError, OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -33,7 +34,7 @@ def save_references(path: pathlib.Path, bank: ConstraintBank) -> None:
 
 
 def with_kept_references(path: pathlib.Path, bank: ConstraintBank) -> ConstraintBank:
-    """The bank with the references of a file; as it is if there is none, or one that is damaged or of other objects."""
+    """Returns the bank with the references of a file; unchanged if the file is missing, damaged or of other objects."""
     message = read_kept(path)
     if message is None or message.meta.get("objects") != _digest(bank) or message.arrays.keys() != set(RENEWED):
         return bank
@@ -43,7 +44,7 @@ def with_kept_references(path: pathlib.Path, bank: ConstraintBank) -> Constraint
 
 
 def _digest(bank: ConstraintBank) -> str:
-    """What names the objects of a bank, their resting poses and their places."""
+    """Digest of the objects of a bank, their resting poses and their order."""
     digest = hashlib.sha256()
     for array in (bank.points, bank.rest):
         digest.update(np.ascontiguousarray(array, np.float32).tobytes())

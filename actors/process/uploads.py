@@ -1,4 +1,4 @@
-"""Rollouts on their way to the learner: each is sent until it has an outcome, across restarts of the learner."""
+"""Rollouts in transit to the learner: each is sent until it has an outcome, across restarts of the learner."""
 
 import itertools
 import logging
@@ -16,7 +16,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.wire.codec import Message
 
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
-"""Outcome of a rollout; `duplicate` means that it had been accepted before, `stale` that it was too old."""
+"""Outcome of a rollout: `duplicate` if it had been accepted before, `stale` if it was too old."""
 _BACKOFF = (0.1, 0.5)  # first and longest delay between two attempts, s
 _SLOWEST = 100e3  # bytes a second of a link that is waited for
 _LONGEST_TICK = 1.0  # s
@@ -77,8 +77,8 @@ class Uploads:
     """Threads that send rollouts.
 
     Attributes:
-      failure: why nothing is sent any more, if that is so; also set by the owner.
-      free: acquired by the owner for each rollout that it hands over; released when that one has its outcome.
+      failure: the reason why sending has stopped, if it has; also set by the owner.
+      free: acquired by the owner for each queued rollout; released when that rollout has its outcome.
       closed: set once no more is sent.
     """
 
@@ -119,7 +119,7 @@ class Uploads:
             threading.Thread(target=self._send_all, daemon=True, name=f"upload-{index}").start()
 
     def put(self, message: Message) -> "Future[Outcome]":
-        """Sends a rollout in the background; returns its outcome to be."""
+        """Sends a rollout in the background; returns a future of its outcome."""
         outcome = Future[Outcome]()
         self._pending.add(outcome)
         outcome.add_done_callback(self._pending.discard)
@@ -127,7 +127,7 @@ class Uploads:
         return outcome
 
     def start_over(self) -> None:
-        """Forgets failure and refusals."""
+        """Clears failure and refusals."""
         self.failure, self._refusals = None, 0
 
     def wait(self, timeout: float) -> bool:
@@ -141,7 +141,7 @@ class Uploads:
         return True
 
     def close(self) -> None:
-        """Stops sending; what has no outcome yet is given up."""
+        """Stops sending; rollouts without an outcome are abandoned."""
         self.closed.set()
         self._queue.put(None)
 
@@ -154,8 +154,8 @@ class Uploads:
             except CongraspError as error:
                 self.failure = self.failure or error
                 outcome.set_exception(error)
-            except Exception as error:  # an answer that is none: the thread must not die in silence
-                self.failure = CongraspError(f"The learner's answer cannot be understood: {error!r}.")
+            except Exception as error:  # an invalid reply: the thread must not die silently
+                self.failure = CongraspError(f"The learner's reply is not valid: {error!r}.")
                 outcome.set_exception(self.failure)
             finally:
                 self.free.release()
@@ -187,7 +187,11 @@ class Uploads:
                 outcome = reply.meta["outcome"]
                 if outcome != "retry" and self._journal is not None:
                     who = {name: message.meta[name] for name in ("actor", "incarnation")}
-                    answer = {"answer": message.meta["sequence"], "outcome": outcome, "life": reply.meta["life"]}
+                    answer = {
+                        "answer": message.meta["sequence"],
+                        "outcome": outcome,
+                        "session_id": reply.meta["session_id"],
+                    }
                     self._journal.write(**who, **answer)
                 if outcome == "refused":
                     return self._refused(str(reply.meta["why"]))
@@ -200,12 +204,12 @@ class Uploads:
         raise TransportError("The link was closed before the rollout was acknowledged.")
 
     def _refused(self, why: str) -> Outcome:
-        """Counts a refusal; too many in a row are the failure of the uploads."""
+        """Counts a refusal; too many in a row make the uploads fail."""
         self._refusals += 1
         if self._refusals >= self._max_refusals:
             self.failure = CongraspError(
                 f"The learner refused {self._refusals} rollouts in a row: {why}",
-                "Start the actor with the version of congrasp that the learner has.",
+                "Start the actor with the learner's version of congrasp.",
             )
         return "refused"
 

@@ -1,4 +1,4 @@
-"""Hands by name: the one place that knows them all."""
+"""Registry of hands by name."""
 
 import functools
 import os
@@ -9,6 +9,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.allegro import ALLEGRO
 from congrasp.common.hands.files import MAX_BYTES, hand_from_text, read_hand
 from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.left import left_hand, right_name
 from congrasp.common.hands.mano import own_mano_hand
 from congrasp.common.hands.sharpa import SHARPA
 from congrasp.common.hands.spec import Hand
@@ -23,25 +24,25 @@ HANDS: dict[str, Callable[[], Hand]] = {
 """Makers of the hands; `mano` needs the user's own file."""
 SUFFIX = ".json"
 VARIABLE = "CONGRASP_HANDS"
-"""Environment variable with the folder of the user's own hands."""
+"""Environment variable with the folder of the user's custom hands."""
 
 
 def own_hands() -> dict[str, pathlib.Path]:
-    """Files of the user's own hands by name: those in `hands_folder`."""
+    """Returns the files of the user's custom hands by name: those in `hands_folder`."""
     return {path.stem: path for path in sorted(hands_folder().glob(f"*{SUFFIX}"))}
 
 
 def hands_folder() -> pathlib.Path:
-    """Where the user's own hands are: `CONGRASP_HANDS`, or congrasp/hands in the user's configuration."""
+    """Folder of the user's custom hands: `CONGRASP_HANDS`, or congrasp/hands in the user's configuration."""
     config = os.environ.get("XDG_CONFIG_HOME") or pathlib.Path.home() / ".config"
     return pathlib.Path(os.environ.get(VARIABLE) or pathlib.Path(config, "congrasp", "hands"))
 
 
 def check_reference(reference: object) -> str:
-    """Returns what a policy may call its hand: a name, or all of the hand's own text, but no path.
+    """Returns a policy's reference to its hand: a name or the hand's full text, but never a path.
 
     Raises:
-      CongraspError: it is neither.
+      CongraspError: `reference` is neither.
     """
     name = reference if isinstance(reference, str) and len(reference) <= MAX_BYTES else ""
     if (name.isidentifier() and len(name) <= LONGEST_NAME) or name.lstrip().startswith("{"):
@@ -50,15 +51,15 @@ def check_reference(reference: object) -> str:
 
 
 def known_hand(reference: object) -> Hand:
-    """The hand that a message or a recording names: one of the package, or one whose text it brings along.
+    """Returns the hand named by a message or a recording: one of the package, or one whose text is included.
 
-    What others send opens no file of this machine, so that they neither learn what is there nor make anything wait.
+    Input from others opens no file of this machine, so that a peer can neither probe for files nor make a reader wait.
 
     Raises:
-      CongraspError: it is neither, or the text is no hand.
+      CongraspError: it is neither, or the text does not describe a hand.
     """
     name = check_reference(reference)
-    if name in HANDS:
+    if right_name(name)[0] in HANDS:
         return get_hand(name)
     if name.isidentifier():
         raise _unknown(reference)
@@ -66,23 +67,26 @@ def known_hand(reference: object) -> Hand:
 
 
 def _unknown(reference: object) -> CongraspError:
-    """The error of a hand that a message cannot name."""
+    """Error for a hand that a message cannot name."""
     return CongraspError(
-        f"{ascii(reference)[:60]} is no hand that a message can name.", f"It is one of: {', '.join(sorted(HANDS))}."
+        f"{ascii(reference)[:60]} is not a hand that a message can name.", f"It is one of: {', '.join(sorted(HANDS))}."
     )
 
 
 @functools.lru_cache(maxsize=64)
 def get_hand(reference: str) -> Hand:
-    """A hand, the same object every time for the same words; `known_hand` is for words that come from others.
+    """Returns the hand of a reference, the same object for the same reference; see `known_hand` for untrusted input.
 
     Args:
-      reference: the name of a hand of the package or of one in `hands_folder`, the path of a hand file, or all of its
-        text (`Hand.reference`).
+      reference: the name of a hand of the package (`human:left` for its mirror image) or of one in `hands_folder`, the
+        path of a hand file, or all of its text (`Hand.reference`).
 
     Raises:
-      CongraspError: there is no such hand; those that exist are listed.
+      CongraspError: there is no such hand; the message lists the available ones.
     """
+    right, left = right_name(reference)
+    if left and right in HANDS:
+        return left_hand(get_hand(right))
     if reference in HANDS:
         return HANDS[reference]()
     if reference.lstrip().startswith("{"):

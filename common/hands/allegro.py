@@ -1,8 +1,8 @@
 """The right Allegro hand V3: four fingers of four joints each.
 
 Geometry, limits and masses are those of the maker's published models (BSD-2, SimLab 2016). Wrist frame: origin at the
-palm's mounting end, fingers towards +z, closing side +x, index finger on the side of +y. What collides are the makers'
-boxes, 20 x 27 mm across a phalanx, and their round fingertips; rewards and features go by capsules of 23 mm.
+palm's mounting end, fingers towards +z, closing side +x, index finger on the side of +y. Collision geometry: the
+maker's boxes, 20 x 27 mm across a phalanx, and round fingertips. Rewards and features use capsules of 23 mm.
 """
 
 import dataclasses
@@ -13,25 +13,25 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands.spec import Capsule, Hand, Joint, Link, Solid, Vector, chain, vector, wrist_gains
 
 _GAINS = {"kp": 3.0, "kv": 0.1, "torque_limit": 0.7, "armature": 1e-3}
-"""Of a proportional-derivative controller as it is common for this hand; the motors' greatest torque is 0.7 N.m."""
+"""Gains of a PD controller that is common for this hand; the motors' greatest torque is 0.7 N.m."""
 _LEAN = np.radians(5.0)
-"""Index and ring finger lean outwards by this."""
+"""Outward lean of the index and the ring finger."""
 _RADIUS, _TIP_RADIUS = 0.0115, 0.0120
 _KNUCKLE = np.array([0.0, 0.0, 0.095])
-"""Base of the middle finger, where the makers' models have the palm's origin."""
+"""Base of the middle finger, the palm's origin in the maker's models."""
 _LIMITS = ((-0.47, 0.47), (-0.196, 1.61), (-0.174, 1.709), (-0.227, 1.618))
 _THUMB_LIMITS = ((0.263, 1.396), (-0.105, 1.163), (-0.189, 1.644), (-0.162, 1.719))
 _LENGTHS = (0.0164, 0.0540, 0.0384, 0.0267)
-"""From joint to joint, and from the last one to the fingertip's centre, m."""
+"""Distances between joints, and from the last joint to the fingertip's centre, m."""
 _THICK, _WIDE = 0.0098, 0.01375
-"""Half of a phalanx's box, across the joint's axis and along it, m."""
+"""Half extents of a phalanx's box across the joint's axis and along it, m."""
 _BOXES, _THUMB_BOXES = (0.0164, 0.0540, 0.0384, 0.0160), (0.0177, 0.0514, 0.0314)
-"""Lengths of the boxes, m; the thumb's first link is a block of its own."""
+"""Lengths of the boxes, m; the thumb's first link is a separate block."""
 _NAMES = ("base", "proximal", "medial", "distal")
 
 
 def _finger(name: str, base: np.ndarray, lean: float) -> tuple[Link, ...]:
-    """A finger whose base is at `base` from the knuckle, turned outwards by `lean` about the palm's normal."""
+    """Links of a finger with its base at `base` from the knuckle, leaning out by `lean` about the palm's normal."""
     along = np.array([0.0, np.sin(lean), np.cos(lean)])
     flexion = np.array([0.0, np.cos(lean), -np.sin(lean)])
     points = [vector(_KNUCKLE + base + reach * along) for reach in np.cumsum([0.0, *_LENGTHS])]
@@ -47,8 +47,10 @@ def _boxed(
     lengths: tuple[float, ...],
     tip: tuple[float, float],
 ) -> tuple[Link, ...]:
-    """Links with the makers' boxes, from `points` on along the last of `axes` (3, 3), as columns; on the last link also
-    a capsule `tip` (m from its joint to its middle, half length)."""
+    """Links with the maker's boxes, from `points` along the last column of `axes` (3, 3).
+
+    The last link also gets a capsule `tip` (m from its joint to its middle, half length).
+    """
     quaternion, along = _quaternion(axes), axes[:, 2]
     found = []
     for link, point, length in zip(links, points, lengths, strict=False):
@@ -60,7 +62,7 @@ def _boxed(
 
 
 def _quaternion(axes: np.ndarray) -> tuple[float, float, float, float]:
-    """(w, x, y, z) of a frame with these axes as columns (3, 3)."""
+    """Quaternion (w, x, y, z) of a frame with these axes as columns (3, 3)."""
     w, x, y, z = Rotation.from_matrix(axes).as_quat(scalar_first=True).tolist()
     return w, x, y, z
 
@@ -98,7 +100,7 @@ def _thumb() -> tuple[Link, ...]:
         (0.0176, 0.0119, 0.0380, 0.0556),
         (1.0, 1.0, 2.0, 6.0),
     )
-    # The first link is a block beside its joint's axis.
+    # The first link is a block next to its joint's axis.
     middle = root - 0.0179 * up + 0.009 * forward + 0.0145 * out
     housing = Capsule(vector(middle - 0.008 * out), vector(middle + 0.008 * out), 0.0150)
     turn = np.stack([np.cross(forward, out), forward, out], -1)

@@ -1,8 +1,7 @@
-"""Closures: a one-parameter family of finger poses, from the widest over the open one to the fist.
+"""Closures: a one-parameter family of finger poses from the widest pose through the open one to the fist.
 
-A closure c in [-1, 1] is q_open + c (q_closed - q_open) where it is positive, and q_open - c (q_wide - q_open) where it
-is negative. The gap of a pose is the free space between the skins of the thumb's and the nearest other fingertip along
-the cross-finger axis.
+A closure c in [-1, 1] is q_open + c (q_closed - q_open) if c is positive, else q_open - c (q_wide - q_open). The gap of
+a pose is the free space between the skins of the thumb's and the nearest other fingertip along the cross-finger axis.
 """
 
 import concurrent.futures
@@ -20,32 +19,32 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.task.types import Array
 
 CLOSURES = np.round(np.arange(-1.0, 0.51, 0.1), 6)
-"""Closures at which gaps and outlines are tabulated: down to where fingers close on thin things."""
+"""Closures at which gaps and outlines are tabulated, down to thin objects."""
 MARGIN = 0.03
-"""Metres that the gap of a preshaped hand is wider than the object."""
+"""Metres by which the gap of a preshaped hand exceeds the object's width."""
 WIDEST = 0.14
-"""Gap in metres, for objects of the human hand's size, beyond which no hand has to open: 12 cm, the widest object that
-headings are made for, and a centimetre on either side."""
-_OFFSET, _TURN = 0.5, 2e-6  # weights of an offset (m^2) and of a motor's turn (rad^2), in the unit of the gap's (m^2)
+"""Gap in metres, for objects of the human hand's size, beyond which no hand needs to open: 12 cm, the widest object
+that gets headings, plus a centimetre on either side."""
+_OFFSET, _TURN = 0.5, 2e-6  # weights of an offset (m^2) and of a motor's rotation (rad^2), in the unit of the gap (m^2)
 
 
 def closure_pose(hand: Hand, closure: Array) -> Array:
-    """(..., F) finger angles at closures (..., 1), or (..., F) with one for each joint."""
+    """Finger angles (..., F) at closures (..., 1), or at (..., F) closures, one for each joint."""
     c = jnp.asarray(closure)
     q_wide, q_open, q_closed = (jnp.asarray(q) for q in (wide_angles(hand), hand.q_open, hand.q_closed))
     return q_open + jnp.maximum(c, 0.0) * (q_closed - q_open) + jnp.maximum(-c, 0.0) * (q_wide - q_open)
 
 
 def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
-    """(B, F) finger angles whose gap is `margin` wider than objects (B,), or as wide as the hand opens; m."""
+    """Finger angles (B, F) whose gap is `margin` wider than objects (B,), or as wide as the hand opens; m."""
     gaps = table_of_gaps(hand)
     return closure_pose(hand, jnp.interp(width + margin, gaps[::-1], CLOSURES[::-1])[..., None])
 
 
 @functools.cache
 def table_of_gaps(hand: Hand) -> np.ndarray:
-    """(S,) gaps in metres at `CLOSURES`, made to fall strictly where the hand's own do not."""
-    # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
+    """Gaps (S,) in metres at `CLOSURES`, made strictly decreasing where the hand's are not."""
+    # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
         q = thread.submit(lambda: closure_pose(hand, CLOSURES[:, None].astype(np.float32))).result()
         gaps = np.asarray(thread.submit(lambda: jnp.min(_gaps(hand, _tips(hand, q)), -1)).result(), np.float64)
@@ -54,7 +53,7 @@ def table_of_gaps(hand: Hand) -> np.ndarray:
 
 @functools.cache
 def wide_angles(hand: Hand) -> np.ndarray:
-    """(F,) finger angles of the hand's widest pose; searched for where the hand's data names none."""
+    """Finger angles (F,) of the hand's widest pose, computed if the hand's data has none."""
     if hand.wide_pose is not None:
         return hand.posed(hand.wide_pose)
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
@@ -62,7 +61,7 @@ def wide_angles(hand: Hand) -> np.ndarray:
 
 
 def widest_gap(hand: Hand) -> float:
-    """Metres between thumb and fingers of the hand's widest pose."""
+    """Gap in metres between thumb and fingers in the hand's widest pose."""
     return float(table_of_gaps(hand)[0])
 
 
@@ -70,15 +69,15 @@ def widest_pose(hand: Hand) -> dict[str, float]:
     """Finger angles of the pose nearest to the open one that has all gaps of `WIDEST`, or the most that limits allow.
 
     It faces the object as the open pose does: the fingertips keep their offsets from the thumb's along the heading axis
-    and along the axis orthogonal to it and the cross-finger axis. The motors minimise (L-BFGS-B, from the open pose)
-    the sum over the other fingers of missing gap and changed offsets, squared.
+    and along the axis orthogonal to it and the cross-finger axis. L-BFGS-B, started at the open pose, minimises over
+    the motors the squared missing gaps and changed offsets, summed over the other fingers.
     """
     lower, upper = motor_limits(hand)
     start = np.asarray(motor_positions(hand, hand.q_open), float)
     program = jax.jit(jax.value_and_grad(functools.partial(_cost, hand)))
 
     def cost(motors: np.ndarray) -> list[np.ndarray]:
-        # L-BFGS-B's own tolerances are made for costs around one.
+        # The default tolerances of L-BFGS-B assume costs around one.
         return [np.asarray(part, float) / _TURN for part in program(jnp.asarray(motors, jnp.float32))]
 
     found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=np.stack([lower, upper], -1)).x
@@ -88,7 +87,7 @@ def widest_pose(hand: Hand) -> dict[str, float]:
 
 
 def _cost(hand: Hand, motors: Array) -> Array:
-    """() m^2, what `widest_pose` minimises."""
+    """Cost () in m^2 that `widest_pose` minimises."""
     started = motor_positions(hand, jnp.asarray(hand.q_open))
     tips, open_tips = (_tips(hand, q) for q in (joint_positions(hand, motors), jnp.asarray(hand.q_open)))
     missing = jnp.maximum(WIDEST * hand.object_scale - _gaps(hand, tips), 0.0)
@@ -97,7 +96,7 @@ def _cost(hand: Hand, motors: Array) -> Array:
 
 
 def _tips(hand: Hand, q: Array) -> Array:
-    """(..., G, 3) fingertips, thumb first, along the grasp frame's axes v, w and v x w."""
+    """Fingertips (..., G, 3), thumb first, along the grasp frame's axes v, w and v x w."""
     frame = grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
     points = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
@@ -105,6 +104,6 @@ def _tips(hand: Hand, q: Array) -> Array:
 
 
 def _gaps(hand: Hand, tips: Array) -> Array:
-    """(..., G - 1) m between the skins of each other fingertip and the thumb's, along w."""
+    """Gaps (..., G - 1) in m along w between the skin of each other fingertip and the thumb's."""
     radii = hand.keypoint_radii[len(hand.links) :]
     return tips[..., 1:, 1] - tips[..., :1, 1] - radii[1:] - radii[0]

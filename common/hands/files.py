@@ -1,7 +1,7 @@
-"""A hand as one JSON file, with everything that `Hand` says: what `congrasp hands import` writes, and a user may edit.
+"""A hand as one JSON file with every field of `Hand`: written by `congrasp hands import`, editable by the user.
 
-Names of fields, units and frames are those of `common.hands.spec`. A file's text goes wherever its hand goes: into the
-configuration of a run, into policies and into recorded episodes.
+Names of fields, units and frames are those of `common.hands.spec`. The file's text is part of the run's configuration,
+of policies and of recorded episodes.
 """
 
 import dataclasses
@@ -21,19 +21,19 @@ from congrasp.common.io.inputs import LONGEST_NAME, read_file
 
 FORMAT = 1
 MAX_BYTES = 1 << 20
-"""Bytes that a hand file may have."""
-_LINKS, _JOINTS, _CAPSULES = 64, 64, 16  # most of a hand, of a hand, of a link
-_LARGEST = 1e5  # of any number; the wrist of a real hand of 7 kg has a gain of 13,000
+"""Largest size of a hand file in bytes."""
+_LINKS, _JOINTS, _CAPSULES = 64, 64, 16  # limits for a hand, a hand and a link
+_LARGEST = 1e5  # bound of all numbers; the wrist of a real hand of 7 kg has a gain of 13,000
 _REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-hand.md."
 _ROUNDING = 1e-5  # rad, of single precision
 _TAKEN = {"hand_base", "table", "anchor", "object", "hold", "world"}
 _WRIST = {"wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz"}
 TAKEN_JOINTS = _WRIST | {"object", "hold"}
-"""Names that no joint and no tendon may have: the scene has joints, actuators and equalities of these names."""
+"""Names reserved for joints, actuators and equalities of the scene: no joint or tendon may have them."""
 
 
 def hand_text(hand: Hand) -> str:
-    """Returns the hand's file; `wide_pose` and the links' `solids` have no key where the hand has none."""
+    """Returns the text of the hand's file; `wide_pose` and `solids` of links have no key if the hand has none."""
     fields = dataclasses.asdict(hand)
     del fields["text"]
     if hand.wide_pose is None:
@@ -45,25 +45,25 @@ def hand_text(hand: Hand) -> str:
 
 
 def hand_from_text(text: str, source: str = "the hand file") -> Hand:
-    """The hand that a file describes; the same text is the same object.
+    """Returns the hand described by a file's text; the same text gives the same object.
 
     Args:
-      text: the file's content.
-      source: how errors call it.
+      text: content of the file.
+      source: name of the file in errors.
 
     Raises:
-      CongraspError: it is not JSON, a field is missing or has the wrong type, or the hand cannot be as it says.
+      CongraspError: it is not JSON, a field is missing or has the wrong type, or the hand is not valid.
     """
     try:
         fields = json.loads(text) if len(text) <= MAX_BYTES else None
     except (ValueError, RecursionError):
         fields = None
     if not isinstance(fields, dict):
-        raise CongraspError(f"{source} is not JSON, or has more than {MAX_BYTES} characters.", _REMEDY)
+        raise CongraspError(f"{source} is not JSON, or is longer than {MAX_BYTES} characters.", _REMEDY)
     found = fields.pop("format", None)
     if found != FORMAT:
         raise CongraspError(f"{source} has the format {found!r:.20}, not {FORMAT}.", _REMEDY)
-    # Without spaces: the text is sent with every episode.
+    # Without spaces, since the text is sent with every episode.
     hand, wrong = _described(json.dumps({"format": FORMAT, **fields}, separators=(",", ":")))
     if hand is None or wrong:
         raise CongraspError(f"{source}: {wrong}.", _REMEDY)
@@ -72,18 +72,18 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
 
 @functools.lru_cache(maxsize=16)
 def _described(text: str) -> tuple[Hand | None, str]:
-    """The hand of a file's text, or what is wrong with it."""
+    """Parses a hand file's text; returns the hand, or None and the fault."""
     fields = json.loads(text)
     del fields["format"]
     try:
         hand = dacite.from_dict(Hand, {**fields, "text": text}, dacite.Config(strict=True, cast=[tuple, float]))
     except (dacite.DaciteError, TypeError, ValueError, OverflowError) as error:
-        return None, f"no hand, {str(error)[:200]}"
+        return None, f"not a hand, {str(error)[:200]}"
     return hand, next(iter(faults(hand)), "")
 
 
 def read_hand(path: pathlib.Path) -> Hand:
-    """The hand of a file; see `hand_from_text`."""
+    """Reads a hand file; see `hand_from_text`."""
     try:
         return hand_from_text(read_file(path, MAX_BYTES, _REMEDY).decode(), str(path))
     except OSError as error:
@@ -93,16 +93,16 @@ def read_hand(path: pathlib.Path) -> Hand:
 
 
 def faults(hand: Hand) -> list[str]:
-    """What is wrong with a hand, one phrase for each fault."""
+    """Returns the faults of a hand, one phrase each."""
     if too_much := _out_of_bounds(hand):
         return [too_much]
     found: list[str] = []
     names = [link.name for link in hand.links]
     joints = [joint.name for joint in hand.joints]
     if not hand.name.isidentifier() or len(hand.name) > LONGEST_NAME:
-        found.append(f"the name '{hand.name}' is more than letters, digits and underscores")
+        found.append(f"the name '{hand.name}' has characters other than letters, digits and underscores")
     for name in sorted({name for name in names + joints if (names + joints).count(name) > 1 or not name}):
-        found.append(f"the name '{name}' is there more than once, or empty")
+        found.append(f"the name '{name}' occurs more than once or is empty")
     found += [f"the name '{name}' is taken" for name in sorted((_TAKEN & {*names}) | (TAKEN_JOINTS & {*joints}))]
     if not hand.links or hand.links[0].joints or hand.links[0].parent:
         return [*found, "the first link must be the palm, without a parent and without joints"]
@@ -110,15 +110,15 @@ def faults(hand: Hand) -> list[str]:
         return [*found, "it has no joints"]
     for i, link in enumerate(hand.links):
         if i and link.parent not in names[:i]:
-            found.append(f"the parent '{link.parent}' of '{link.name}' does not come before it")
+            found.append(f"the parent '{link.parent}' of '{link.name}' must precede it")
         if i and not link.joints:
             found.append(f"the link '{link.name}' has no joint: make it part of its parent")
         if not link.capsules or any(capsule.radius <= 0 for capsule in link.capsules):
-            found.append(f"the link '{link.name}' needs capsules, of radii above zero")
+            found.append(f"the link '{link.name}' needs capsules with radii above zero")
         if any(min(_sizes(solid)) <= 0 for solid in link.solids):
-            found.append(f"the link '{link.name}' has a solid of no size")
+            found.append(f"the link '{link.name}' has a solid without a size")
         if any(abs(float(np.linalg.norm(solid.quaternion)) - 1) > 1e-3 for solid in link.solids):
-            found.append(f"the link '{link.name}' has a solid whose quaternion is not of length one")
+            found.append(f"the link '{link.name}' has a solid whose quaternion is not normalised")
         if not link.mass > 0 or link.contact_weight < 0:
             found.append(f"the link '{link.name}' needs a mass above zero and a contact weight of at least zero")
     for joint in hand.joints:
@@ -134,10 +134,10 @@ def faults(hand: Hand) -> list[str]:
         if min(motor.kp, motor.torque_limit) <= 0 or motor.kv < 0:
             found.append(f"gains and torque limit of '{motor.name}' must be above zero")
     for pose, named, q in (("open", hand.open_pose, hand.q_open), ("closed", hand.closed_pose, hand.q_closed)):
-        found += [f"the {pose} pose names '{name}', which is no joint" for name in sorted({*named} - {*joints})]
+        found += [f"the {pose} pose names '{name}', which is not a joint" for name in sorted({*named} - {*joints})]
         for joint, angle in zip(hand.joints, q, strict=True):
             if not joint.lower - _ROUNDING <= angle <= joint.upper + _ROUNDING:
-                found.append(f"'{joint.name}' is outside of its limits in the {pose} pose")
+                found.append(f"'{joint.name}' is outside its limits in the {pose} pose")
     tips = [link.name for link in hand.links if link.tip is not None]
     if hand.thumb not in tips or len(tips) < 2:
         found.append("the thumb must be a link with a tip, and at least one other link needs one")
@@ -149,7 +149,7 @@ def faults(hand: Hand) -> list[str]:
 
 
 def _coupling_faults(hand: Hand) -> list[str]:
-    """What is wrong with couplings and tendons."""
+    """Returns the faults of couplings and tendons."""
     joints = [joint.name for joint in hand.joints]
     followers = [coupling.joint for coupling in hand.couplings]
     pulled = [name for tendon in hand.tendons for name in tendon.joints]
@@ -157,21 +157,24 @@ def _coupling_faults(hand: Hand) -> list[str]:
     found = []
     for x in hand.couplings:
         if x.joint not in joints or x.leader not in joints or x.leader in followers or followers.count(x.joint) > 1:
-            found.append(f"'{x.joint}' cannot follow '{x.leader}': one is no joint, or follows another")
+            found.append(f"'{x.joint}' cannot follow '{x.leader}': one is not a joint, or follows another")
         if not x.ratio:
             found.append(f"'{x.joint}' follows '{x.leader}' with the ratio zero")
     for tendon in hand.tendons:
         odd = [name for name in tendon.joints if name not in joints or name in followers or pulled.count(name) > 1]
         if odd:
-            found.append(f"the tendon '{tendon.name}' pulls '{odd[0]}', which is no joint, follows another, or has two")
+            found.append(
+                f"the tendon '{tendon.name}' pulls '{odd[0]}', which is not a joint, follows another, or has two "
+                "tendons"
+            )
         if len(tendon.joints) < 2 or not all(tendon.joints.values()):
-            found.append(f"the tendon '{tendon.name}' needs two joints at least, and coefficients that are not zero")
+            found.append(f"the tendon '{tendon.name}' needs at least two joints and nonzero coefficients")
         if tendon.name in TAKEN_JOINTS | {*joints} or tendons.count(tendon.name) > 1 or not tendon.name:
             found.append(f"the name '{tendon.name}' of a tendon is taken, or empty")
     if not found:
         lower, upper = motor_limits(hand)
         found += [
-            f"the limits of the joints that '{motor.name}' moves leave it no way"
+            f"the limits of the joints that '{motor.name}' moves leave it no range"
             for motor, low, high in zip(hand.motors, lower, upper, strict=True)
             if not low < high
         ]
@@ -179,7 +182,7 @@ def _coupling_faults(hand: Hand) -> list[str]:
 
 
 def _out_of_bounds(hand: Hand) -> str:
-    """Why a hand is no hand at all, whatever else it says: numbers that are not finite, too many parts; or nothing."""
+    """Returns why a hand is not valid at all (numbers that are not finite, too many parts), or an empty string."""
     if len(hand.links) > _LINKS or len(hand.joints) > _JOINTS:
         return f"it has more than {_LINKS} links or {_JOINTS} joints"
     if max(len(hand.couplings), *(len(tendon.joints) for tendon in hand.tendons), len(hand.tendons)) > _JOINTS:
@@ -195,12 +198,12 @@ def _out_of_bounds(hand: Hand) -> str:
 
 
 def _sizes(solid: Solid) -> tuple[float, ...]:
-    """The numbers of its size that count."""
+    """Returns the entries of a solid's size that its shape uses."""
     return solid.size[:2] if solid.kind in ("cylinder", "capsule") else solid.size
 
 
 def _numbers(value: Any) -> Iterator[float]:
-    """The numbers in fields, at any depth."""
+    """Yields the numbers in fields, at any depth."""
     if isinstance(value, (int, float)):
         yield value
     elif isinstance(value, (dict, list, tuple)):

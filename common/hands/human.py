@@ -16,7 +16,7 @@ _DIP = (-0.09, 1.571)
 
 
 def _joint(name: str, anchor: Vector, axis: Vector, limits: tuple[float, float]) -> Joint:
-    """A joint from its anatomical limits in degrees."""
+    """Returns a joint from its anatomical limits in degrees."""
     norm = sum(x * x for x in axis) ** 0.5
     unit = (axis[0] / norm, axis[1] / norm, axis[2] / norm)
     return Joint(name, unit, anchor, *limits, **FINGER_GAINS)
@@ -30,7 +30,7 @@ def _finger(
     radii: tuple[float, float, float],
     masses: tuple[float, float, float],
 ) -> tuple[Link, ...]:
-    """Three phalanges; `axes` are MCP flexion, MCP abduction, PIP and DIP."""
+    """Returns the links of three phalanges; `axes` are MCP flexion, MCP abduction, PIP and DIP."""
     mcp, pip, dip = anchors
     return chain(
         [f"{name}_proximal", f"{name}_middle", f"{name}_distal"],

@@ -22,11 +22,11 @@ class _Chain(NamedTuple):
 
     levels: tuple[tuple[int, ...], ...]
     parents: tuple[int, ...]
-    link_joint: tuple[int, ...]  # the last joint that moves each link, -1 for the palm
+    link_joint: tuple[int, ...]  # last joint that moves each link, -1 for the palm
 
 
 class GraspFrame(NamedTuple):
-    """The hand's local grasping coordinates in the wrist frame, from the open pose (paper, section Hand Modeling)."""
+    """Local grasp coordinates of the hand in the wrist frame, from the open pose (paper, section Hand Modeling)."""
 
     heading: np.ndarray
     """(3,) v, unit: forward from the middle of the opening, orthogonal to w."""
@@ -40,7 +40,7 @@ class GraspFrame(NamedTuple):
 
 @functools.cache
 def _chain(hand: Hand) -> _Chain:
-    """The hand's joints by depth."""
+    """Returns the hand's joints by depth."""
     index = {link.name: i for i, link in enumerate(hand.links)}
     parents: list[int] = []
     last: list[int] = []
@@ -57,7 +57,7 @@ def _chain(hand: Hand) -> _Chain:
 
 
 def link_transforms(hand: Hand, q: Array) -> tuple[Array, Array]:
-    """Motion of every link from the zero pose: x = rotation @ x0 + translation, for points x0 at zero.
+    """Motion of every link from the zero pose: x = rotation @ x0 + translation for points x0 of the zero pose.
 
     Args:
       hand: the hand.
@@ -89,7 +89,7 @@ def link_transforms(hand: Hand, q: Array) -> tuple[Array, Array]:
 
 
 def keypoints(hand: Hand, transforms: tuple[Array, Array]) -> Array:
-    """(..., P, 3) link origins and fingertips, from `link_transforms`."""
+    """Link origins and fingertips (..., P, 3), from `link_transforms`."""
     rotation, translation = transforms
     carrier = hand.keypoint_links
     points = rotations.apply(rotation[..., carrier, :, :], jnp.array(hand.keypoints)[:, None])[..., 0, :]
@@ -97,7 +97,7 @@ def keypoints(hand: Hand, transforms: tuple[Array, Array]) -> Array:
 
 
 def capsules(hand: Hand, transforms: tuple[Array, Array]) -> Array:
-    """(..., C, 2, 3) where the hand's capsules start and end, from `link_transforms`; see `Hand.capsule_radii`."""
+    """End points (..., C, 2, 3) of the hand's capsules, from `link_transforms`; see `Hand.capsule_radii`."""
     rotation, translation = transforms
     ends = jnp.asarray(hand.capsules)
     turned = rotations.apply(rotation[..., hand.capsule_links, :, :], ends)
@@ -115,7 +115,7 @@ def link_poses(hand: Hand, q: Array) -> tuple[Array, Array]:
 
 
 def hand_center(hand: Hand, points: Array) -> Array:
-    """(..., 3) the dynamic hand centre: middle between the thumb's tip and the mean of the other tips.
+    """Dynamic hand centre (..., 3): midpoint of the thumb's tip and the mean of the other tips.
 
     Args:
       hand: the hand.
@@ -127,14 +127,14 @@ def hand_center(hand: Hand, points: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _points(hand: Hand, q: Array) -> Array:
-    """(P, 3) `keypoints` of finger angles (F,), in one program rather than a hundred."""
+    """`keypoints` (P, 3) of finger angles (F,), compiled as one program."""
     return keypoints(hand, link_transforms(hand, q))
 
 
 @functools.cache
 def grasp_frame(hand: Hand) -> GraspFrame:
     """The grasp frame of the open hand; v is the direction from the wrist to the centre, made orthogonal to w."""
-    # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
+    # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
         points = thread.submit(lambda: np.asarray(_points(hand, np.array(hand.q_open, np.float32)))).result()
     tips = points[len(hand.links) :]

@@ -1,7 +1,7 @@
-"""The MANO right hand: 20 anatomical joints on the skeleton of the user's own `MANO_RIGHT.pkl`.
+"""The MANO right hand: 20 anatomical joints on the skeleton of the user's copy of `MANO_RIGHT.pkl`.
 
-MANO may not be passed on, so that nothing of it is part of this package, and this hand always needs the file (from
-mano.is.tue.mpg.de, after registration). Wrist frame: MANO's own, with the wrist joint as origin; fingers towards -x,
+MANO may not be redistributed, so no part of it is in this package: this hand always needs the file (from
+mano.is.tue.mpg.de, after registration). Wrist frame: that of MANO, with the wrist joint as origin; fingers towards -x,
 back of the hand +y, thumb side +z.
 """
 
@@ -19,7 +19,7 @@ from congrasp.common.io.pickles import read_pickle
 VARIABLE = "CONGRASP_MANO"
 """Environment variable with the path of the user's file."""
 MANO_FINGERS = ("index", "middle", "little", "ring", "thumb")
-"""Order of the fingers in MANO's arrays; each has three joints, from the palm to the tip."""
+"""Order of the fingers in MANO's arrays; each has three joints from the palm to the tip."""
 TIP_VERTICES = {"thumb": 745, "index": 317, "middle": 444, "ring": 556, "little": 673}
 """Vertices of the right hand at the fingertips."""
 _SHAPES = {
@@ -51,10 +51,10 @@ _THUMB_LIMITS = {"cmc_abduction": (-15, 50), "cmc_flexion": (-20, 50), "mp_flexi
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ManoModel:
-    """What of a MANO file is used; lengths in m, in MANO's frame."""
+    """Arrays used from a MANO file; lengths in m, in MANO's frame."""
 
     vertices: np.ndarray
-    """(778, 3) of the mean shape."""
+    """(778, 3) of the mean shape, m."""
     shape_directions: np.ndarray
     """(778, 3, 10) change of the vertices with each shape parameter."""
     regressor: np.ndarray
@@ -62,13 +62,13 @@ class ManoModel:
     hand_mean: np.ndarray
     """(45,) mean axis-angles of the finger joints, in the order of `MANO_FINGERS`."""
     components: np.ndarray
-    """(45, 45) principal components of the finger joints' axis-angles, one a row."""
+    """(45, 45) principal components of the finger joints' axis-angles, one per row."""
 
     def skeleton(self, betas: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Joints (16, 3), the wrist and then three for each of `MANO_FINGERS`, and the five fingertips (5, 3).
+        """Returns joints (16, 3), the wrist and then three for each of `MANO_FINGERS`, and the five fingertips (5, 3).
 
         Args:
-          betas: (up to 10,) shape parameters; the mean shape without.
+          betas: (up to 10,) shape parameters; None is the mean shape.
         """
         vertices = self.vertices
         if betas is not None:
@@ -77,10 +77,10 @@ class ManoModel:
 
 
 def read_mano(path: pathlib.Path) -> ManoModel:
-    """A MANO file.
+    """Reads a MANO file.
 
     Raises:
-      CongraspError: it is not there, no MANO file, or that of a left hand.
+      CongraspError: the file is missing, is not a MANO file, or is that of a left hand.
     """
     content = read_pickle(path)
     arrays = []
@@ -97,14 +97,14 @@ def read_mano(path: pathlib.Path) -> ManoModel:
 
 
 def mano_axes(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
-    """(15, 3, 3) anatomical axes of the finger joints at zero: rows are twist, spread and bend, unit and orthogonal.
+    """Anatomical axes (15, 3, 3) of the finger joints at zero: rows are twist, spread and bend, unit and orthogonal.
 
-    The twist points from the child to the joint, along the bone that the joint moves; the bend is orthogonal to it and
+    The twist points from the child to the joint, along the bone that the joint moves. The bend is orthogonal to it and
     to the back of the hand, and flexes with positive angles; positive spread is towards the thumb.
 
     Args:
       joints: (16, 3) from `ManoModel.skeleton`.
-      tips: (5, 3) from there, too.
+      tips: (5, 3) from `ManoModel.skeleton`.
     """
     fingers = joints[1:].reshape(5, 3, 3)
     child = np.concatenate([fingers[:, 1:], tips[:, None]], 1)
@@ -115,7 +115,7 @@ def mano_axes(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
 
 
 def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
-    """The hand of a MANO model, of its mean shape or of one with shape parameters (up to 10,)."""
+    """Returns the hand of a MANO model, of its mean shape or with shape parameters (up to 10,)."""
     joints, tips = model.skeleton(betas)
     axes = mano_axes(joints, tips).reshape(5, 3, 3, 3)
     anchors, ends = (joints[1:] - joints[0]).reshape(5, 3, 3), tips - joints[0]
@@ -124,7 +124,7 @@ def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
     for finger in ("thumb", "index", "middle", "ring", "little"):
         i = MANO_FINGERS.index(finger)
         radii = _RADII[finger]
-        # Skin ends at the fingertip, a capsule's axis one radius before it.
+        # The skin ends at the fingertip, a capsule's axis one radius before it.
         end = ends[i] - radii[2] * _unit(ends[i] - anchors[i, 2])
         points = [vector(point) for point in (*anchors[i], end)]
         limits = _THUMB_LIMITS if finger == "thumb" else _LIMITS
@@ -160,7 +160,7 @@ def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
 
 
 def own_mano_model(path: pathlib.Path | None = None) -> ManoModel | None:
-    """The user's MANO file at `path`, or else where the environment variable `CONGRASP_MANO` says; None without either.
+    """Returns the user's MANO model from `path` or the environment variable `CONGRASP_MANO`; None if neither is set.
 
     Raises:
       CongraspError: see `read_mano`.
@@ -170,25 +170,25 @@ def own_mano_model(path: pathlib.Path | None = None) -> ManoModel | None:
 
 
 def own_mano_hand() -> Hand:
-    """The hand of the user's file, which the environment variable `CONGRASP_MANO` names.
+    """Returns the hand of the user's MANO file, named by the environment variable `CONGRASP_MANO`.
 
     Raises:
-      CongraspError: it names none, or see `read_mano`.
+      CongraspError: the variable is not set; or see `read_mano`.
     """
     model = own_mano_model()
     if model is None:
         raise CongraspError(
-            "The hand 'mano' needs your own MANO_RIGHT.pkl, which may not come with this package.",
+            "The hand 'mano' needs your copy of MANO_RIGHT.pkl, which this package may not contain.",
             f"Get it from mano.is.tue.mpg.de and set {VARIABLE}=/path/to/MANO_RIGHT.pkl.",
         )
     return mano_hand(model)
 
 
 def _each(**angles: float) -> dict[str, float]:
-    """Angles of the same joints of the four fingers."""
+    """Returns the same angles for the joints of the four fingers."""
     return {f"{finger}_{name}": x for finger in ("index", "middle", "ring", "little") for name, x in angles.items()}
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) of length one."""
+    """Vectors (..., 3) normalised to length one."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -1,7 +1,6 @@
-"""What a hand looks like in its file: a mesh for each link, kept beside the hand's file.
+"""Visual meshes of a hand: one for each link, stored next to the hand's file.
 
-Physics and policies know the capsules alone. The meshes are what pictures and exports show, and what is measured
-against the object beside the capsules.
+Physics and policies use the capsules only. The meshes are for pictures, exports and measurements of penetration.
 """
 
 import pathlib
@@ -15,28 +14,28 @@ from congrasp.common.io.npz import read_npz
 
 SUFFIX = ".visual.npz"
 MAX_FACES = 3000
-"""Triangles of a link; finer meshes are simplified."""
+"""Most triangles of a link; finer meshes are simplified."""
 MAX_BYTES = 16 << 20
-"""Bytes of all meshes."""
+"""Largest total size of all meshes in bytes."""
 MAX_DISTANCE = 2.0
-"""Metres that each coordinate of a mesh may be from the wrist's origin: farther is a file in another unit."""
+"""Greatest distance of a mesh's coordinates from the wrist's origin, m; a larger one means a file in another unit."""
 PARTS = ("vertices", "faces")
-_REMEDY = "Make it anew with 'congrasp hands import', or delete it."
+_REMEDY = "Run 'congrasp hands import' again, or delete the file."
 
 Meshes = dict[str, tuple[np.ndarray, np.ndarray]]
-"""Vertices (V, 3) m, wrist frame at zero, and triangles (E, 3) by the names of links."""
+"""Vertices (V, 3) m, wrist frame at zero, and triangles (E, 3), by link name."""
 
 
 def beside(path: pathlib.Path) -> pathlib.Path:
-    """Where the meshes of a hand file are."""
+    """Returns the path of the meshes of a hand file."""
     return path.with_suffix(SUFFIX)
 
 
 def load_meshes(path: pathlib.Path, hand: Hand) -> Meshes:
-    """The meshes beside a hand file; none where there is no such file.
+    """Loads the meshes of a hand file; returns none if there is no such file.
 
     Raises:
-      CongraspError: it is damaged, not of this hand's links, or larger than a hand.
+      CongraspError: the file is damaged, has links that the hand lacks, or is too large for a hand.
     """
     file = beside(path)
     if not file.is_file():
@@ -51,17 +50,19 @@ def load_meshes(path: pathlib.Path, hand: Hand) -> Meshes:
             raise CongraspError(f"{file} holds no mesh of '{name[:60]}'.", _REMEDY)
         if (farthest := np.abs(vertices).max()) > MAX_DISTANCE:
             raise CongraspError(
-                f"{file} has '{name[:60]}' {farthest:.3g} m from the wrist; {MAX_DISTANCE:g} m is the most.",
-                f"Is it in another unit? {_REMEDY}",
+                f"{file} has '{name[:60]}' {farthest:.3g} m from the wrist, more than {MAX_DISTANCE:g} m.",
+                f"Check the file's unit. {_REMEDY}",
             )
         found[name] = vertices, faces
     if odd := sorted({*found} - {link.name for link in hand.links}):
-        raise CongraspError(f"{file} is not of the hand '{hand.name}', which has no link '{odd[0][:60]}'.", _REMEDY)
+        raise CongraspError(
+            f"{file} does not belong to the hand '{hand.name}', which has no link '{odd[0][:60]}'.", _REMEDY
+        )
     return found
 
 
 def own_meshes(hand: Hand) -> Meshes:
-    """The meshes of one of the user's own hands; none of any other, nor of one that has changed since its import.
+    """Loads the meshes of a custom hand; returns none for any other hand, and for one changed since its import.
 
     Raises:
       CongraspError: see `load_meshes`.
@@ -71,6 +72,6 @@ def own_meshes(hand: Hand) -> Meshes:
         return {}
     try:
         mine = get_hand(hand.name)
-    except CongraspError:  # it is another hand of this name, and its file cannot be read
+    except CongraspError:  # a different hand of this name whose file cannot be read
         return {}
     return load_meshes(file, hand) if mine.text == hand.text else {}

@@ -1,4 +1,4 @@
-"""A hand as MuJoCo bodies: virtual wrist, links with capsules or solids of their own, and position actuators."""
+"""A hand as MuJoCo bodies: virtual wrist, links with capsules or solids, and position actuators."""
 
 import functools
 from typing import Any
@@ -12,8 +12,8 @@ from congrasp.common.objects.mjcf import GEOM_TYPES
 from congrasp.common.objects.spec import Piece
 
 HAND_CONTYPE = 1
-"""Collision bit of the hand: whatever collides with it has this bit in its conaffinity."""
-_COUPLING_TIME = 0.005  # s, within which a joint is again where its leader puts it
+"""Collision bit of the hand: geoms that collide with it have this bit in their conaffinity."""
+_COUPLING_TIME = 0.005  # time constant of joint couplings, s
 WRIST_JOINTS = ("wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz")
 
 
@@ -31,9 +31,9 @@ def add_hand(
     initial wrist pose, so that all six start at zero. Actuators are in the order of (u, q). Gravity on the hand is
     compensated, because the wrist is a virtual mount.
 
-    With `self_collision` links collide with one another, without friction, except neighbours and `overlapping` pairs.
-    All contacts of the hand have the time constant `contact_time` in seconds, whatever they are with. Those of
-    fingertips resist turning about their normal by `torsional_friction` metres times the normal force.
+    With `self_collision`, links collide without friction, except neighbours and `overlapping` pairs. All contacts of
+    the hand have the time constant `contact_time` in seconds. Contacts of fingertips have the torsional friction
+    `torsional_friction` in metres.
     """
     base = spec.worldbody.add_body(name="hand_base")
     bodies: dict[str, mujoco.MjsBody] = {}
@@ -68,9 +68,9 @@ def add_hand(
 
 @functools.cache
 def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
-    """Pairs of links whose shapes overlap while the hand is open or at zero, so that contact means nothing there.
+    """Pairs of links whose shapes overlap in the open pose or at zero; their contacts are excluded.
 
-    They stand for housings that nest in one another at the knuckles. What touches only in a fist is not here.
+    They represent housings that nest at the knuckles. Pairs that touch only in a fist are not included.
     """
     spec = mujoco.MjSpec()
     bodies: dict[str, mujoco.MjsBody] = {}
@@ -115,7 +115,7 @@ def _add_wrist(spec: mujoco.MjSpec, body: mujoco.MjsBody, hand: Hand) -> None:
 
 
 def _add_transmission(spec: mujoco.MjSpec, hand: Hand) -> None:
-    """Adds the motors, tendons for those that pull several joints, and what couples joints to others."""
+    """Adds motors, tendons that pull several joints, and couplings of joints."""
     for motor in hand.motors:
         alone = motor.joints == {motor.name: 1.0}
         if not alone:
@@ -140,7 +140,7 @@ def _add_transmission(spec: mujoco.MjSpec, hand: Hand) -> None:
 def _add_position_actuator(
     spec: mujoco.MjSpec, name: str, kind: mujoco.mjtTrn, kp: float, kv: float, limit: float
 ) -> None:
-    """Adds a position servo of the joint or tendon of its name, which stops at `limit`."""
+    """Adds a position servo for the joint or tendon of this name, with this force limit."""
     actuator = spec.add_actuator(
         name=name,
         target=name,
@@ -154,7 +154,7 @@ def _add_position_actuator(
 def _add_shapes(
     body: mujoco.MjsBody, link: Link, origin: np.ndarray, self_collision: bool, contact_time: float, torsion: float
 ) -> None:
-    """Adds a link's solids, or the capsules of one without; they share its mass by their volumes."""
+    """Adds a link's solids, or its capsules if it has none; they share its mass by volume."""
     found = [_solid(solid, origin) for solid in link.solids] or [_capsule(x, origin) for x in link.capsules]
     volumes = np.array([volume for _, volume in found])
     for i, ((fields, _), share) in enumerate(zip(found, volumes / volumes.sum(), strict=True)):
@@ -164,15 +164,15 @@ def _add_shapes(
             mass=link.mass * share,
             contype=HAND_CONTYPE,
             conaffinity=HAND_CONTYPE if self_collision else 0,
-            condim=4 if torsion else 1,  # the greater of two decides: between links 1, against the object its 3
+            condim=4 if torsion else 1,  # the greater of the two decides: 1 between links, 3 against the object
             solref=(contact_time, 1.0),
-            solmix=1000.0,  # against others' 1, so that it decides
-            friction=(0.1, torsion, 0.0),  # MuJoCo takes the greater of two: the object's sliding friction decides
+            solmix=1000.0,  # against 1 of other geoms, so that it decides
+            friction=(0.1, torsion, 0.0),  # MuJoCo uses the greater of two: the object's sliding friction decides
         )
 
 
 def _capsule(capsule: Capsule, origin: np.ndarray) -> tuple[dict[str, Any], float]:
-    """The geom of a capsule in a frame at `origin` (3,), and its volume over pi in m^3."""
+    """Returns the geom of a capsule in a frame at `origin` (3,), and its volume over pi in m^3."""
     ends = np.concatenate([np.subtract(capsule.start, origin), np.subtract(capsule.end, origin)])
     length = np.linalg.norm(np.subtract(capsule.end, capsule.start)) + 4 / 3 * capsule.radius
     fields = {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "fromto": ends, "size": (capsule.radius, 0.0, 0.0)}
@@ -180,7 +180,7 @@ def _capsule(capsule: Capsule, origin: np.ndarray) -> tuple[dict[str, Any], floa
 
 
 def _solid(solid: Solid, origin: np.ndarray) -> tuple[dict[str, Any], float]:
-    """The geom of a solid in a frame at `origin` (3,), and its volume in m^3."""
+    """Returns the geom of a solid in a frame at `origin` (3,), and its volume in m^3."""
     place = {"pos": np.subtract(solid.position, origin), "quat": solid.quaternion}
     fields = {"type": GEOM_TYPES[solid.kind], "size": solid.size}
     if solid.kind == "ellipsoid" and len({*solid.size}) == 1:

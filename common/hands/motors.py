@@ -1,8 +1,8 @@
-"""Motors and the joints that they move, for hands with fewer motors than joints: coupled and tendon-driven ones.
+"""Motors and the joints they move, for underactuated hands: coupled and tendon-driven ones.
 
-What a policy commands are motors; what the task sees are joints. A motor is at the sum of its joints' angles times
-their coefficients. Of a tendon's joints contact decides which moves; where targets need an angle for each, they are
-thought to go from limit to limit together. For a hand with a motor for every joint all of this is the identity.
+A policy commands motors; the task observes joints. The position of a motor is the sum of its joints' angles times their
+coefficients. Contact decides how the joints of a tendon share a motion; where targets need one angle for each, they are
+assumed to move together from limit to limit. For a hand with a motor for every joint all of this is the identity.
 
 Arrays are NumPy's or JAX's.
 """
@@ -18,7 +18,7 @@ Array = Any
 
 
 class _Transmission(NamedTuple):
-    """How a hand's motors (M) and joints (F) belong together."""
+    """Mapping between a hand's motors (M) and joints (F)."""
 
     pulled: np.ndarray
     """(M, T) indices of the joints of each motor."""
@@ -27,7 +27,7 @@ class _Transmission(NamedTuple):
     motor: np.ndarray
     """(F,) index of the motor that moves each joint, directly or by its leader."""
     ratio: np.ndarray
-    """(F,) radians of a joint for one of its motor."""
+    """(F,) radians of a joint per radian of its motor."""
     rest: np.ndarray
     """(F,) angle of a joint where its motor is at zero."""
     limits: np.ndarray
@@ -68,7 +68,7 @@ def transmission(hand: Hand) -> _Transmission:
 
 
 def motor_positions(hand: Hand, q: Array) -> Array:
-    """(..., M) positions of the motors at joint angles (..., F), rad."""
+    """Positions (..., M) of the motors at joint angles (..., F), rad."""
     if len(hand.motors) == len(hand.joints):
         return q
     own = transmission(hand)
@@ -76,7 +76,7 @@ def motor_positions(hand: Hand, q: Array) -> Array:
 
 
 def joint_positions(hand: Hand, motors: Array) -> Array:
-    """(..., F) joint angles for positions (..., M) of the motors, rad; those of a tendon move together."""
+    """Joint angles (..., F) for positions (..., M) of the motors, rad; joints of a tendon move together."""
     if len(hand.motors) == len(hand.joints):
         return motors
     own = transmission(hand)
@@ -84,12 +84,12 @@ def joint_positions(hand: Hand, motors: Array) -> Array:
 
 
 def motor_limits(hand: Hand) -> np.ndarray:
-    """(2, M) lowest and highest motor positions, rad."""
+    """Lowest and highest motor positions (2, M), rad."""
     return transmission(hand).limits
 
 
 def coupled(hand: Hand, q: Array) -> Array:
-    """(..., F) joint angles with those that follow others where their leaders put them."""
+    """Joint angles (..., F) with coupled joints set by their leaders."""
     if not hand.couplings:
         return q
     names = [joint.name for joint in hand.joints]

@@ -1,4 +1,4 @@
-"""How far a hand reaches around its centre in a few finger poses: what decides whether a table leaves it room."""
+"""Extent of a hand around its centre in a few finger poses, which decides whether a table leaves room for it."""
 
 import concurrent.futures
 import functools
@@ -13,13 +13,13 @@ from congrasp.common.hands.spec import Hand
 
 
 class Outline(NamedTuple):
-    """Balls in S finger poses, from the least closed to the most, that the hand lies in the hull of.
+    """Balls whose hull contains the hand, in S finger poses from the least to the most closed.
 
-    The frame has its origin in the hand's centre and the axes v, w and v x w of the grasp frame.
+    The frame has its origin at the hand's centre and the axes v, w and v x w of the grasp frame.
     """
 
     points: np.ndarray
-    """(S, E, 3) m, their centres."""
+    """(S, E, 3) centres of the balls, m."""
     radii: np.ndarray
     """(E,) m."""
     openings: np.ndarray
@@ -27,15 +27,15 @@ class Outline(NamedTuple):
 
 
 CENTER = Outline(np.zeros((1, 1, 3)), np.array([0.01]), np.array([np.inf]))
-"""A ball of 1 cm around the hand's centre, where no hand is named."""
+"""A ball of 1 cm around the hand's centre, for requests that name no hand."""
 
 
 @functools.cache
 def outline(hand: Hand) -> Outline:
-    """The hand's capsules in the poses of `CLOSURES`."""
+    """Returns the hand's capsules in the poses of `CLOSURES`."""
     frame = kinematics.grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
-    # In a thread of its own nothing is being traced; inside of a trace, it would compile operation by operation.
+    # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
         q = thread.submit(closure_pose, hand, CLOSURES[:, None].astype(np.float32)).result()
         ends, center = (np.asarray(part, np.float64) for part in thread.submit(_posed, hand, q).result())
@@ -44,18 +44,18 @@ def outline(hand: Hand) -> Outline:
 
 
 def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
-    """(S, H) metres that the hand in each of S poses reaches below its centre.
+    """Depth (S, H) in metres of the hand's lowest point below its centre, in each of S poses.
 
     Args:
-      outline: of the hand.
-      up: (H, 3) unit, the world's vertical in the outline's frame.
+      outline: outline of the hand.
+      up: (H, 3) unit, vertical of the world in the outline's frame.
     """
     return -(np.einsum("sei,hi->she", outline.points, up) - outline.radii).min(-1)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _posed(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The ends (S, E, 3) of the hand's capsules at finger angles (S, F), and its centre (S, 3), in the wrist frame."""
+    """Ends (S, E, 3) of the hand's capsules at finger angles (S, F), and its centres (S, 3), in the wrist frame."""
     transforms = kinematics.link_transforms(hand, q)
     ends = kinematics.capsules(hand, transforms)
     return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(hand, kinematics.keypoints(hand, transforms))

@@ -14,7 +14,7 @@ from congrasp.common.hands.spec import Capsule, Hand, Joint, Link, Vector, chain
 
 
 class _Drive(NamedTuple):
-    """Gains (N.m/rad, N.m.s/rad), greatest torque (N.m) and armature (kg.m^2) of a kind of joint."""
+    """Gains (N.m/rad, N.m.s/rad), greatest torque (N.m) and armature (kg.m^2) of a type of joint."""
 
     kp: float
     kv: float
@@ -36,7 +36,7 @@ _TIP_RADIUS = 0.0081
 
 
 def _joint(name: str, axis: np.ndarray, anchor: np.ndarray, limits: tuple[float, float], drive: _Drive) -> Joint:
-    """A hinge about an axis through an anchor, with the gains of its motor."""
+    """Returns a hinge about an axis through an anchor, with the gains of its motor."""
     return Joint(name, vector(axis), vector(anchor), *limits, **drive._asdict(), damping=0.0)
 
 
@@ -91,7 +91,7 @@ def _thumb() -> tuple[Link, ...]:
         (0.13837, 0.03328, 0.00798),
         (2.0, 2.0, 6.0),
     )
-    # The metacarpal's housing ends before the joint.
+    # The metacarpal's housing ends in front of the joint.
     housing = Capsule((0.0161, 0.0497, 0.0300), (0.0161, 0.0736, 0.0539), 0.0207)
     return (dataclasses.replace(metacarpal, capsules=(housing,)), *rest)
 
@@ -105,7 +105,7 @@ _MCP: dict[str, Vector] = {
 
 
 def _knuckle(name: str) -> Capsule:
-    """The housing of a finger's first joint, which turns about itself as the finger flexes."""
+    """Housing of a finger's first joint, which rotates as the finger flexes."""
     x, y, z = _MCP[name]
     return Capsule((x, y - 0.002, z), (x, y + 0.002, z), 0.0126)
 

@@ -1,4 +1,4 @@
-"""What a hand's surface is made from: links, joints and capsules with every joint at zero, as arrays."""
+"""Input of a hand's surface: links, joints and capsules with every joint at zero, as arrays."""
 
 from typing import NamedTuple
 
@@ -15,9 +15,9 @@ class Skeleton(NamedTuple):
     names: tuple[str, ...]
     """L names; the first is the palm."""
     parents: np.ndarray
-    """(L,) index of the link that carries each, -1 for the palm."""
+    """(L,) index of each link's parent, -1 for the palm."""
     origins: np.ndarray
-    """(L, 3) of the links' frames, which are turned as the wrist's."""
+    """(L, 3) origins of the links' frames, whose axes are parallel to the wrist's."""
     capsules: np.ndarray
     """(C, 2, 3)."""
     radii: np.ndarray
@@ -32,7 +32,7 @@ class Skeleton(NamedTuple):
     """(F,) index of the link that each joint moves."""
 
     def chains(self) -> list[list[int]]:
-        """Links from the palm (without it) to each last link that has a capsule, a thumb first."""
+        """Links from the palm (excluded) to each last link with a capsule, a thumb first."""
         found = []
         for tip in np.unique(self.capsule_link):
             if tip and not (self.parents == tip).any():
@@ -44,7 +44,7 @@ class Skeleton(NamedTuple):
 
 
 def skeleton_of(hand: Hand) -> Skeleton:
-    """The skeleton of a hand."""
+    """Returns the skeleton of a hand."""
     names = tuple(link.name for link in hand.links)
     return Skeleton(
         hand.name,

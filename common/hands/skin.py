@@ -1,6 +1,6 @@
-"""A surface for every hand: flesh for human hands, for robots the meshes of their files or bevelled housings.
+"""Surface of any hand: flesh for human hands; the file's meshes or bevelled housings for robots.
 
-A surface is made once, with every joint at zero, and follows the links by linear blend skinning.
+A surface is computed once, with every joint at zero, and moved with the links by linear blend skinning.
 """
 
 import functools
@@ -10,17 +10,22 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
+from congrasp.common import mirror
+from congrasp.common.hands.dress import nails, sleeve
 from congrasp.common.hands.flesh import Surface, flesh
+from congrasp.common.hands.left import right_name
 from congrasp.common.hands.meshes import Meshes, own_meshes
 from congrasp.common.hands.skeleton import Skeleton, skeleton_of
 from congrasp.common.hands.spec import Hand, Link, link_origin
 
 HUMAN_HANDS = ("human", "mano")
-"""Names of the hands that have flesh."""
+"""Names of hands with flesh."""
+MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
+"""What a surface is made of."""
 _LARGEST = 0.5  # m
-_SECTIONS = 20  # of a housing
-_BEVEL = 0.45  # of a housing's ends, in radii
-_DRUM_RADIUS, _DRUM_LENGTH = 0.72, 1.04  # of a joint's drum, in radii of its link
+_SECTIONS = 20  # bevel of a housing
+_BEVEL = 0.45  # length of a housing's ends, in radii
+_DRUM_RADIUS, _DRUM_LENGTH = 0.72, 1.04  # radius of a joint's drum, in radii of its link
 
 
 class Skin(NamedTuple):
@@ -31,18 +36,21 @@ class Skin(NamedTuple):
     normals: np.ndarray
     """(V, 3) float32 unit."""
     faces: np.ndarray
-    """(F, 3) int32; they wind outwards."""
+    """(F, 3) int32, with outward normals."""
     weights: np.ndarray
-    """(V, L) float32, at most four of a point above zero; they sum to one."""
+    """(V, L) float32, at most four nonzero for each point; rows sum to one."""
     origins: np.ndarray
-    """(L, 3) of the links' frames, which are turned as the wrist's."""
-    flesh: bool
-    """Whether it is that of a human hand."""
-    joint: np.ndarray
-    """(V,) bool: part of a robot's joint, which viewers draw darker."""
+    """(L, 3) origins of the links' frames, whose axes are parallel to the wrist's."""
+    material: np.ndarray
+    """(V,) int, of each point: its index in `MATERIALS`. The points of a triangle have the same."""
+
+    def parts(self) -> dict[str, np.ndarray]:
+        """Faces (n, 3) of each material that there is."""
+        of_face = self.material[self.faces[:, 0]]
+        return {name: self.faces[of_face == i] for i, name in enumerate(MATERIALS) if (of_face == i).any()}
 
     def influences(self) -> tuple[np.ndarray, np.ndarray]:
-        """The four links (V, 4) int that move each point most, and their weights (V, 4); link 0 where it is none."""
+        """Links (V, 4) int with the greatest weights of each point, and the weights (V, 4); link 0 if unused."""
         links = np.argsort(-self.weights, 1, kind="stable")[:, :4]
         if links.shape[1] < 4:
             links = np.pad(links, ((0, 0), (0, 4 - links.shape[1])))
@@ -51,7 +59,7 @@ class Skin(NamedTuple):
         return np.where(weights > 0, links, 0), weights
 
     def posed(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (V, 3) and unit normals (V, 3) with the links' frames at (L, 3), turned by matrices (L, 3, 3)."""
+        """Points (V, 3) and unit normals (V, 3) for link frames at (L, 3) with rotations (L, 3, 3)."""
         matrices = np.concatenate(
             [rotation, (position - np.einsum("lij,lj->li", rotation, self.origins))[..., None]], -1
         )
@@ -63,32 +71,45 @@ class Skin(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def skin_of(hand: Hand) -> Skin:
-    """The surface of a hand: its file's meshes where it is one of the user's own, looked for once a process."""
+    """Returns the surface of a hand, from its file's meshes if it is a custom one; they are loaded once per process."""
     meshes = own_meshes(hand)
     return skin_of_meshes(hand, meshes) if meshes else skin_on(skeleton_of(hand))
 
 
 def skin_on(skeleton: Skeleton) -> Skin:
-    """The surface of the hand with this skeleton."""
-    human = skeleton.hand in HUMAN_HANDS and _anatomical(skeleton)
-    if human:
-        surface = flesh(skeleton)
-        joint = np.zeros(len(surface.points), bool)
+    """Returns the surface of the hand with this skeleton; a left hand's is the mirror image of the right hand's."""
+    right, left = right_name(skeleton.hand)
+    if left:
+        own = _mirrored(skeleton, ("origins", "capsules", "anchors"))
+        skin = skin_on(skeleton._replace(hand=right, axes=mirror.axial(skeleton.axes), **own))
+        return skin._replace(faces=skin.faces[:, ::-1].copy(), **_mirrored(skin, ("points", "normals", "origins")))
+    if skeleton.hand in HUMAN_HANDS and _anatomical(skeleton):
+        kinds = ("flesh", flesh(skeleton)), ("sleeve", sleeve(skeleton)), *(("nail", nail) for nail in nails(skeleton))
+        material = np.concatenate([np.full(len(part.points), MATERIALS.index(kind)) for kind, part in kinds])
+        firsts = np.cumsum([0, *(len(part.points) for _, part in kinds)])
+        faces = [part.faces + first for (_, part), first in zip(kinds, firsts, strict=False)]
+        points, normals, weights = (np.concatenate([part[k] for _, part in kinds]) for k in (0, 1, 3))
+        surface = Surface(points, normals, np.concatenate(faces), weights)
     else:
         surface, joint = _housings(skeleton)
+        material = np.where(joint, MATERIALS.index("joint"), MATERIALS.index("link"))
     return Skin(
         surface.points.astype(np.float32),
         surface.normals.astype(np.float32),
         surface.faces.astype(np.int32),
         surface.weights.astype(np.float32),
         skeleton.origins,
-        human,
-        joint,
+        material,
     )
 
 
+def _mirrored(shape: Skeleton | Skin, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Mirrored points of a shape, by their names."""
+    return {name: mirror.vector(getattr(shape, name)) for name in names}
+
+
 def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
-    """A surface of links' meshes, which follow one link each, and of the capsules of links that have none."""
+    """Returns a surface of the links' meshes, each rigid, and the capsules of links without a mesh."""
     parts = [
         trimesh.Trimesh(*meshes[link.name], process=False) if link.name in meshes else _rounded(link)
         for link in hand.links
@@ -96,20 +117,19 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
     counts = [len(part.vertices) for part in parts]
     starts = np.cumsum([0, *counts[:-1]])
     normals = np.concatenate([part.vertex_normals for part in parts]).astype(np.float32)
-    normals[~normals.any(1)] = 0.0, 0.0, 1.0  # points of no face, or whose faces lie back to back
+    normals[~normals.any(1)] = 0.0, 0.0, 1.0  # points without faces, or with faces back to back
     return Skin(
         points=np.concatenate([part.vertices for part in parts]).astype(np.float32),
         normals=normals,
         faces=np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]).astype(np.int32),
         weights=np.eye(len(parts), dtype=np.float32)[np.repeat(np.arange(len(parts)), counts)],
         origins=np.array([link_origin(link) for link in hand.links]),
-        flesh=False,
-        joint=np.zeros(sum(counts), bool),
+        material=np.full(sum(counts), MATERIALS.index("link")),
     )
 
 
 def _rounded(link: Link) -> trimesh.Trimesh:
-    """A link's capsules, in the wrist frame at zero."""
+    """Returns a mesh of a link's capsules, in the wrist frame at zero."""
     parts = []
     for capsule in link.capsules:
         way = np.subtract(capsule.end, capsule.start)
@@ -123,7 +143,7 @@ def _rounded(link: Link) -> trimesh.Trimesh:
 
 
 def _anatomical(skeleton: Skeleton) -> bool:
-    """Whether there is a palm with a thumb and other fingers, each link with a capsule, of a hand's size."""
+    """True for a palm with a thumb and other fingers, with a capsule on each link, of a hand's size."""
     chains, with_capsule = skeleton.chains(), set(skeleton.capsule_link.tolist())
     return (
         len(chains) > 2
@@ -135,7 +155,7 @@ def _anatomical(skeleton: Skeleton) -> bool:
 
 
 def _housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
-    """A bevelled housing around every capsule, a drum at every joint, and (V,) bool what is a joint's."""
+    """Returns a bevelled housing around every capsule, a drum at every joint, and a mask (V,) of the joints' points."""
     parts, links, joints = [], [], []
     for (start, end), radius, link in zip(skeleton.capsules, skeleton.radii, skeleton.capsule_link, strict=True):
         parts.append(_bevelled(start, end, radius, radius))
@@ -157,7 +177,7 @@ def _housings(skeleton: Skeleton) -> tuple[Surface, np.ndarray]:
 
 
 def _bevelled(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -> tuple[np.ndarray, ...]:
-    """Points, normals and faces of a cylinder with bevelled ends that reaches beyond both points (3,)."""
+    """Points, normals and faces of a cylinder with bevelled ends that extends beyond both points (3,)."""
     length, bevel = float(np.linalg.norm(end - start)), _BEVEL * min(radius, reach)
     outline = [
         (0.0, -reach),
@@ -175,7 +195,7 @@ def _bevelled(start: np.ndarray, end: np.ndarray, radius: float, reach: float) -
         turn = trimesh.geometry.align_vectors([0, 0, 1], (end - start) / length)[:3, :3]
     angles = 2 * np.pi * np.arange(_SECTIONS) / _SECTIONS
     around = np.stack([np.cos(angles), np.sin(angles)], -1)
-    for (r0, z0), (r1, z1) in itertools.pairwise(outline):  # each strip has points of its own: sharp edges
+    for (r0, z0), (r1, z1) in itertools.pairwise(outline):  # separate points for each strip give sharp edges
         out = np.array([z1 - z0, r0 - r1]) / np.hypot(z1 - z0, r0 - r1)
         first = _SECTIONS * len(points)
         for r, z in ((r0, z0), (r1, z1)):

@@ -1,4 +1,4 @@
-"""What a hand is: data. Every length is in metres, every angle in radians, every mass in kilograms.
+"""Specification of a hand as data: lengths in metres, angles in radians, masses in kilograms.
 
 All points and axes are given in the wrist frame with every joint at zero, so that forward kinematics is a product of
 exponentials (`common.hands.kinematics`) and the MJCF (`common.hands.mjcf`) follows from the same numbers.
@@ -14,24 +14,24 @@ import numpy as np
 
 Vector = tuple[float, float, float]
 CONTACT_TIME = 0.006
-"""Seconds, the time constant of contacts that are as stiff as a hand of flesh or rubber needs them."""
-_ARM = 0.65  # kg, what an arm adds to the inertia of the hand that it carries
+"""Time constant of contacts that are as stiff as flesh or rubber, s."""
+_ARM = 0.65  # inertia that an arm adds to that of the hand, kg
 _GYRATION = 0.06  # m, a hand's radius of gyration about its wrist
 
 
 def vector(array: np.ndarray) -> Vector:
-    """An array (3,) as data."""
+    """Returns an array (3,) as a tuple."""
     x, y, z = array.tolist()
     return x, y, z
 
 
 @dataclasses.dataclass(frozen=True)
 class Coupling:
-    """A joint without a motor that follows another, whatever pushes it: q = offset + ratio * q of the leader."""
+    """A joint without a motor that follows another: q = offset + ratio * q of the leader."""
 
     joint: str
     leader: str
-    """Name of a joint that has a motor, or is pulled by a tendon."""
+    """Name of a joint with a motor or a tendon."""
     ratio: float
     offset: float = 0.0
     """rad."""
@@ -39,7 +39,7 @@ class Coupling:
 
 @dataclasses.dataclass(frozen=True)
 class Motor:
-    """A position servo that pulls joints: at sum(c q), it turns each by c times its own torque.
+    """A position servo that pulls joints: its position is sum(c q), and each joint gets c times its torque.
 
     Gains are in N.m/rad, N.m.s/rad and N.m of the motor.
     """
@@ -56,7 +56,7 @@ class Motor:
 class Joint:
     """A hinge. `axis` and `anchor` in the wrist frame at zero; gains in N.m/rad, N.m.s/rad and N.m.
 
-    The gains are those of its own motor; a joint that follows another or is pulled by a tendon has none, and zeros.
+    The gains are those of its motor. They are zero for a joint that follows another or is pulled by a tendon.
     """
 
     name: str
@@ -82,14 +82,14 @@ class Capsule:
 
 @dataclasses.dataclass(frozen=True)
 class Solid:
-    """A collision shape of a hand's own file, in the wrist frame at zero; `size` follows MuJoCo."""
+    """A collision shape of the hand's file, in the wrist frame at zero; `size` follows MuJoCo."""
 
     kind: Literal["box", "cylinder", "capsule", "ellipsoid"]
-    """By half extents; radius and half length along z; the same; radii."""
+    """Meaning of `size`: half extents; radius and half length along z; the same; radii."""
     size: Vector
     position: Vector
     quaternion: tuple[float, float, float, float]
-    """(w, x, y, z) its frame to the wrist frame."""
+    """(w, x, y, z) from its frame to the wrist frame."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,9 +104,9 @@ class Link:
     contact_weight: float
     """Relative share of this link in the contact reward."""
     tip: Vector | None = None
-    """The fingertip, on the last link of a finger."""
+    """Fingertip, on the last link of a finger."""
     solids: tuple[Solid, ...] = ()
-    """What collides in physics instead of the capsules, where there are any."""
+    """Collision shapes used instead of the capsules, if there are any."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,24 +135,24 @@ class Hand:
     thumb: str
     """Name of the thumb's last link; the other links with a tip are the non-thumb fingers."""
     open_pose: dict[str, float]
-    """Finger angles at the start of a grasp without a reference pose; joints that are not named are at zero."""
+    """Finger angles at the start of a grasp without a reference pose; other joints are at zero."""
     closed_pose: dict[str, float]
     """Finger angles of a fist, for pictures and for closing around an object."""
     wrist: WristGains
     wide_pose: dict[str, float] | None = None
-    """Finger angles of the widest pose that still faces an object (`common.hands.closure`); searched for if absent."""
+    """Finger angles of the widest pose that still faces an object (`common.hands.closure`); computed if absent."""
     object_scale: float = 1.0
     """Factor on object sizes in the paper's comparison of hands."""
     couplings: tuple[Coupling, ...] = ()
-    """Joints that follow others, in the place of a motor."""
+    """Joints that follow others and have no motor."""
     tendons: tuple[Motor, ...] = ()
-    """Motors that pull several joints each; every other joint that follows none has one of its own."""
+    """Motors that pull several joints each; every other joint without a coupling has a motor."""
     text: str = ""
     """The hand's file, for hands that are not part of the package."""
 
     @property
     def reference(self) -> str:
-        """What `common.hands.get_hand` finds this hand by on any machine: its name, or all of its file."""
+        """Reference for `common.hands.get_hand` on any machine: the hand's name, or the text of its file."""
         return self.text or self.name
 
     @functools.cached_property
@@ -209,13 +209,13 @@ class Hand:
 
     @functools.cached_property
     def fingers(self) -> tuple[str, ...]:
-        """Names of the G fingers, thumb first: `index` of `index_proximal` where that tells them apart."""
+        """Names of the G fingers, thumb first: `index` for `index_proximal` if that is unique."""
         short = tuple(root.rpartition("_")[0] or root for root in self.finger_roots)
         return short if len(set(short)) == len(short) else self.finger_roots
 
     @functools.cached_property
     def link_fingers(self) -> np.ndarray:
-        """(L,) index of the finger that each link belongs to, -1 for the palm and what has no tip."""
+        """(L,) index of each link's finger, -1 for the palm and for links without a tip."""
         roots = [next(iter(chain_of(self, link.name)), "") for link in self.links]
         return np.array([self.finger_roots.index(root) if root in self.finger_roots else -1 for root in roots])
 
@@ -249,12 +249,12 @@ class Hand:
 
     @functools.cached_property
     def capsules(self) -> np.ndarray:
-        """(C, 2, 3) where the capsules of all links start and end, in the wrist frame at zero."""
+        """(C, 2, 3) end points of the capsules of all links, in the wrist frame at zero."""
         return np.array([(c.start, c.end) for link in self.links for c in link.capsules], np.float32)
 
     @functools.cached_property
     def capsule_radii(self) -> np.ndarray:
-        """(C,) m."""
+        """(C,) radii in m."""
         return np.array([c.radius for link in self.links for c in link.capsules], np.float32)
 
     @functools.cached_property
@@ -264,7 +264,7 @@ class Hand:
 
     @functools.cached_property
     def wrist_inertia(self) -> np.ndarray:
-        """(2,) what the virtual wrist's servos move: kg along a slide, kg.m^2 about a hinge."""
+        """(2,) inertia moved by the virtual wrist's servos: kg along a slide, kg.m^2 about a hinge."""
         mass = sum(link.mass for link in self.links)
         return np.array([mass + self.wrist.slide_armature, mass * _GYRATION**2 + self.wrist.hinge_armature])
 
@@ -279,7 +279,7 @@ class Hand:
         return np.repeat(np.array([slide, hinge], np.float32).T, 3, axis=1)
 
     def posed(self, angles: dict[str, float]) -> np.ndarray:
-        """(F,) angles in the order of the joints; those that follow others are where these put them."""
+        """(F,) angles in the order of the joints; coupled joints are set by their leaders."""
 
         follow = {x.joint: x.offset + x.ratio * angles.get(x.leader, 0.0) for x in self.couplings}
         return np.array([(angles | follow).get(joint.name, 0.0) for joint in self.joints], np.float32)
@@ -291,7 +291,7 @@ def link_origin(link: Link) -> Vector:
 
 
 def capsule_ends(link: Link) -> np.ndarray:
-    """(C, 2, 3) m, where the link's capsules start and end, in its frame."""
+    """(C, 2, 3) end points of the link's capsules, in its frame, m."""
     return np.array([(capsule.start, capsule.end) for capsule in link.capsules]).reshape(-1, 2, 3) - link_origin(link)
 
 
@@ -304,16 +304,16 @@ def chain(
     weights: Sequence[float],
     parent: str = "palm",
 ) -> tuple[Link, ...]:
-    """A finger: links one after the other, each a capsule between two of its points, with the tip on the last.
+    """Builds a finger: a chain of links, each a capsule between two of the points, with the tip on the last.
 
     Args:
       names: n names, the first next to the palm.
-      joints: n tuples, the joints that move each link against the one before it.
+      joints: n tuples, the joints between each link and the previous one.
       points: n + 1 points in the wrist frame at zero; the last is the fingertip.
       radii: n capsule radii.
       masses: n masses.
       weights: n contact weights.
-      parent: the link that carries the first.
+      parent: parent of the first link.
     """
     rows = zip(names, (parent, *names), joints, itertools.pairwise(points), radii, masses, weights, strict=False)
     return tuple(
@@ -323,7 +323,7 @@ def chain(
 
 
 def chain_of(hand: Hand, name: str) -> tuple[str, ...]:
-    """Names of the links from the palm (without it) to this one."""
+    """Names of the links from the palm (excluded) to this one."""
     parents = {link.name: link.parent for link in hand.links}
     above: list[str] = []
     while parents[name]:
@@ -333,9 +333,9 @@ def chain_of(hand: Hand, name: str) -> tuple[str, ...]:
 
 
 def wrist_gains(mass: float) -> WristGains:
-    """Gains of the virtual wrist of a hand of this mass (kg), on an arm whose inertia there is 0.65 kg.
+    """Gains of the virtual wrist for a hand of this mass (kg), on an arm that adds an inertia of 0.65 kg.
 
-    The wrist follows its targets with a time constant of 0.05 s (0.06 s about the hinges) whatever the hand weighs.
+    The wrist follows its targets with a time constant of 0.05 s (0.06 s about the hinges) for any mass.
     """
     moved, heavier = mass + _ARM, (mass + 0.2) / 0.55
     return WristGains(

@@ -1,4 +1,4 @@
-"""What is kept between runs because it follows from its inputs alone: folders by subject, files by content."""
+"""Caches between runs of results that depend only on their inputs: a folder for each subject."""
 
 import contextlib
 import functools
@@ -14,7 +14,7 @@ from congrasp.common.wire.codec import Message, decode, encode
 
 @functools.cache
 def source_digest(*packages: ModuleType) -> str:
-    """Sixteen hex digits of all source in these packages: what they made and is kept ends with their next change."""
+    """Returns sixteen hex digits of all source in these packages, which invalidate cache entries when it changes."""
     digest = hashlib.sha256()
     for folder in (folder for package in packages for folder in package.__path__):
         for file in sorted(pathlib.Path(folder).rglob("*.py")):
@@ -23,7 +23,7 @@ def source_digest(*packages: ModuleType) -> str:
 
 
 def read_kept(path: pathlib.Path) -> Message | None:
-    """A kept message, if it is there and whole; it counts as used now."""
+    """Reads a cached message if it exists and is intact, and marks it as used now."""
     try:
         message = decode(path.read_bytes(), max_bytes=path.stat().st_size)
         os.utime(path)
@@ -33,9 +33,9 @@ def read_kept(path: pathlib.Path) -> Message | None:
 
 
 def keep(path: pathlib.Path, message: Message, most: int) -> None:
-    """Writes a message, and removes all but the `most` files of its folder that were used last.
+    """Writes a message to the cache, and removes all but the `most` last used files of its folder.
 
-    A disk that is full, or a folder that cannot be written to, costs the next run some time and no more.
+    A full disk or a folder without write permission is ignored: the next run recomputes the entry.
     """
     with contextlib.suppress(CongraspError, OSError):
         write_atomically(path, encode(message))

@@ -1,4 +1,4 @@
-"""Files that are either the old ones or the new ones, whatever happens in between."""
+"""Atomic file writes: a reader finds the old content or the new one."""
 
 import contextlib
 import os
@@ -8,10 +8,10 @@ from congrasp.common.errors import CongraspError
 
 
 def write_atomically(path: pathlib.Path, data: bytes) -> None:
-    """Replaces a file's content: written beside it, flushed to the disk, renamed over it.
+    """Replaces a file's content atomically: writes a temporary file, flushes it to disk and renames it.
 
     Raises:
-      CongraspError: naming the file, when it cannot be written; what was there before is intact.
+      CongraspError: the file cannot be written; earlier content is intact.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -27,23 +27,23 @@ def write_atomically(path: pathlib.Path, data: bytes) -> None:
             temporary.unlink(missing_ok=True)
         raise CongraspError(
             f"{path} could not be written: {error.strerror}.",
-            "Free space or choose another folder; an earlier file of that name is intact.",
+            "Free space or choose another folder. An earlier file of that name is intact.",
         ) from None
 
 
 def check_free(path: pathlib.Path, *, force: bool = False) -> None:
-    """Raises a CongraspError where a command would overwrite a file, unless its user asked for that with --force."""
+    """Raises a CongraspError if a command would overwrite a file without --force."""
     if path.exists() and not force:
-        raise CongraspError(f"{path} is there already.", "Name another with --out, or replace it with --force.")
+        raise CongraspError(f"{path} exists already.", "Pass another path with --out, or --force to replace it.")
 
 
 def cache_folder(name: str) -> pathlib.Path:
-    """The user's folder for what is kept of one subject; `XDG_CACHE_HOME` names another place for all of them."""
+    """Returns the user's cache folder for one subject; `XDG_CACHE_HOME` overrides the parent folder."""
     return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / name
 
 
 def sync_directory(path: pathlib.Path) -> None:
-    """Makes renames inside a directory survive a power cut."""
+    """Makes renames inside a directory durable across a power failure."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

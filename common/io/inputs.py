@@ -1,4 +1,4 @@
-"""What comes from outside: names that become files, and files of bounded size."""
+"""Validation of external input: names used as files, and files of bounded size."""
 
 import json
 import os
@@ -10,16 +10,16 @@ from typing import Any, BinaryIO
 from congrasp.common.errors import CongraspError
 
 LONGEST_NAME = 100
-"""Characters of a name that becomes a file or a folder."""
+"""Longest name of a file or folder, in characters."""
 _NAME = re.compile(rf"\w[\w .+()-]{{0,{LONGEST_NAME - 1}}}")
 
 
 def file_name(text: object, what: str) -> str:
-    """The text itself, if it can be a file or a folder inside of another one and nowhere else.
+    """Returns the text if it is a safe name for a file or folder.
 
     Args:
-      text: what a file, a message or a user gives as a name.
-      what: what it names, for the error.
+      text: a name from a file, a message or a user.
+      what: the thing it names, for the error.
 
     Raises:
       CongraspError: it is empty or too long, begins with a dot, or holds a slash or another special character.
@@ -33,40 +33,40 @@ def file_name(text: object, what: str) -> str:
 
 
 def read_file(path: pathlib.Path, largest: int, remedy: str = "") -> bytes:
-    """All of a regular file.
+    """Returns the content of a regular file.
 
     Args:
       path: the file.
-      largest: bytes that it may have.
-      remedy: what to do, for an error's text.
+      largest: size limit in bytes.
+      remedy: remedy for the error message.
 
     Raises:
-      CongraspError: it is larger, or no regular file (a pipe would never end).
+      CongraspError: it is larger, or not a regular file (a pipe would block).
       OSError: it cannot be read.
     """
     with open_file(path, remedy) as file:
         size = os.fstat(file.fileno()).st_size
         if size > largest:
-            raise CongraspError(f"{path} has {size} bytes, more than the {largest} that are read.", remedy)
+            raise CongraspError(f"{path} has {size} bytes; the limit is {largest}.", remedy)
         return file.read(size)
 
 
 def open_file(path: pathlib.Path, remedy: str = "") -> BinaryIO:
-    """Opens a regular file for reading, without waiting; raises as `read_file` does."""
+    """Opens a regular file for reading without blocking; raises like `read_file`."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)
-    raise CongraspError(f"{path} is no regular file.", remedy)
+    raise CongraspError(f"{path} is not a regular file.", remedy)
 
 
 def read_json(path: pathlib.Path, largest: int, remedy: str = "") -> Any:
-    """What a JSON file holds; raises as `read_file` does, and a CongraspError if it is no JSON or nested too deep."""
+    """Parses a JSON file; raises like `read_file`, and a CongraspError if it is not JSON or nested too deep."""
     return parse_json(read_file(path, largest, remedy), str(path), remedy)
 
 
 def parse_json(text: bytes, what: str, remedy: str = "") -> Any:
-    """What JSON text holds; a CongraspError if it is no JSON or nested too deep."""
+    """Parses JSON text; raises a CongraspError if it is not JSON or nested too deep."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""Append-only journals of JSON lines, by which what several processes did can be compared afterwards.
+"""Append-only journals of JSON lines, for comparing afterwards what several processes did.
 
 Every line is one write to the operating system, so that it survives the death of its process. It ends with the CRC-32
 of the line before, as the field `after`, and that of what comes before in its own, as the field `crc32`. A line that
@@ -17,7 +17,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import open_file
 
 AUDIT = "audit"
-"""Folder of a run directory where its journals are."""
+"""Folder of the journals in a run directory."""
 MAX_NUMBER = 1 << 53
 """Integers from here on, which JSON readers do not keep exactly, are in no journal."""
 _CHECK = ', "crc32": "{}"}}\n'
@@ -27,14 +27,14 @@ _MAX_LINE = 1 << 22
 
 
 class Journal:
-    """A journal that is being written; safe to use from several threads."""
+    """A journal opened for writing; thread-safe."""
 
     def __init__(self, path: pathlib.Path, warn: Callable[[str], None] = lambda text: None):
-        """Opens a journal, or goes on with one.
+        """Opens a journal, appending to an existing file.
 
         Args:
-          path: the file; its folder is made.
-          warn: called with one line when lines cannot be written; the process goes on without them.
+          path: the file; its folder is created if needed.
+          warn: called with one line when lines cannot be written; the process continues without them.
 
         Raises:
           CongraspError: the file cannot be opened.
@@ -50,7 +50,7 @@ class Journal:
         self._lost, self._refused = int(self._cut), False
 
     def write(self, **entry: Any) -> None:
-        """Adds a line; one that the disk refuses is counted in the next that it takes, as `lost`."""
+        """Appends a line; lines that the disk refuses are counted in the next written one, as `lost`."""
         with self._lock:
             lost = {"lost": self._lost} if self._lost else {}
             text, check = _line({**entry, **lost, "after": self._after})
@@ -73,10 +73,10 @@ class Journal:
 
 
 class JournalLines(NamedTuple):
-    """What a journal holds."""
+    """Content of a journal."""
 
     entries: list[dict[str, Any] | None]
-    """The intact lines in their order; None stands where damaged ones were."""
+    """Intact lines in order; None marks damaged ones."""
     lost: int
     """Lines that are missing because the disk was full, or that were cut at the end."""
     damaged: int
@@ -93,11 +93,11 @@ class JournalLines(NamedTuple):
 
 
 def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] = lambda entry: True) -> JournalLines:
-    """Reads a journal, whatever is in the file.
+    """Reads a journal of arbitrary content.
 
     Args:
       path: the file.
-      is_entry: whether a line is one of this kind of journal; others are damaged.
+      is_entry: predicate for valid lines of this kind of journal; others count as damaged.
 
     Raises:
       CongraspError: the file cannot be read.
@@ -133,24 +133,24 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
 
 
 def number(value: Any) -> int:
-    """A value as it is if it is a count; 0 for everything else."""
+    """Returns the value if it is a count, else 0."""
     return value if type(value) is int and 0 <= value < MAX_NUMBER else 0
 
 
 def has_fields(entry: dict[str, Any], **types: type) -> bool:
-    """Whether an entry has these fields, of these types; integers only below `MAX_NUMBER`."""
+    """True if an entry has these fields with these types; integers only below `MAX_NUMBER`."""
     return all(is_value(entry.get(name), kind) for name, kind in types.items())
 
 
 def is_rows(value: Any, *types: type) -> bool:
-    """Whether a value is a list of rows whose columns have these types."""
+    """True if a value is a list of rows whose columns have these types."""
     return isinstance(value, list) and all(
         isinstance(row, list) and len(row) == len(types) and all(map(is_value, row, types)) for row in value
     )
 
 
 def is_value(value: Any, kind: type) -> bool:
-    """Whether a value of a JSON line is of a type; integers only below `MAX_NUMBER`."""
+    """True if a value of a JSON line has the type; integers only below `MAX_NUMBER`."""
     return type(value) is kind and not (isinstance(value, int) and abs(value) >= MAX_NUMBER)
 
 

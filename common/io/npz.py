@@ -1,4 +1,4 @@
-"""NPZ files read within limits: what an array says of its size is checked before there is memory for it."""
+"""Reads NPZ files within limits: the declared size of an array is checked before memory is allocated."""
 
 import io
 import math
@@ -13,9 +13,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file
 
 MAX_BYTES = 512 << 20
-"""Bytes that the arrays of a file may have together, unless the caller says otherwise."""
+"""Default limit of the total size of a file's arrays, in bytes."""
 MAX_ARRAYS = 1000
-"""Arrays of a file."""
+"""Default limit of the number of arrays."""
 _KINDS = "biufUS"
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _UNREADABLE = (ValueError, LookupError, RuntimeError, OverflowError, SyntaxError, TypeError, MemoryError)
@@ -30,18 +30,18 @@ def read_npz(
     most: int = MAX_ARRAYS,
     pickled: bool = False,
 ) -> dict[str, Any]:
-    """The arrays of a file by name: numbers, booleans and texts.
+    """Reads the arrays of a file by name: numbers, booleans and texts.
 
     Args:
       path: the file.
-      remedy: what to do, for an error's text.
-      kind: what the file should be, for the same.
-      largest: bytes that all arrays together may have.
-      most: arrays of the file.
-      pickled: arrays of objects are the bytes of their pickle; refused without.
+      remedy: remedy for the error message.
+      kind: expected kind of file, for the error message.
+      largest: limit of the arrays' total size, bytes.
+      most: limit of the number of arrays.
+      pickled: returns arrays of objects as the bytes of their pickle; otherwise they are errors. Nothing is unpickled.
 
     Raises:
-      CongraspError: it is no NPZ file, or damaged, or larger than that; this function unpickles nothing.
+      CongraspError: the file is not an NPZ file, is damaged, or exceeds a limit.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(read_file(path, largest, remedy))) as archive:
@@ -54,16 +54,16 @@ def read_npz(
     except _UNREADABLE as error:
         why = " ".join(str(error).split())[:200]
     except (zipfile.BadZipFile, EOFError, zlib.error):
-        why = "it is no NPZ file, or was cut"
+        why = "it is not an NPZ file, or was cut"
     raise CongraspError(f"{path} cannot be read: it is not {kind} ({why}).", remedy)
 
 
 def _check_members(members: list[zipfile.ZipInfo], largest: int, most: int) -> None:
-    """A ValueError where the members are none of an NPZ file, or too many or too large once they are inflated."""
+    """Raises a ValueError if the members are not those of an NPZ file, are too many, or inflate to too many bytes."""
     if len(members) > most:
         raise ValueError(f"it has more than {most} arrays")
     if sum(member.file_size for member in members) > largest:
-        raise ValueError(f"its arrays have more than {largest >> 20} MB")
+        raise ValueError(f"its arrays exceed {largest >> 20} MB")
     for member in members:
         if not member.filename.endswith(".npy") or member.compress_type not in _METHODS:
             raise ValueError("it holds something else than arrays")
@@ -72,7 +72,7 @@ def _check_members(members: list[zipfile.ZipInfo], largest: int, most: int) -> N
 
 
 def _array(data: bytes, name: str, pickled: bool) -> Any:
-    """One array of its bytes in NumPy's format."""
+    """Parses one array in NumPy's format."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -81,7 +81,7 @@ def _array(data: bytes, name: str, pickled: bool) -> Any:
     if dtype.hasobject and pickled:
         return bytes(rest)
     if dtype.kind not in _KINDS:
-        raise ValueError(f"'{name[:60]}' is of the type {str(dtype)[:40]}")
+        raise ValueError(f"'{name[:60]}' has the type {str(dtype)[:40]}")
     if math.prod(shape) * dtype.itemsize != len(rest) or (not dtype.itemsize and math.prod(shape) > 1):
         raise ValueError(f"'{name[:60]}' has {len(rest)} bytes, which is not {dtype} times {shape}")
     return np.frombuffer(rest, dtype, count=math.prod(shape)).reshape(shape, order="F" if fortran else "C").copy("K")

@@ -1,7 +1,7 @@
-"""Arrays out of pickles, which are unpickled with an allow-list by a child process under limits.
+"""Reads arrays from pickles, unpickled with an allow-list by a child process under limits.
 
 The child (`common/io/unpickle.py`) knows the names that arrays of NumPy, SciPy, chumpy and PyTorch need, and refuses
-any other one. It has limited memory, processor time and output, and answers with an NPZ file.
+all others. It has limited memory, processor time and output, and returns an NPZ file.
 """
 
 import os
@@ -19,30 +19,30 @@ from congrasp.common.io.inputs import read_file
 from congrasp.common.io.npz import read_npz
 
 MAX_BYTES = 512 << 20
-"""Bytes of the pickles that one process reads, and of their arrays."""
+"""Limit in bytes of the pickles read by one process, and of their arrays."""
 MAX_ARRAYS = 100_000
-"""Arrays of the same."""
+"""Limit of the number of arrays."""
 MEMORY = 3 << 30
-"""Bytes of address space of the process."""
+"""Limit of the process's address space in bytes."""
 SECONDS = 10
-"""Processor time of the process."""
+"""Limit of the process's processor time in seconds."""
 DEADLINE = 200.0
-"""Seconds after which a busy machine gives up."""
+"""Deadline in seconds, for a busy machine."""
 _CHILD = pathlib.Path(__file__).with_name("unpickle.py")
-_REMEDY = "Only pickles of plain values and arrays are read; get the file again."
+_REMEDY = "Only pickles of plain values and arrays are read; download the file again."
 
 
 def read_pickle(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Arrays of a pickle by name.
 
-    Names of nested dictionaries are joined by "/"; a value that is no dictionary has the name "". Numbers, texts and
+    Names of nested dictionaries are joined by "/"; a value outside any dictionary has the name "". Numbers, texts and
     lists of them are arrays, too, and None is an empty array. Other values are left out.
 
     Args:
       path: the file.
 
     Raises:
-      CongraspError: there is no such file, it is no pickle of arrays, or it exceeds the limits above.
+      CongraspError: the file is missing, is not a pickle of arrays, or exceeds the limits above.
     """
     try:
         data = read_file(path, MAX_BYTES, _REMEDY)
@@ -55,10 +55,10 @@ def read_pickles(pickles: Iterable[tuple[str, bytes]]) -> list[dict[str, np.ndar
     """Arrays of each pickle, read in one process; see `read_pickle`.
 
     Args:
-      pickles: name of each, for error messages, and its bytes.
+      pickles: (name for error messages, bytes) pairs.
 
     Raises:
-      CongraspError: one of them is no pickle of arrays, or together they exceed the limits above.
+      CongraspError: a pickle is not one of arrays, or together they exceed the limits above.
     """
     with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
         source, answer = pathlib.Path(folder, "pickles.zip"), pathlib.Path(folder, "arrays.npz")
@@ -68,7 +68,7 @@ def read_pickles(pickles: Iterable[tuple[str, bytes]]) -> list[dict[str, np.ndar
                 archive.writestr(str(len(names)), data)
                 names.append(name)
                 if (size := size + len(data)) > MAX_BYTES:
-                    raise CongraspError(f"{name} and what it belongs to exceed {MAX_BYTES >> 20} MB.", _REMEDY)
+                    raise CongraspError(f"{name} and the related files exceed {MAX_BYTES >> 20} MB.", _REMEDY)
         if not names:
             return []
         _unpickle(source, answer, names)

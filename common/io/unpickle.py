@@ -97,7 +97,7 @@ def _storage(data: bytes) -> np.ndarray:
     stream = io.BytesIO(data)
     magic, _, machine, dtype, keys = (_StorageUnpickler(stream).load() for _ in range(5))
     if magic != _TORCH_MAGIC or not machine["little_endian"] or len(keys) != 1:
-        raise pickle.UnpicklingError("has a tensor of an unknown format")
+        raise pickle.UnpicklingError("has a tensor of unknown format")
     count = int.from_bytes(stream.read(8), "little")
     return np.frombuffer(stream.read(), dtype, count)
 
@@ -134,7 +134,7 @@ class _Unpickler(pickle.Unpickler):
         """The stand-in of a name; an UnpicklingError for any other name."""
         full = f"{module}.{name}"
         if full not in _ALLOWED:
-            raise pickle.UnpicklingError(f"names {full[:80]!r}, which stands for no array")
+            raise pickle.UnpicklingError(f"names {full[:80]!r}, which is not part of an array")
         return _ALLOWED[full]
 
 
@@ -219,7 +219,7 @@ def _reason(error: Exception) -> str:
             return "contains itself, or is nested too deeply"
         case OSError():
             return "has arrays that are too large"
-    return "is no pickle, or is damaged"
+    return "is not a pickle, or is damaged"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Whether an object's values are those of an object that a hand could grasp, wherever they come from."""
+"""Plausibility checks of an object, whatever its source."""
 
 import math
 from collections.abc import Iterator
@@ -10,17 +10,17 @@ from congrasp.common.io.inputs import LONGEST_NAME, file_name
 from congrasp.common.objects.spec import COLOUR_POINTS, SURFACE_POINTS, GraspObject, Piece
 
 LARGEST = 10.0
-"""Metres from the object frame's origin to anything of the object."""
+"""Greatest distance from the object frame's origin to any part of the object, m."""
 HEAVIEST = 1000.0
 """Kilograms."""
-_PIECES, _PARTS, _RESTS, _NOTES = 64, 256, 256, 100  # most of each
-_CORNERS = 4096  # most vertices of a piece
+_PIECES, _PARTS, _RESTS, _NOTES = 64, 256, 256, 100  # limits
+_CORNERS = 4096  # limit of a piece's vertices
 _SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "ellipsoid": 3, "mesh": 0}
 _ROUNDING = 1e-3
 
 
 def faults(obj: GraspObject) -> Iterator[str]:
-    """What is wrong with an object, one phrase for each fault; those that come first make sense of the others."""
+    """Yields the faults of an object, one phrase each; later ones assume that earlier checks passed."""
     yield from _facts(obj)
     wrong_shape = list(_shapes(obj))
     yield from wrong_shape
@@ -34,17 +34,17 @@ def faults(obj: GraspObject) -> Iterator[str]:
 
 
 def _facts(obj: GraspObject) -> Iterator[str]:
-    """Faults of names and single numbers."""
+    """Yields faults of names and scalars."""
     try:
         file_name(obj.name, "an object")
     except CongraspError as error:
         yield str(error).split(". ")[0]
     if not isinstance(obj.family, str) or len(obj.family) > LONGEST_NAME:
-        yield "its family is no name"
+        yield "its family is not a name"
     if not 1 <= len(obj.part_names) <= _PARTS or not all(_is_text(name) for name in obj.part_names):
-        yield f"its parts have no names, or are more than {_PARTS}"
+        yield f"its parts have no names, or exceed {_PARTS}"
     if len(obj.notes) > _NOTES or not all(isinstance(note, str) for note in obj.notes):
-        yield f"its notes are no text, or more than {_NOTES}"
+        yield f"its notes are not texts, or exceed {_NOTES}"
     if not (_is_number(obj.mass) and 0 < obj.mass <= HEAVIEST):
         yield f"its mass is {obj.mass!r:.20}, not above 0 and at most {HEAVIEST:g} kg"
     if not (_is_number(obj.file_scale) and 0 < obj.file_scale < 1e9):
@@ -53,7 +53,7 @@ def _facts(obj: GraspObject) -> Iterator[str]:
         yield "its origin is not three finite numbers"
     for name in ("surface_error", "volume_error"):
         if getattr(obj, name) is not None and not _is_number(getattr(obj, name)):
-            yield f"its {name} is {getattr(obj, name)!r:.20}, which is no number"
+            yield f"its {name} is {getattr(obj, name)!r:.20}, which is not a number"
 
 
 def _is_number(value: object) -> bool:
@@ -65,7 +65,7 @@ def _is_text(value: object) -> bool:
 
 
 def _shapes(obj: GraspObject) -> Iterator[str]:
-    """Arrays of another shape or kind than `GraspObject` says."""
+    """Yields arrays whose shape or type differs from `GraspObject`."""
     wanted: dict[str, tuple[str, tuple[int | None, ...]]] = {
         "graspable": ("b", (len(obj.part_names),)),
         "inertia": ("f", (3, 3)),
@@ -92,28 +92,28 @@ def _shapes(obj: GraspObject) -> Iterator[str]:
 
 
 def _arrays(obj: GraspObject) -> Iterator[str]:
-    """Values of arrays that cannot be."""
+    """Yields implausible values of arrays."""
     placed = {name: getattr(obj, name) for name in ("inertia", "points", "normals", "rest_poses", "visual_vertices")}
     for name, values in (placed | ({"colour_points": obj.colours.points} if obj.colours else {})).items():
         if not np.isfinite(values).all():
             yield f"its {name} holds numbers that are not finite"
         elif values.size and np.abs(values).max() > (HEAVIEST * LARGEST**2 if name == "inertia" else LARGEST):
-            yield f"its {name} goes up to {np.abs(values).max():.3g}, which is no size of an object"
+            yield f"its {name} goes up to {np.abs(values).max():.3g}, which is too large for an object"
     if obj.labels.min() < 0 or obj.labels.max() >= len(obj.part_names):
-        yield "its labels name parts that are not there"
+        yield "its labels name parts that do not exist"
     if not 1 <= len(obj.rest_poses) <= _RESTS:
         yield f"it has {len(obj.rest_poses)} resting poses, not 1 to {_RESTS}"
     elif np.abs(np.linalg.norm(obj.rest_poses[:, 3:], axis=-1) - 1).max() > _ROUNDING:
-        yield "its rest_poses hold quaternions that are not of length one"
+        yield "its rest_poses hold quaternions that are not normalised"
     if np.abs(np.linalg.norm(obj.normals, axis=-1) - 1).max() > 10 * _ROUNDING:
-        yield "its normals are not of length one"
+        yield "its normals are not normalised"
     faces = obj.visual_faces
     if not len(faces) or faces.min() < 0 or faces.max() >= len(obj.visual_vertices):
-        yield "its visual_faces are none, or name vertices that are not there"
+        yield "its visual_faces are empty, or name vertices that do not exist"
 
 
 def _inertia(obj: GraspObject) -> Iterator[str]:
-    """An inertia that no body has: its principal moments are positive, and two of them exceed the third."""
+    """Yields faults of the inertia: principal moments are positive, and two of them exceed the third."""
     if not np.isfinite(obj.inertia).all():
         return
     if np.abs(obj.inertia - obj.inertia.T).max() > _ROUNDING * np.abs(obj.inertia).max():
@@ -121,25 +121,25 @@ def _inertia(obj: GraspObject) -> Iterator[str]:
         return
     small, middle, large = np.linalg.eigvalsh(obj.inertia.astype(float))
     if small <= 0 or small + middle < (1 - _ROUNDING) * large:
-        yield f"its inertia has the principal moments {small:.3g}, {middle:.3g} and {large:.3g}, which no body has"
+        yield f"its inertia has principal moments {small:.3g}, {middle:.3g} and {large:.3g}, which no rigid body has"
 
 
 def _piece(piece: Piece, parts: int) -> Iterator[str]:
-    """What is wrong with a piece."""
+    """Yields the faults of a piece."""
     numbers = [*piece.size, *piece.pos, *piece.quat]
     if (len(piece.size), len(piece.pos), len(piece.quat)) != (3, 3, 4) or not all(map(math.isfinite, numbers)):
-        yield "has a size or pose that is not of finite numbers"
+        yield "has a size or pose with numbers that are not finite"
         return
     used = piece.size[: _SIZES[piece.kind]]
     if any(not 0 < x <= LARGEST for x in used) or any(abs(x) > LARGEST for x in piece.pos):
         yield f"has the size {piece.size} and position {piece.pos}"
     if abs(math.hypot(*piece.quat) - 1) > _ROUNDING:
-        yield "has a quaternion that is not of length one"
+        yield "has a quaternion that is not normalised"
     if not 0 <= piece.part < parts:
-        yield "belongs to a part that is not there"
+        yield "belongs to a part that does not exist"
     vertices = piece.vertices
     if (piece.kind == "mesh") != (vertices is not None):
-        yield "needs vertices if it is a mesh, and otherwise none"
+        yield "needs vertices if it is a mesh, and none otherwise"
     elif vertices is not None and not (
         vertices.ndim == 2
         and vertices.shape[1] == 3

@@ -1,11 +1,11 @@
-"""Signed distance from an object's real surface, on grids that compiled functions sample.
+"""Signed distance from an object's surface, on grids that compiled functions sample.
 
-The surface is that of the primitives, or where an object has mesh pieces the mesh that pictures show, not the convex
-pieces that stand for it in the physics. Grids hold the distance exactly for primitives outside of them (the least over
-the pieces; inside of several pieces at once the distance is understated), and for meshes up to the sampling that finds
-the nearest triangle. Between grid points values are interpolated linearly. Measured against exact queries 2 to 22 mm
-outside of the surface, where the axes of fingers are: mean error 0.01 to 0.05 mm, 99th percentile 0.05 to 0.4 mm,
-near edges up to 0.8 mm (`tests/common/test_distance.py`).
+The surface is that of the primitives; for an object with mesh pieces it is the visual mesh, not the convex pieces of
+the physics. Grids hold the distance exactly for primitives outside of them (the least over the pieces; inside of
+several pieces at once the distance is understated), and for meshes up to the sampling that finds the nearest triangle.
+Between grid points values are interpolated linearly. Measured against exact queries 2 to 22 mm outside of the surface,
+where the axes of fingers are: mean error 0.01 to 0.05 mm, 99th percentile 0.05 to 0.4 mm, near edges up to 0.8 mm
+(`tests/common/test_distance.py`).
 """
 
 import functools
@@ -29,17 +29,17 @@ from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import Message
 
 CELLS = 1 << 17
-"""Grid points of an object: cells of 1.5 to 3 mm, in a quarter of a megabyte."""
+"""Most grid points of an object: cells of 1.5 to 3 mm, in a quarter of a megabyte."""
 MARGIN = 0.024
-"""Metres around the object that its grid covers: the radius of the thickest capsule of a hand, and more."""
-_MOST = 1 << 28  # grid points of all objects together
-_SPACING, _SAMPLES = 1e-3, (4000, 120_000)  # of points on a mesh: m, and fewest and most
-_MOST_FILES = 4096  # grids of meshes that are kept
-_NEWTON = 12  # iterations to the nearest point of an ellipsoid
+"""Margin of the grid around the object, m: more than the radius of the thickest capsule of a hand."""
+_MOST = 1 << 28  # limit of the grid points of all objects
+_SPACING, _SAMPLES = 1e-3, (4000, 120_000)  # spacing of samples on a mesh, m; fewest and most
+_MOST_FILES = 4096  # cached grids of meshes
+_NEWTON = 12  # iterations of the search for the nearest point of an ellipsoid
 
 
 class DistanceField(NamedTuple):
-    """Grids of N objects, each with M grid points of which the first ones are used; in the objects' frames."""
+    """Grids of N objects with M grid points each, of which the first are used; in the objects' frames."""
 
     values: Array
     """(N, M) float16: signed distance in metres, negative inside; the last axis of the grid runs fastest."""
@@ -51,10 +51,10 @@ class DistanceField(NamedTuple):
     """(N, 3) int: grid points along each axis."""
 
     def at(self, index: Array, points: Array) -> Array:
-        """Signed distances (B, P) in metres; beyond a grid its border's plus the distance from it, which is too much.
+        """Signed distances (B, P) in m; outside a grid, the border's value plus the distance from it (an upper bound).
 
         Args:
-          index: (B,) int, the objects.
+          index: (B,) int, indices of the objects.
           points: (B, P, 3) in their frames, m.
         """
         shape = self.shape[index][:, None]
@@ -74,10 +74,10 @@ class DistanceField(NamedTuple):
 
 
 def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
-    """The grids of objects, on JAX's device; those of meshes are kept in the user's cache folder.
+    """Computes the grids of objects on JAX's device; those of meshes are cached in the user's cache folder.
 
     Args:
-      objects: N objects; beyond 2,048 of them grids become coarser, so that all need half a gigabyte.
+      objects: N objects; beyond 2,048 grids become coarser, so that they need at most half a gigabyte.
     """
     cells = min(CELLS, _MOST // len(objects))
     lattices = [_lattice(obj, cells) for obj in objects]
@@ -92,15 +92,15 @@ def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
 
 
 def primitive_distance(pieces: Sequence[Piece], points: Array) -> Array:
-    """(n,) exact signed distance in metres of points (n, 3) of the object frame from primitive pieces.
+    """Exact signed distances (n,) in metres of points (n, 3) of the object frame from primitive pieces.
 
-    That of the nearest piece: inside of several pieces at once it is understated.
+    The value is that of the nearest piece; inside several pieces at once it is understated.
     """
     return _least(_slots(pieces), jnp.asarray(points, jnp.float32))
 
 
 class _Slots(NamedTuple):
-    """Primitive pieces of one kind, S slots of which the first ones are used."""
+    """Primitive pieces of one kind, in S slots of which the first are used."""
 
     used: np.ndarray  # (S,) bool
     size: np.ndarray  # (S, 3)
@@ -109,7 +109,7 @@ class _Slots(NamedTuple):
 
 
 def _slots(pieces: Sequence[Piece]) -> dict[str, _Slots]:
-    """Pieces by their kind, in as many slots as there are at most, so that one program serves all objects."""
+    """Groups pieces by kind, padded to a fixed number of slots, so that one program serves all objects."""
     found = {}
     for kind, count in PRIMITIVE_SLOTS.items():
         own = [piece for piece in pieces if piece.kind == kind]
@@ -125,13 +125,13 @@ def _slots(pieces: Sequence[Piece]) -> dict[str, _Slots]:
 
 @jax.jit
 def _least(pieces: dict[str, _Slots], points: Array) -> Array:
-    """(n,) least distance of points (n, 3) from the pieces in use."""
+    """Least distance (n,) of points (n, 3) from the pieces in use."""
     distance = {"box": _box, "cylinder": _cylinder, "capsule": _capsule, "ellipsoid": _ellipsoid}
     least = jnp.full(len(points), jnp.inf)
     for kind, slots in pieces.items():
 
         def nearer(least: Array, slot: _Slots, of: Callable[[Array, Array], Array] = distance[kind]) -> Array:
-            # In the piece's frame; all of them are symmetric.
+            # In the piece's frame; all shapes are symmetric.
             return jnp.minimum(least, of(jnp.abs((points - slot.position) @ slot.rotation), slot.size))
 
         for i in range(len(slots.used)):
@@ -141,26 +141,26 @@ def _least(pieces: dict[str, _Slots], points: Array) -> Array:
 
 
 def _box(x: Array, half: Array) -> Array:
-    """(n,) signed distance of points (n, k) whose coordinates are not negative from a box of half extents (k,)."""
+    """Signed distance (n,) from a box of half extents (k,), of points (n, k) with non-negative coordinates."""
     beyond = x - half
     return jnp.linalg.norm(jnp.maximum(beyond, 0.0), axis=-1) + jnp.minimum(jnp.max(beyond, -1), 0.0)
 
 
 def _cylinder(x: Array, size: Array) -> Array:
-    """The same from a cylinder of this radius and half length along z: a box in two dimensions."""
+    """Signed distance (n,) from a cylinder of this radius and half length along z: a box in two dimensions."""
     return _box(jnp.stack([jnp.hypot(x[:, 0], x[:, 1]), x[:, 2]], -1), size[:2])
 
 
 def _capsule(x: Array, size: Array) -> Array:
-    """The same from a capsule of this radius and half length along z."""
+    """Signed distance (n,) from a capsule of this radius and half length along z."""
     return jnp.linalg.norm(x.at[:, 2].set(jnp.maximum(x[:, 2] - size[1], 0.0)), axis=-1) - size[0]
 
 
 def _ellipsoid(x: Array, radii: Array) -> Array:
-    """The same from an ellipsoid.
+    """Signed distance (n,) from an ellipsoid.
 
     The nearest point is r^2 x / (r^2 + t), with t the largest root of sum (r x / (r^2 + t))^2 = 1 (Eberly, "Distance
-    from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid", 2013). The left side falls and is convex, so that
+    from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid", 2013). The left side is decreasing and convex, so
     Newton's method from below the root never overshoots.
     """
     squares, x = radii**2, jnp.maximum(x, 1e-3 * radii)  # in a plane of symmetry the root would be a pole
@@ -176,14 +176,14 @@ def _ellipsoid(x: Array, radii: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnames="cells")
 def _primitive_values(pieces: dict[str, _Slots], origin: Array, cell: Array, shape: Array, cells: int) -> Array:
-    """(cells,) float16 distances from primitive pieces at the points of a grid, and anything behind its last one."""
+    """Distances (cells,) float16 from primitive pieces at grid points; entries beyond the last point are undefined."""
     number = jnp.arange(cells)
     place = jnp.stack([number // (shape[1] * shape[2]), number // shape[2] % shape[1], number % shape[2]], -1)
     return _least(pieces, origin + cell * place).astype(jnp.float16)
 
 
 def _lattice(obj: GraspObject, cells: int) -> tuple[np.ndarray, float, np.ndarray]:
-    """First point (3,), spacing and size (3,) of a grid of at most `cells` points around an object."""
+    """First point (3,), spacing and shape (3,) of a grid of at most `cells` points around an object."""
     low, high = obj.visual_vertices.min(0) - MARGIN, obj.visual_vertices.max(0) + MARGIN
     cell = float(np.prod(high - low) / cells) ** (1 / 3)
     while np.prod(shape := np.ceil((high - low) / cell).astype(np.int32) + 1) > cells:
@@ -192,7 +192,7 @@ def _lattice(obj: GraspObject, cells: int) -> tuple[np.ndarray, float, np.ndarra
 
 
 def _mesh_values(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray, cells: int) -> np.ndarray:
-    """(cells,) float16 distances from a visual mesh at the points of a grid, and zeros; from the cache if possible."""
+    """Distances (cells,) float16 from a visual mesh at the grid points, padded with zeros; cached if possible."""
     parts = [obj.visual_vertices.astype(np.float32), obj.visual_faces.astype(np.int32), origin, shape]
     key = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:32]
     file = cache_folder("distances") / f"{key}.safetensors"
@@ -206,18 +206,18 @@ def _mesh_values(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.nd
 
 
 def _mesh_distance(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
-    """(n,) signed distances from an object's visual mesh at the points of a grid.
+    """Signed distances (n,) from an object's visual mesh at the points of a grid.
 
-    The distance is that from the triangle on which the nearest of many samples lies. Inside is what the grid's border
-    cannot reach without coming within half a cell's diagonal of the surface; so neither the faces' winding nor small
-    holes matter, and walls thinner than two cells have no inside.
+    The magnitude is the distance from the triangle of the nearest of many samples. A point is inside if the grid's
+    border cannot reach it without passing within half a cell's diagonal of the surface. The orientation of faces and
+    small holes therefore do not matter, and walls thinner than two cells have no inside.
     """
     points = origin + cell * np.indices(shape.tolist()).reshape(3, -1).T
     triangles = obj.visual_vertices[obj.visual_faces].astype(float)
     mesh = trimesh.Trimesh(obj.visual_vertices, obj.visual_faces, process=False)
     count = int(np.clip(mesh.area / _SPACING**2, *_SAMPLES))
     samples, face = trimesh.sample.sample_surface(mesh, count, seed=0)
-    # Triangles too small to be sampled have their centres.
+    # Triangles too small to be sampled contribute their centres.
     samples, face = np.concatenate([samples, triangles.mean(1)]), np.concatenate([face, np.arange(len(triangles))])
     distance, nearest = cKDTree(samples).query(points, workers=-1)
     on_triangle = trimesh.triangles.closest_point(triangles[face[nearest]], points)
@@ -225,7 +225,7 @@ def _mesh_distance(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.
     free = (distance > 0.5 * math.sqrt(3.0) * cell).reshape(shape)
     regions, _ = ndimage.label(free)
     inside = free & (regions != regions[0, 0, 0])
-    if free.any():  # near the surface the side is that of the nearest point away from it
+    if free.any():  # near the surface the sign is that of the nearest point farther away from it
         nearest_free = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
         inside = inside[tuple(nearest_free)]
     return np.where(inside.ravel(), -distance, distance)

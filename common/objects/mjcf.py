@@ -1,4 +1,4 @@
-"""An object as a free body of a MuJoCo model, and the contact settings that every scene shares."""
+"""An object as a free body of a MuJoCo model, and the contact settings shared by all scenes."""
 
 import dataclasses
 
@@ -10,17 +10,17 @@ from congrasp.common.objects.spec import GraspObject
 
 @dataclasses.dataclass(frozen=True)
 class ContactSettings:
-    """How geoms of hand, object and table touch.
+    """Contact parameters of hand, object and table.
 
-    Contacts have three dimensions, but for those of fingertips (`common.hands.mjcf`): no torsional and no rolling
-    friction. What keeps a ball from rolling for ever is the damping of the object's free joint: it acts in the same
-    way in every engine and costs nothing.
+    Contacts have three dimensions, without torsional or rolling friction, except those of fingertips
+    (`common.hands.mjcf`). The damping of the object's free joint stops a rolling ball: it acts the same way in every
+    engine and costs nothing.
     """
 
     friction: tuple[float, float, float] = (1.0, 0.0, 0.0)
     """Sliding (dimensionless), torsional (m) and rolling (m) friction."""
     condim: int = 3
-    """Dimensions of a contact."""
+    """Dimensions of a contact (condim)."""
     solref: tuple[float, float] = (0.012, 1.0)
     """Time constant (s) and damping ratio of the contact's spring."""
     solimp: tuple[float, float, float, float, float] = (0.9, 0.95, 0.001, 0.5, 2.0)
@@ -52,20 +52,20 @@ def add_object(
 ) -> mujoco.MjsBody:
     """Adds the object's body, with a free joint, its inertia and its collision geoms, to a model under construction.
 
-    The body's frame is the object frame, whose origin is the centre of mass. The joint is called `<name>`, the geoms
-    `<name>_<i>` in the order of `obj.pieces`, their meshes (made from vertices, without files) likewise. The free
-    joint's six damping values can be changed in the compiled model.
+    The body's frame is the object frame, whose origin is the centre of mass. The joint is named `<name>`, the geoms and
+    their meshes (made from vertices, without files) `<name>_<i>` in the order of `obj.pieces`. The free joint's six
+    damping values can be changed in the compiled model.
 
     Args:
       spec: the model.
       obj: the object.
-      name: the body's name.
-      contype: collision bits of the geoms.
-      conaffinity: the bits they collide with.
+      name: name of the body.
+      contype: contype of the geoms.
+      conaffinity: conaffinity of the geoms.
       contact: contact settings.
 
     Returns:
-      The new body, a child of the world.
+      The new body, a child of the world body.
     """
     body = spec.worldbody.add_body(name=name, mass=obj.mass, ipos=[0, 0, 0], explicitinertial=True)
     i = obj.inertia

@@ -1,4 +1,4 @@
-"""Meshes cut finely enough for colours of their points to show a picture."""
+"""Meshes subdivided finely enough for vertex colours to show a texture."""
 
 import functools
 
@@ -8,20 +8,20 @@ from scipy.spatial import cKDTree
 from congrasp.common.objects.spec import Colours
 
 _EDGE, _MOST_FACES = 0.006, 12_000
-"""m, that no edge need be shorter than; most faces."""
-_OWN_EDGE, _OWN_MOST_FACES = 0.003, 40_000  # where a surface has colours of its own
+"""Edge length below which no edge is split, m; most faces."""
+_OWN_EDGE, _OWN_MOST_FACES = 0.003, 40_000  # for coloured surfaces
 
 
 def finer(
     vertices: np.ndarray, faces: np.ndarray, edge: float = _EDGE, most: int = _MOST_FACES
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface, its longest edges halved again and again.
+    """Subdivides a surface by repeatedly halving its longest edges.
 
     Args:
       vertices: (V, 3).
       faces: (F, 3).
-      edge: how short edges need be, m; on a large surface they stay longer.
-      most: how many faces there may be; a mesh that has as many is left as it is.
+      edge: edge length at which subdivision stops, m; edges of large surfaces stay longer.
+      most: most faces; a mesh with as many is returned unchanged.
 
     Returns:
       Vertices (V', 3) float32 and faces (F', 3) int32.
@@ -47,9 +47,9 @@ def finer(
 
 
 def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh (V, 3), (F, 3) cut finer, and (V', 3) uint8 sRGB of its points: of each the nearest known one's.
+    """Subdivides a mesh (V, 3), (F, 3); returns it with (V', 3) uint8 sRGB, the colours of the nearest known points.
 
-    What was found for the last few objects is kept; the arrays are read-only.
+    Results of the last few objects are cached; the arrays are read-only.
     """
     kinds = (vertices, float), (faces, np.int64), (colours.points, float), (colours.values, np.uint8)
     return _painted(*(np.asarray(array, kind).tobytes() for array, kind in kinds))
@@ -57,7 +57,7 @@ def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[
 
 @functools.lru_cache(maxsize=8)
 def _painted(*content: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`painted` by the content of its arrays, which tells objects apart."""
+    """`painted` by the content of its arrays, as a cache key."""
     kinds = float, np.int64, float, np.uint8
     corners, faces, *own = (np.frombuffer(a, kind).reshape(-1, 3) for a, kind in zip(content, kinds, strict=True))
     vertices, faces = finer(corners, faces, _OWN_EDGE, _OWN_MOST_FACES)

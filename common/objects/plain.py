@@ -1,4 +1,4 @@
-"""Objects that are nothing but their convex pieces: one part, no resting poses."""
+"""Objects made only of convex pieces: one part, no resting poses."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from congrasp.common.objects.surface import mass_properties, sample_union
 
 
 def plain_object(name: str, pieces: tuple[Piece, ...], density: float) -> GraspObject:
-    """An object of convex pieces.
+    """Returns an object of convex pieces.
 
     Args:
-      name: its name.
-      pieces: in the object frame, whose origin is taken for the centre of mass.
-      density: kg/m^3.
+      name: name of the object.
+      pieces: convex pieces in the object frame; its origin is assumed to be the centre of mass.
+      density: density, kg/m^3.
     """
     mass, _, inertia = mass_properties(pieces, np.full(len(pieces), density))
     points, normals, _ = sample_union(pieces, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""The objects of one actor or of one evaluation, from a run's configuration."""
+"""Object pool of an actor or an evaluation, from a run's configuration."""
 
 import pathlib
 from collections.abc import Sequence
@@ -11,17 +11,17 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.store import Catalogue
 
 HELD_OUT_SEED = 1_000_000
-"""Seeds from here upward are never trained on; those below `FIGURES_SEED` are for development."""
+"""Seeds from here upward are never used for training; those below `FIGURES_SEED` are for development."""
 FIGURES_SEED = 2_000_000
-"""Seeds from here upward are for figures alone: nothing is tuned on their objects."""
+"""Seeds from here upward are for published figures only: nothing is tuned on their objects."""
 
 
 def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:
-    """Objects of a folder, or procedural ones.
+    """Returns the objects of a folder, or procedural ones.
 
     Args:
-      config: which objects.
-      shift: number of the actor: every actor has procedural objects of its own.
+      config: configuration of the objects.
+      shift: number of the actor; each actor has different procedural objects.
 
     Raises:
       CongraspError: the folder holds no object, or the count is not positive.
@@ -35,22 +35,24 @@ def load_pool(config: ObjectsConfig, shift: int = 0) -> list[GraspObject]:
             )
         return objects
     if config.count < 1:
-        raise CongraspError(f"A pool of {config.count} objects is empty.", "Set --objects.count to at least 1.")
+        raise CongraspError(
+            f"The pool is empty: objects.count is {config.count}.", "Set --objects.count to at least 1."
+        )
     return procedural.generate_many(config.count, first_seed(config, shift), config.families)
 
 
 def object_scale(hand: Hand, task: TaskConfig) -> float:
-    """Factor on the lengths of this task's objects: the task's, or else the hand's own."""
+    """Factor on object lengths: the task's, or else the hand's default."""
     return task.object_scale or hand.object_scale
 
 
 def scale_objects(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> list[GraspObject]:
-    """Objects in the size in which this hand grasps them."""
+    """Returns the objects in the size in which this hand grasps them."""
     return [obj.scaled(object_scale(hand, task), constant_mass=task.constant_mass) for obj in objects]
 
 
 def first_seed(config: ObjectsConfig, shift: int) -> int:
-    """The first seed of actor number `shift`: neighbours follow one another, and nobody reaches the held-out seeds."""
+    """First seed of actor number `shift`: ranges are disjoint and never reach the held-out seeds."""
     if config.seed >= HELD_OUT_SEED:
         return config.seed
     return (config.seed + shift * config.count) % max(1, HELD_OUT_SEED - config.count + 1)

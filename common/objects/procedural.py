@@ -1,4 +1,4 @@
-"""Procedural objects: any number of them from a seed, no two alike, with part labels and resting poses."""
+"""Procedural objects from seeds, with part labels and resting poses."""
 
 import dataclasses
 import zlib
@@ -25,47 +25,47 @@ GROUPS = {
     "all": (*BASIC_FAMILIES, *HOUSEHOLD_FAMILIES),
     "scans": tuple(SCANS),
 }
-"""Names that stand for several families; scans' kinds of shape are apart, so that pools of `all` stay the same."""
+"""Names of groups of families; shapes of scans are a separate group, so that pools of `all` do not change."""
 MASS_RANGE = (0.02, 0.6)
 """Kilograms."""
 _SETTLED = {True: (0.05, 0.5), False: (0.02, 0.5)}
-"""Kilograms between which basic families' objects, and the others, settle into their resting poses: masses may change
-without moving these by rounding errors."""
+"""Masses in kilograms at which objects settle into their resting poses: of basic families, and of the others. They are
+fixed so that a change of mass does not move resting poses by rounding errors."""
 _SIZE_RANGE, _HOUSEHOLD_SIZE_RANGE = (0.03, 0.25), (0.03, 0.3)
 _LEAST_SHARE = 0.1
 _ATTEMPTS = 100
 
 
 def generate(seed: int, family: str | None = None) -> GraspObject:
-    """A random object, the same for the same seed and family.
+    """Generates a random object, the same for the same seed and family.
 
-    Its largest side is between 3 and 25 cm (30 cm in household families) and its mass between 0.02 and 0.6 kg, and both
-    its graspable and its non-graspable region cover at least a tenth of the surface.
-    Mass and inertia are those of the sum of its pieces (overlaps count twice), scaled together where the mass had to
-    be brought into range.
+    Its largest side is between 3 and 25 cm (30 cm in household families) and its mass between 0.02 and 0.6 kg, . Both
+    its graspable and its avoid region cover at least a tenth of the surface. Mass and inertia are those of the sum of
+    its pieces (overlaps count twice), scaled together if the mass is out of range.
 
     Args:
-      seed: not negative; seeds from one million upward are kept for evaluation.
-      family: one of `FAMILIES`; one of the basic ones, chosen by the seed, if not given.
+      seed: not negative; seeds from one million upward are reserved for evaluation.
+      family: one of `FAMILIES`; by default a basic one chosen by the seed.
 
     Raises:
-      CongraspError: unknown family or negative seed.
+      CongraspError: the family is unknown or the seed negative.
     """
     _check(seed, () if family is None else (family,))
     if family is None:
         family = BASIC_FAMILIES[np.random.default_rng((seed, len(BASIC))).integers(len(BASIC))]
-    # By name, so that families come and go without changing the others' objects; basic ones keep their first numbers.
+    # Seeded by name, so that adding families does not change the objects of others; basic ones keep their first
+    # numbers.
     stream = BASIC_FAMILIES.index(family) if family in BASIC else zlib.crc32(family.encode())
     rng = np.random.default_rng((seed, stream))
     for _ in range(_ATTEMPTS):
         obj = _build(f"{family}_{seed}", family, BUILDERS[family](rng), rng)
         if obj is not None:
             return obj
-    raise RuntimeError(f"family {family} gave no usable object for seed {seed}")
+    raise RuntimeError(f"family {family} produced no valid object for seed {seed}")
 
 
 def generate_many(count: int, seed: int, families: Sequence[str] = ()) -> list[GraspObject]:
-    """`count` objects of the seeds `seed`, `seed` + 1, ..., whose families take turns.
+    """Generates `count` objects with the seeds `seed`, `seed` + 1, ..., cycling through the families.
 
     Args:
       count: number of objects.
@@ -73,13 +73,13 @@ def generate_many(count: int, seed: int, families: Sequence[str] = ()) -> list[G
       families: names of `FAMILIES` or `GROUPS`; empty means the basic ones.
 
     Raises:
-      CongraspError: unknown family or negative seed.
+      CongraspError: a family is unknown or the seed negative.
     """
     return parallel_map(generate, range(seed, seed + count), family_turns(count, seed, families))
 
 
 def family_turns(count: int, seed: int, families: Sequence[str] = ()) -> list[str]:
-    """The families of the objects of `generate_many`, in their order."""
+    """Families of the objects of `generate_many`, in order."""
     chosen = [name for entry in families or ("basic",) for name in GROUPS.get(entry, (entry,))]
     _check(seed, chosen)
     return [chosen[(seed + i) % len(chosen)] for i in range(count)]
@@ -97,7 +97,7 @@ def _check(seed: int, families: Sequence[str]) -> None:
 
 
 def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> GraspObject | None:
-    """The object of a draft, or None where its size or its parts are out of range."""
+    """Builds the object of a draft; returns None if its size or its parts are out of range."""
     sizes = _SIZE_RANGE if family in BASIC else _HOUSEHOLD_SIZE_RANGE
     weight = np.array(draft.weight or [1.0] * max(1, len(draft.part_names)))
     densities = rng.uniform(*draft.density) * weight[[piece.part for piece in draft.pieces]]

@@ -1,4 +1,4 @@
-"""Stable poses of an object on a table: found on its convex hull, then settled by physics."""
+"""Stable poses of an object on a table: computed from its convex hull, then settled by physics."""
 
 from typing import NamedTuple
 
@@ -10,26 +10,30 @@ from congrasp.common.objects.mjcf import CONTACT, add_object
 from congrasp.common.objects.spec import GraspObject, Piece
 
 MAX_POSES = 8
-_SAME_NORMAL = np.cos(np.radians(15))  # directions nearer than this count as one
-_SAME_KIND = 0.03  # poses whose heights differ by less than this share are turns of one another
+_SAME_NORMAL = np.cos(np.radians(15))  # tolerance at which two directions count as one
+_SAME_KIND = 0.03  # poses whose heights differ by less than this share count as rotations of one another
 _PER_KIND = 4
 _LEAST_LIKELY = 0.02
 _STILL = 1e-3  # m/s
 _SPEED_SECONDS = 0.025
-_FREE_SECONDS = 0.5  # after which an object that is not stable betrays itself by its speed
-_DROPS = ((0.03, 1.5e-6), (0.06, 5e-6))  # rad, m; a pose whose centre of mass a tilt lowers by more is not stable
+_FREE_SECONDS = 0.5  # time after which an unstable object is recognised by its speed
+_DROPS = (
+    (0.03, 1.5e-6),
+    (0.06, 5e-6),
+)  # rad, m; a pose is unstable if a tilt lowers its centre of mass by more than this
 _ROUNDS = 4
 _UPRIGHT = np.radians(30)
 
 
 class Settled(NamedTuple):
-    """Where physics has taken an object."""
+    """Result of settling an object."""
 
     pose: np.ndarray
-    """(7,) position and quaternion in the world."""
+    """(7,) position and quaternion in the world frame."""
     speed: float
-    """Bound of its fastest point's mean speed over the last 25 ms, m/s: linear plus angular speed times the object's
-    radius. A mean, because a contact that comes or goes makes a resting object's velocity jump for a single step."""
+    """Upper bound of the mean speed of its fastest point over the last 25 ms, m/s: linear plus angular speed times the
+    object's radius. It is a mean because an appearing or vanishing contact makes the velocity of a resting object jump
+    for one step."""
     moved: float
     """Distance of the centre of mass from its start, m."""
 
@@ -57,18 +61,18 @@ class TableScene:
         self.radius = float(np.linalg.norm(obj.visual_vertices, axis=-1).max())
 
     def settle(self, pose: np.ndarray, seconds: float, *, overdamped: bool = False) -> Settled:
-        """Lets the object move freely from rest.
+        """Simulates the object from rest.
 
         Args:
-          pose: (7,) where it starts.
+          pose: (7,) initial pose.
           seconds: simulated time.
-          overdamped: damps rotation so much that rocking dies out quickly; off, physics is the task's.
+          overdamped: damps rotation so strongly that rocking stops quickly; False gives the task's physics.
         """
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = pose
         damping = self.model.dof_damping.copy()
         if overdamped:
-            # A good part of the critical damping of a pendulum with the object's weight, size and inertia.
+            # A large part of the critical damping of a pendulum with the object's weight, size and inertia.
             inertia = self.model.body_inertia[1].max()
             self.model.dof_damping[3:] += 0.25 * np.sqrt(self.model.body_mass[1] * 9.81 * self.radius * inertia)
         steps = max(1, round(seconds / CONTACT.timestep))
@@ -86,16 +90,16 @@ class TableScene:
 
 
 def settle(obj: GraspObject, pose: np.ndarray, seconds: float) -> Settled:
-    """Lets an object move freely on the table for some seconds, from rest in a pose (7,)."""
+    """Simulates an object on the table for some seconds, from rest in a pose (7,)."""
     return TableScene(obj).settle(pose, seconds)
 
 
 def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
-    """Poses (R, 7), 1 <= R <= 8, in which the object rests still on the table, most likely first.
+    """Poses (R, 7), 1 <= R <= 8, in which the object rests on the table, most likely first.
 
-    The quasi-static poses are settled by physics, for `seconds` or a few times as long where that is not enough;
-    those that do not come to rest, those that a small tilt would lower and those that end in a pose found before are
-    left out. If none is left, the object is let go in the most likely one until it has come to rest.
+    Physics settles the quasi-static poses for `seconds`, or a few times as long if needed. Poses are dropped if they do
+    not come to rest, if a small tilt would lower them, or if they end in an earlier pose. If none remains, the most
+    likely one is simulated until the object rests.
     """
     candidates, _ = quasi_static_poses(obj.pieces)
     scene = TableScene(obj)
@@ -122,38 +126,38 @@ def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
 
 
 def upright_rest(obj: GraspObject) -> int | None:
-    """The resting pose in which the object's z axis is nearest to upright; None if it is 30 degrees off in all."""
+    """Index of the resting pose with the object's z axis closest to upright; None if it is 30 degrees off in all."""
     tilts = rest_tilts(obj)
     best = int(np.argmin(tilts))
     return best if tilts[best] < _UPRIGHT else None
 
 
 def rest_tilts(obj: GraspObject) -> np.ndarray:
-    """(R,) rad by which the object's z axis is tilted from upright in each of its resting poses."""
+    """Angles (R,) in rad between the object's z axis and upright in each of its resting poses."""
     up = [shapes.matrix(np.asarray(pose[3:], float))[2, 2] for pose in obj.rest_poses]
     return np.arccos(np.clip(np.array(up, float), -1.0, 1.0))
 
 
 def quasi_static_poses(pieces: tuple[Piece, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Poses in which the object can lie still, from its convex hull, most likely first.
+    """Poses in which the object can rest, from its convex hull, most likely first.
 
-    An object that touches the table with a facet beyond whose edge its centre of mass lies rolls over that edge onto
-    the next facet, until it lies on a facet below its centre of mass. A pose's likelihood is the solid angle, seen
-    from the centre of mass, of all the facets from which it ends there (quasi-static pose statistics; Goldberg et
-    al. 1999, "Part pose statistics: estimators and experiments"). Round pieces are faceted for this, and the
-    poses found are then moved to the lowest centre of mass nearby.
+    An object whose centre of mass lies beyond an edge of its supporting facet rolls over that edge onto the next facet,
+    until the facet is below the centre of mass. A pose's likelihood is the solid angle, seen from the centre of mass,
+    of all facets from which the object ends there (quasi-static pose statistics; Goldberg et al. 1999, "Part pose
+    statistics: estimators and experiments"). Round pieces are faceted for this; the resulting poses are then moved to
+    the nearest minimum of the centre of mass's height.
 
     Args:
       pieces: convex pieces in the object frame, whose origin is the centre of mass.
 
     Returns:
-      Poses (R, 7), 1 <= R <= 8, on the table's top z = 0 with x = y = 0 and arbitrary heading, and their
-      likelihoods (R,), without those of the unlikely poses that were left out.
+      Poses (R, 7), 1 <= R <= 8, on the table's top z = 0 with x = y = 0 and arbitrary heading, and their likelihoods
+      (R,). Unlikely poses are dropped.
     """
     hull = shapes.hull_of(np.concatenate([shapes.tessellate(piece)[0] for piece in pieces]))
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
     corners = hull.points[hull.simplices]
-    # How far the foot of the centre of mass lies beyond the edge opposite to each corner.
+    # Distance of the projected centre of mass beyond the edge opposite to each corner.
     foot = -offsets[:, None] * normals
     start, along = np.roll(corners, -1, 1), np.roll(corners, -2, 1) - np.roll(corners, -1, 1)
     outward = np.cross(along, normals[:, None])
@@ -178,12 +182,12 @@ def quasi_static_poses(pieces: tuple[Piece, ...]) -> tuple[np.ndarray, np.ndarra
 
 
 def _height(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
-    """Height (D,) of the centre of mass above a plane that the object touches with directions (D, 3) downwards."""
+    """Heights (D,) of the centre of mass above the table, with directions (D, 3) of the object downwards."""
     return np.max([shapes.support(piece, downs) for piece in pieces], axis=0)
 
 
 def _lowest_nearby(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
-    """Directions (D, 3) near to those given with a lower centre of mass, by pattern search on the sphere."""
+    """Directions (D, 3) near the given ones with a lower centre of mass, by pattern search on the sphere."""
     best, height = downs, _height(pieces, downs)
     columns = np.arange(len(best))
     step = 0.1
@@ -199,13 +203,13 @@ def _lowest_nearby(pieces: tuple[Piece, ...], downs: np.ndarray) -> np.ndarray:
 
 
 def _stable(pieces: tuple[Piece, ...], down: np.ndarray) -> bool:
-    """Whether no small tilt lowers the centre of mass of an object with a direction (3,) downwards."""
+    """True if no small tilt lowers the centre of mass of an object with a direction (3,) downwards."""
     height = _height(pieces, down[None])[0]
     return all(_height(pieces, _cone(down[None], tilt, 64)[:, 0]).min() > height - drop for tilt, drop in _DROPS)
 
 
 def _cone(axes: np.ndarray, slope: float, count: int, phase: float = 0.0) -> np.ndarray:
-    """Unit directions (count, D, 3) around each axis (D, 3), the arc tangent of `slope` away from it."""
+    """Unit directions (count, D, 3) around each axis (D, 3), at the arc tangent of `slope` from it."""
     side = np.cross(axes, np.eye(3)[np.abs(axes).argmin(-1)])
     side /= np.linalg.norm(side, axis=-1, keepdims=True)
     turn = (2 * np.pi / count * np.arange(count) + phase)[:, None, None]
@@ -223,7 +227,7 @@ def _solid_angles(corners: np.ndarray) -> np.ndarray:
 
 
 def _merge(downs: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions and weights, likeliest first, after adding to each the weights of those close to it."""
+    """Merges close directions; returns directions and summed weights, most likely first."""
     order = np.argsort(-weights, kind="stable")
     downs, weights = downs[order], weights[order].copy()
     close = downs @ downs.T > _SAME_NORMAL
@@ -239,7 +243,7 @@ def _merge(downs: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _choose(heights: np.ndarray, weights: np.ndarray) -> list[int]:
-    """Indices of at most eight poses, likely ones, not too many of which are turns of one another."""
+    """Indices of at most eight likely poses, with few rotations of one another."""
     chosen: list[int] = []
     for i, (height, weight) in enumerate(zip(heights, weights, strict=True)):
         alike = sum(abs(heights[k] - height) < _SAME_KIND * height for k in chosen)
@@ -249,7 +253,7 @@ def _choose(heights: np.ndarray, weights: np.ndarray) -> list[int]:
 
 
 def _upright(down: np.ndarray) -> np.ndarray:
-    """Quaternion (4,) of the smallest rotation that points a direction (3,) of the object downwards."""
+    """Quaternion (4,) of the smallest rotation that turns a direction (3,) of the object downwards."""
     if down[2] > 1 - 1e-9:
         return np.array([0.0, 1.0, 0.0, 0.0])
     q = np.array([1.0 - down[2], -down[1], down[0], 0.0])

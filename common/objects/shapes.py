@@ -14,19 +14,19 @@ _SEGMENTS = 24
 
 
 def rotation(piece: Piece) -> np.ndarray:
-    """(3, 3) rotation from the piece's frame to the object frame."""
+    """Rotation (3, 3) from the piece's frame to the object frame."""
     return matrix(piece.quat)
 
 
 def matrix(quat: Sequence[float] | np.ndarray) -> np.ndarray:
-    """(3, 3) rotation of a unit quaternion (w, x, y, z)."""
+    """Rotation matrix (3, 3) of a unit quaternion (w, x, y, z)."""
     flat = np.empty(9)
     mujoco.mju_quat2Mat(flat, np.asarray(quat, np.float64))
     return flat.reshape(3, 3)
 
 
 def hull_of(vertices: np.ndarray) -> ConvexHull:
-    """Convex hull of (V, 3) points; its facets' `equations` point outwards. The last few hulls are remembered.
+    """Convex hull of points (V, 3); the `equations` of its facets point outwards. The last few hulls are cached.
 
     Raises:
       scipy.spatial.QhullError: the points lie in a plane.
@@ -41,13 +41,13 @@ def _hull(data: bytes) -> ConvexHull:
 
 
 def triangulate(vertices: np.ndarray) -> trimesh.Trimesh:
-    """The convex hull of (V, 3) points as a closed mesh whose faces wind outwards; do not change it, it is shared."""
+    """Convex hull of points (V, 3) as a closed mesh with outward normals; it is cached and must not be modified."""
     return _triangulated(np.ascontiguousarray(vertices, np.float64).tobytes())
 
 
 @functools.lru_cache(maxsize=32)
 def _triangulated(data: bytes) -> trimesh.Trimesh:
-    """The mesh of such a hull."""
+    """Mesh of the hull of points given as bytes of float64."""
     hull = _hull(data)
     vertices, faces = hull.points, hull.simplices
     corners = vertices[faces]
@@ -87,7 +87,7 @@ def unit_inertia(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
         elif piece.kind == "cylinder":
             squares = np.array([a**2 / 4, a**2 / 4, b**2 / 3])
         else:
-            # A cylinder and two half balls whose own centres are 3a/8 beyond its ends.
+            # A cylinder and two half balls whose centres of mass are 3a/8 beyond its ends.
             cylinder, ball = 2 * np.pi * a**2 * b, 4 / 3 * np.pi * a**3
             axial = cylinder * b**2 / 3 + ball * (a**2 / 5 + b**2 + 3 * a * b / 4)
             radial = cylinder * a**2 / 4 + ball * a**2 / 5
@@ -98,7 +98,7 @@ def unit_inertia(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
 
 
 def contains(piece: Piece, points: np.ndarray) -> np.ndarray:
-    """(N,) whether points (N, 3) of the object frame lie inside the piece."""
+    """Mask (N,) of the points (N, 3) of the object frame that lie inside the piece."""
     x = (points - np.asarray(piece.pos)) @ rotation(piece)
     a, b, c = piece.size
     if piece.kind == "box":
@@ -115,7 +115,7 @@ def contains(piece: Piece, points: np.ndarray) -> np.ndarray:
 
 
 def support(piece: Piece, directions: np.ndarray) -> np.ndarray:
-    """(D,) the largest coordinate of the piece along unit directions (D, 3) of the object frame."""
+    """Largest coordinate (D,) of the piece along unit directions (D, 3) of the object frame."""
     d = directions @ rotation(piece)
     a, b, c = piece.size
     if piece.kind == "box":
@@ -132,7 +132,7 @@ def support(piece: Piece, directions: np.ndarray) -> np.ndarray:
 
 
 def proposal_area(piece: Piece) -> float:
-    """Area from which `propose` draws; larger than the surface's area where `propose` thins its points out."""
+    """Area from which `propose` draws; larger than the surface's area where `propose` rejects points."""
     a, b, c = piece.size
     if piece.kind == "box":
         return 8 * (a * b + b * c + c * a)
@@ -146,11 +146,12 @@ def proposal_area(piece: Piece) -> float:
 
 
 def propose(piece: Piece, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points that are uniform on the piece's surface where `u` (N, 4) is uniform in the unit cube.
+    """Samples points uniformly on the piece's surface for `u` (N, 4) uniform in the unit cube.
 
     Returns:
-      Points (N, 3) and outward unit normals (N, 3) in the object frame, and (N,) which of them to keep (all of them
-      but for ellipsoids, where the map from the sphere is thinned out in proportion to its stretch of area).
+      Points (N, 3) and outward unit normals (N, 3) in the object frame, and a mask (N,) of points to keep. It is True
+      everywhere except for ellipsoids, where points are rejected to correct the area distortion of the map from the
+      sphere.
     """
     a, b, c = piece.size
     keep = np.ones(len(u), bool)
@@ -174,10 +175,10 @@ def propose(piece: Piece, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def on_triangles(triangles: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points that are uniform on triangles (F, 3, 3) where `u` (N, >= 3) is uniform in the unit cube.
+    """Samples points uniformly on triangles (F, 3, 3) for `u` (N, >= 3) uniform in the unit cube.
 
     Returns:
-      Points (N, 3), unit normals (N, 3) by the right-hand rule, and (N,) index of each point's triangle.
+      Points (N, 3), unit normals (N, 3) by the right-hand rule, and indices (N,) of each point's triangle.
     """
     crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     doubled = np.linalg.norm(crosses, axis=-1)
@@ -189,7 +190,7 @@ def on_triangles(triangles: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) in the object frame, on the surface, and faces (F, 3) winding outwards."""
+    """Vertices (V, 3) on the surface in the object frame, and faces (F, 3) with outward normals."""
     a, b, c = piece.size
     if piece.kind == "mesh":
         mesh = triangulate(_vertices(piece))
@@ -204,7 +205,7 @@ def tessellate(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mesh_of(pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float32 and faces (F, 3) int32 of all pieces, one after the other, in the object frame."""
+    """Vertices (V, 3) float32 and faces (F, 3) int32 of all pieces, concatenated, in the object frame."""
     meshes = [tessellate(piece) for piece in pieces]
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes[:-1])])
     vertices = np.concatenate([vertices for vertices, _ in meshes]).astype(np.float32)
@@ -219,20 +220,20 @@ def _template(kind: str) -> tuple[np.ndarray, np.ndarray]:
     elif kind == "cylinder":
         mesh = trimesh.creation.cylinder(1.0, 2.0, sections=_SEGMENTS)
     else:
-        # An even number of rings leaves none on the equator, where a capsule is cut in two.
+        # An even number of rings has none on the equator, where a capsule is cut in two.
         mesh = trimesh.creation.uv_sphere(1.0, count=(9 if kind == "capsule" else 10, _SEGMENTS // 2))
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 def _vertices(piece: Piece) -> np.ndarray:
-    """(V, 3) vertices of a mesh piece."""
+    """Vertices (V, 3) of a mesh piece."""
     if piece.vertices is None:
         raise ValueError(f"a {piece.kind} piece has no vertices")
     return piece.vertices
 
 
 def _sphere(u: np.ndarray) -> np.ndarray:
-    """Points (n, 3) spread evenly over the unit sphere by random numbers (n, 2 or more)."""
+    """Points (n, 3) distributed evenly over the unit sphere, from random numbers (n, 2 or more)."""
     z = 2 * u[:, 0] - 1
     ring, turn = np.sqrt(1 - z**2), 2 * np.pi * u[:, 1]
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], -1)
@@ -270,7 +271,7 @@ def _propose_cylinder(radius: float, half: float, u: np.ndarray) -> tuple[np.nda
 
 def _propose_capsule(radius: float, half: float, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points and normals (n, 3) on a capsule along z."""
-    # A sphere's area is uniform along its axis, as is a cylinder's: one coordinate runs over both.
+    # The area of a sphere is uniform along its axis, like that of a cylinder: one coordinate covers both.
     along = (2 * u[:, 0] - 1) * (radius + half)
     center = np.clip(along, -half, half)
     z = (along - center) / radius

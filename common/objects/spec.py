@@ -1,6 +1,7 @@
-"""What an object is to this project: convex pieces, a labelled surface, mass and resting poses.
+"""Specification of an object: convex pieces, a labelled surface, mass and resting poses.
 
-The object frame has its origin at the centre of mass; its orientation is the author's. Quaternions are (w, x, y, z).
+The object frame has its origin at the centre of mass; its orientation is that of the source. Quaternions are (w, x, y,
+z).
 """
 
 import dataclasses
@@ -8,14 +9,16 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from congrasp.common import mirror
+
 PieceKind = Literal["box", "cylinder", "capsule", "ellipsoid", "mesh"]
 SURFACE_POINTS = 512
 COLOUR_POINTS = 32_768
-"""Points of an object's surface whose colours are known, if it has any of its own."""
+"""Greatest number of coloured surface points, if the object has colours."""
 PRIMITIVE_SLOTS = {"box": 3, "cylinder": 2, "capsule": 3, "ellipsoid": 2}
-"""Most pieces of each kind in a primitive object: the geoms that a batched environment keeps for its object."""
+"""Most pieces of each kind in a primitive object: the geoms reserved for the object in a batched environment."""
 SURFACE_ERROR, VOLUME_ERROR = 0.005, 0.5
-"""m, and share of the mesh's volume, from which an imported shape is unreliable."""
+"""Deviation in m, and as a share of the mesh's volume, from which an imported shape is unreliable."""
 MAX_MESH_PIECES = 48
 """Most convex pieces of an object with mesh pieces."""
 MAX_MESH_VERTICES = 64
@@ -26,8 +29,8 @@ MAX_MESH_VERTICES = 64
 class Piece:
     """A convex collision piece in the object frame.
 
-    `size` follows MuJoCo: half extents of a box; radius and half length (along z) of a cylinder or capsule; radii of
-    an ellipsoid; zeros for a mesh, whose `vertices` (V, 3) are in the piece's own frame (`pos`, `quat`).
+    `size` follows MuJoCo: half extents of a box; radius and half length (along z) of a cylinder or capsule; radii of an
+    ellipsoid; zeros for a mesh, whose `vertices` (V, 3) are in the piece's frame (`pos`, `quat`).
     """
 
     kind: PieceKind
@@ -40,7 +43,7 @@ class Piece:
 
 
 class Colours(NamedTuple):
-    """What a surface looks like at points of it; in between it looks like the nearest of them."""
+    """Colours of surface points; elsewhere the colour is that of the nearest point."""
 
     points: np.ndarray
     """(P, 3) float32, m."""
@@ -50,13 +53,13 @@ class Colours(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class GraspObject:
-    """An entry of the catalogue.
+    """An object of the catalogue.
 
     Shapes: `points`, `normals` (512, 3), outward unit normals; `labels` (512,) part index of each surface point;
-    `graspable` (parts,) bool, which of them may be grasped by default; `inertia` (3, 3) about the centre of mass,
-    kg.m^2; `rest_poses` (R, 7) position and quaternion in the world with the table's top at z = 0;
-    `visual_vertices` (V, 3), `visual_faces` (F, 3) for pictures, in the object frame; `origin` (3,) where the origin of
-    the file that it was imported from lies in the object frame.
+    `graspable` (parts,) bool, parts that may be grasped by default; `inertia` (3, 3) about the centre of mass, kg.m^2;
+    `rest_poses` (R, 7) position and quaternion in the world frame, with the table's top at z = 0; `visual_vertices` (V,
+    3), `visual_faces` (F, 3) for pictures, in the object frame; `origin` (3,) origin of the imported file in the object
+    frame.
     """
 
     name: str
@@ -74,35 +77,60 @@ class GraspObject:
     visual_faces: np.ndarray
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     file_scale: float = 1.0
-    """Metres per unit of that file."""
+    """Metres per unit of the imported file."""
     notes: tuple[str, ...] = ()
-    """What its import mended, or what else the user should know."""
+    """Repairs made by the import, and other remarks for the user."""
     surface_error: float | None = None
-    """Hausdorff distance of the pieces' surface from the mesh's that was imported, m."""
+    """Hausdorff distance between the surface of the pieces and that of the imported mesh, m."""
     volume_error: float | None = None
-    """(Volume of the pieces' union - the mesh's) / the mesh's; None where the mesh was open, too."""
+    """(Volume of the pieces' union - the mesh's) / the mesh's; None if the mesh was open."""
     colours: Colours | None = None
-    """Its own, in the object frame."""
+    """Colours of the surface, in the object frame."""
 
     @property
     def shape_reliable(self) -> bool:
-        """True if the pieces are close enough to the imported mesh for a grasp of them to be one of it."""
+        """True if the pieces are close enough to the imported mesh for their grasps to transfer to it."""
         surface, volume = self.surface_error or 0.0, self.volume_error or 0.0
         return surface <= SURFACE_ERROR and abs(volume) <= VOLUME_ERROR
 
     @property
     def non_graspable_points(self) -> np.ndarray:
-        """(512,) whether each surface point belongs to the avoid region."""
+        """(512,) bool: surface points of the avoid region."""
         return ~self.graspable[self.labels]
 
+    def mirrored(self) -> "GraspObject":
+        """The mirror image of the object, point by point and resting pose by resting pose (`common.mirror`)."""
+        sides = np.array([-1.0, 1.0, 1.0])
+
+        def piece(own: Piece) -> Piece:
+            """A mirrored piece; all kinds but meshes are symmetric in their own frames."""
+            (x, y, z), (a, b, c, d) = own.pos, own.quat
+            vertices = None if own.vertices is None else mirror.vector(own.vertices)
+            return dataclasses.replace(own, pos=(-x, y, z), quat=(a, b, -c, -d), vertices=vertices)
+
+        x, y, z = self.origin
+        rest = self.rest_poses
+        return dataclasses.replace(
+            self,
+            pieces=tuple(map(piece, self.pieces)),
+            inertia=self.inertia * np.outer(sides, sides),
+            points=mirror.vector(self.points),
+            normals=mirror.vector(self.normals),
+            rest_poses=np.concatenate([mirror.vector(rest[:, :3]), mirror.quaternion(rest[:, 3:])], -1),
+            visual_vertices=mirror.vector(self.visual_vertices),
+            visual_faces=self.visual_faces[:, ::-1],
+            origin=(-x, y, z),
+            colours=self.colours and self.colours._replace(points=mirror.vector(self.colours.points)),
+        )
+
     def scaled(self, factor: float, *, constant_mass: bool = False) -> "GraspObject":
-        """The object with every length times `factor`, of the same density or, with `constant_mass`, mass."""
+        """Scales all lengths by `factor`, at the same density or, with `constant_mass`, the same mass."""
         if factor == 1.0:
             return self
         heavier = 1.0 if constant_mass else factor**3
 
         def longer(vector: tuple[float, float, float]) -> tuple[float, float, float]:
-            """A vector times the factor."""
+            """Returns the vector times the factor."""
             x, y, z = (factor * length for length in vector)
             return x, y, z
 

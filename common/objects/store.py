@@ -16,7 +16,7 @@ from congrasp.common.wire.codec import Message, decode, encode
 
 SUFFIX = ".safetensors"
 MAX_BYTES = 64 << 20
-"""Bytes that an object file may have."""
+"""Largest size of an object file in bytes."""
 _FORMAT = 1
 _KINDS = ("box", "cylinder", "capsule", "ellipsoid", "mesh")
 _ERRORS = ("surface_error", "volume_error")
@@ -24,12 +24,12 @@ _ARRAYS = ("graspable", "inertia", "points", "normals", "labels", "rest_poses", 
 
 
 def digest(obj: GraspObject) -> str:
-    """Sixteen hex digits that identify the object's content."""
+    """Returns sixteen hex digits that identify the object's content."""
     return hashlib.sha256(encode(_to_message(obj))).hexdigest()[:16]
 
 
 def save(obj: GraspObject, path: str | os.PathLike[str]) -> None:
-    """Writes an object; the file appears complete or not at all.
+    """Writes an object atomically.
 
     Raises:
       CongraspError: the file cannot be written.
@@ -41,12 +41,14 @@ def load(path: str | os.PathLike[str]) -> GraspObject:
     """Reads an object. Its arrays are read-only.
 
     Raises:
-      CongraspError: no such file, another kind of file, damaged content, or values that no object has (`faults`).
+      CongraspError: the file is missing, of another kind, damaged, or has implausible values (`faults`).
     """
     path = pathlib.Path(path)
-    remedy = "Make it anew with 'congrasp objects import' or 'congrasp objects generate'."
+    remedy = "Run 'congrasp objects import' or 'congrasp objects generate' again."
     if not path.exists():
-        raise CongraspError(f"There is no object file {path}.", "'congrasp objects list' shows what a folder holds.")
+        raise CongraspError(
+            f"There is no object file {path}.", "'congrasp objects list' shows the content of a folder."
+        )
     try:
         message = decode(read_file(path, MAX_BYTES))
     except (CongraspError, OSError) as error:
@@ -56,7 +58,7 @@ def load(path: str | os.PathLike[str]) -> GraspObject:
     try:
         obj = _from_message(message)
     except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
-        raise CongraspError(f"{path} lacks a part of an object: {error}.", remedy) from None
+        raise CongraspError(f"{path} lacks an array or a field: {error}.", remedy) from None
     for fault in faults(obj):
         raise CongraspError(f"{path}: {fault}.", remedy)
     return obj
@@ -81,21 +83,21 @@ class Catalogue:
         return sorted(path.stem for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith("."))
 
     def get(self, name: str) -> GraspObject:
-        """The object of a name.
+        """Returns the object of this name.
 
         Raises:
-          CongraspError: there is none, or its file is damaged.
+          CongraspError: there is no such object, or its file is damaged.
         """
         return load(self.path(name))
 
     def add(self, obj: GraspObject) -> pathlib.Path:
-        """Stores an object under its name, in place of one with the same name; returns the file."""
+        """Stores an object under its name, replacing one of the same name; returns the file."""
         path = self.path(obj.name)
         save(obj, path)
         return path
 
     def path(self, name: str) -> pathlib.Path:
-        """The file of a name.
+        """Returns the file of a name.
 
         Raises:
           CongraspError: the name cannot be a file name.
@@ -104,7 +106,7 @@ class Catalogue:
 
 
 def _to_message(obj: GraspObject) -> Message:
-    """The object as a message."""
+    """Returns the object as a message."""
     arrays = {name: np.asarray(getattr(obj, name)) for name in _ARRAYS}
     if obj.colours:
         arrays |= {"colour_points": obj.colours.points, "colour_values": obj.colours.values}
@@ -138,7 +140,7 @@ def _to_message(obj: GraspObject) -> Message:
 
 
 def _from_message(message: Message) -> GraspObject:
-    """The object of a message; a KeyError, IndexError or ValueError where a part is missing."""
+    """Returns the object of a message; raises KeyError, IndexError or ValueError if a field is missing or invalid."""
     arrays, meta = message.arrays, message.meta
     ends = np.cumsum(arrays["piece_vertex_count"])
     vertices = np.split(arrays["piece_vertices"], ends[:-1])

@@ -5,8 +5,8 @@ import numpy as np
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import SURFACE_POINTS, Piece
 
-_SEAM = 2e-4  # m; a point is outside if it still is after this step along its normal
-_REACHABLE = 4e-3  # m; a mesh's surface counts as open if the collision pieces end within this distance
+_SEAM = 2e-4  # m; a point is on the outer surface if a step of this length along its normal leaves all pieces
+_REACHABLE = 4e-3  # m; a mesh's surface counts as accessible if the collision pieces end within this distance
 # The generalised golden ratio of four dimensions: the positive root of x^5 = x + 1 (Roberts' R4 sequence).
 _STRIDE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
@@ -14,18 +14,18 @@ _STRIDE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 def sample_union(
     pieces: tuple[Piece, ...], rng: np.random.Generator, count: int = SURFACE_POINTS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points that are evenly distributed over the outer surface of the pieces' union.
+    """Samples points evenly over the outer surface of the union of pieces.
 
-    The points follow a low-discrepancy sequence with a random start, so that the first few of them cover the
-    surface as well as all of them. Points of one piece inside another are left out.
+    The points follow a low-discrepancy sequence with a random start, so that any prefix covers the surface evenly.
+    Points of one piece inside another are dropped.
 
     Args:
       pieces: the convex pieces, in the object frame.
-      rng: draws the start of the sequence.
+      rng: generator for the start of the sequence.
       count: number of points N.
 
     Returns:
-      Points (N, 3) and outward unit normals (N, 3) in the object frame, and (N,) index of each point's piece.
+      Points (N, 3) and outward unit normals (N, 3) in the object frame, and indices (N,) of each point's piece.
     """
     edges = np.cumsum([shapes.proposal_area(piece) for piece in pieces])
     starts = np.concatenate([[0.0], edges[:-1]])
@@ -59,21 +59,21 @@ def sample_mesh(
     oriented: bool,
     count: int = SURFACE_POINTS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points on the part of a mesh that a finger can reach.
+    """Samples points on the part of a mesh that a finger can reach.
 
-    Points that lie more than a few millimetres below the surface of the collision pieces (inner walls, hollows that
-    the pieces fill) are left out, unless that would leave less than a quarter.
+    Points that lie more than a few millimetres below the surface of the collision pieces (inner walls, hollows filled
+    by the pieces) are dropped, unless less than a quarter would remain.
 
     Args:
       triangles: (F, 3, 3) corners.
       pieces: collision pieces in the same frame.
-      rng: draws the start of the low-discrepancy sequence.
-      oriented: whether the triangles wind outwards everywhere; if not, normals that point into the pieces where the
-        other side is free are turned.
+      rng: generator for the start of the low-discrepancy sequence.
+      oriented: True if all triangles have outward normals; otherwise, normals that point into the pieces while the
+        other side is free are flipped.
       count: number of points N.
 
     Returns:
-      Points (N, 3), outward unit normals (N, 3), and (N,) index of each point's triangle.
+      Points (N, 3), outward unit normals (N, 3), and indices (N,) of each point's triangle.
     """
     points, normals, face = shapes.on_triangles(triangles, _sequence(rng.random(4), 0, 8 * count))
     outer, inner = (
@@ -106,14 +106,14 @@ def halves(points: np.ndarray, cut: float) -> np.ndarray:
 
 
 def _sequence(offset: np.ndarray, start: int, count: int) -> np.ndarray:
-    """(count, 4) points of the low-discrepancy sequence in the unit cube, from index `start` on."""
+    """Points (count, 4) of the low-discrepancy sequence in the unit cube, from index `start` on."""
     return (offset + np.arange(start, start + count)[:, None] * _STRIDE) % 1.0
 
 
 def mass_properties(pieces: tuple[Piece, ...], densities: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass (kg), centre of mass (3,) and inertia (3, 3) about it, in the frame of the pieces.
 
-    The object is taken as the sum of its pieces: where pieces overlap, their densities add up.
+    The object is the sum of its pieces: densities add where pieces overlap.
 
     Args:
       pieces: the convex pieces.

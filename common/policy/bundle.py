@@ -1,7 +1,7 @@
-"""The policy bundle: weights, critic and normalisers of one version, as one immutable unit.
+"""Policy bundle: weights, critic and normalisers of one version, as one immutable unit.
 
-It is what the learner publishes, what actors and the policy server act with, and what comes with the package. Acting
-normalises with the bundle's own statistics, so that a log probability belongs to exactly one bundle.
+The learner publishes bundles, actors and the policy server act with them, and the package ships some. Acting normalises
+with the bundle's statistics, so that a log probability belongs to exactly one bundle.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common.config import NetworkConfig, TaskConfig, with_older_critic, with_older_physics
+from congrasp.common.config import NetworkConfig, TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import check_reference, get_hand
 from congrasp.common.io.files import write_atomically
@@ -32,17 +32,18 @@ from congrasp.common.task import privileged
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
-FORMAT = 1
+FORMAT = 2
+_SCHEMA = 1
 _MALFORMED = (LookupError, AttributeError, TypeError, ValueError, OverflowError)
-_REMEDY = "Use a bundle made by 'congrasp train' of this version."
+_REMEDY = "Use a bundle from 'congrasp train' of this version."
 
 
 @dataclasses.dataclass(frozen=True)
 class PolicySpec:
-    """What a policy's arrays mean: whose observation goes in, whose action comes out, and the networks between."""
+    """Interface of a policy's arrays: hand, observation layout, and sizes of the networks."""
 
     hand: str
-    """The hand's reference: its name, or all of its file if it is none of the package."""
+    """Reference of the hand: its name, or the text of its file for a custom hand."""
     layout: Layout
     """Names and sizes of the observation's blocks."""
     action_size: int
@@ -50,12 +51,12 @@ class PolicySpec:
     network: NetworkConfig
     """Sizes of the networks."""
     privileged: Layout = ()
-    """Names and sizes of the critic's privileged inputs (`common.task.privileged`); no part of the schema, because
-    acting needs none of them."""
+    """Names and sizes of the critic's privileged inputs (`common.task.privileged`); not part of the schema, because
+    acting does not use them."""
 
     @property
     def privileged_size(self) -> int:
-        """P."""
+        """P, the number of the critic's privileged inputs."""
         return sum(size for _, size in self.privileged)
 
     @property
@@ -65,23 +66,23 @@ class PolicySpec:
 
     @functools.cached_property
     def schema(self) -> str:
-        """Sixteen hex digits that two policies share if one can stand in for the other."""
+        """Sixteen hex digits shared by policies that can replace each other."""
         sizes = [self.network.hidden, self.network.encoder]
-        text = json.dumps([FORMAT, self.hand, self.layout, self.action_size, sizes])
+        text = json.dumps([_SCHEMA, self.hand, self.layout, self.action_size, sizes])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def require(self, spec: "PolicySpec", source: str) -> None:
-        """Raises `CongraspError` unless `spec`, which is that of `source`, is this one."""
+        """Raises a `CongraspError` unless `spec`, that of `source`, equals this one."""
         if spec.schema != self.schema:
             raise CongraspError(
-                f"The policy {source} is for hand '{spec.hand_name}' (schema {spec.schema}), but hand "
-                f"'{self.hand_name}' (schema {self.schema}) is needed.",
-                "Choose a policy of this hand, task and network, or change them.",
+                f"The policy {source} is for hand '{spec.hand_name}' (schema {spec.schema}), not for hand "
+                f"'{self.hand_name}' (schema {self.schema}).",
+                "Use a policy of this hand, task and network, or change them.",
             )
 
 
 def policy_spec(task: TaskConfig, sizes: NetworkConfig) -> PolicySpec:
-    """The spec of a task's policy."""
+    """Returns the spec of a task's policy."""
     hand = get_hand(task.hand)
     return PolicySpec(
         hand=hand.reference,
@@ -93,12 +94,12 @@ def policy_spec(task: TaskConfig, sizes: NetworkConfig) -> PolicySpec:
 
 
 def full_layout(task: TaskConfig) -> Layout:
-    """The layout of a policy's observation that sees all of the task, whatever this one's sees."""
+    """Layout of the full observation of the task, even if its policy observes less."""
     return task_observation.layout(get_hand(task.hand), dataclasses.replace(task, observation="full"))
 
 
 class InferenceParameters(NamedTuple):
-    """The part of a bundle that inference needs; the first argument of `mean_action` and `sample_action`."""
+    """Part of a bundle that inference uses; an argument of `mean_action` and `sample_action`."""
 
     params: Params
     normalization: Affine
@@ -106,42 +107,42 @@ class InferenceParameters(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PolicyBundle:
-    """One version of a policy with everything needed to act or to go on training."""
+    """One version of a policy with everything needed to act or to resume training."""
 
     spec: PolicySpec
-    """What the arrays mean."""
+    """Interface of the arrays."""
     task: TaskConfig
-    """The task that it was trained on."""
+    """Task of the training."""
     params: Params
-    """Actor and critic (`common.policy.network`)."""
+    """Parameters of actor and critic (`common.policy.network`)."""
     observation: Statistics
-    """Of observations."""
+    """Statistics of the observations."""
     value: Statistics
-    """Of returns."""
+    """Statistics of the returns."""
     version: int
-    """Rises with every update of a run, also over restarts of its learner."""
+    """Increases with every update of a run, also across restarts of its learner."""
     run_id: str
-    """Identity of the run's beginning: another one when training restarts from scratch, the same after a resume."""
+    """Identifier of the run's start: new when training restarts from scratch, unchanged by a resume."""
     transitions: int
-    """Environment steps that it was trained on."""
+    """Environment steps of the training."""
     privileged: Statistics | None = None
-    """Of the critic's privileged inputs; None: it has none, or there are no samples."""
+    """Statistics of the critic's privileged inputs; None without inputs or samples."""
 
     @functools.cached_property
     def inference_parameters(self) -> InferenceParameters:
-        """The actor and the frozen normalisation, on the default device."""
+        """Actor and frozen normalisation, on the default device."""
         affine = normalizer.observation_affine(self.observation, self.spec.layout)
         return InferenceParameters(*jax.device_put(({"actor": self.params["actor"]}, affine)))
 
     def to_message(self) -> Message:
-        """The bundle as arrays and meta data; arrays are shared, not copied."""
+        """Returns the bundle as arrays and metadata; arrays are shared, not copied."""
         tree = {**self.params, "observation": self.observation._asdict(), "value": self.value._asdict()}
         if self.spec.privileged:
             tree["privileged"] = (self.privileged or normalizer.empty((self.spec.privileged_size,)))._asdict()
         meta = {
             "format": FORMAT,
             "version": self.version,
-            "epoch": self.run_id,
+            "run_id": self.run_id,
             "transitions": self.transitions,
             "schema": self.spec.schema,
             "hand": self.spec.hand,
@@ -155,14 +156,14 @@ class PolicyBundle:
 
     @staticmethod
     def from_message(message: Message, source: str = "bundle") -> "PolicyBundle":
-        """The inverse of `to_message`.
+        """Returns the bundle of a message; the inverse of `to_message`.
 
         Args:
           message: a bundle.
-          source: what to call it in errors.
+          source: name of the bundle in errors.
 
         Raises:
-          CongraspError: if entries are missing, of another shape, or not finite, naming the first.
+          CongraspError: an entry is missing, has the wrong shape, or is not finite; the message names the first.
         """
         meta = message.meta
         if meta.get("format") != FORMAT:
@@ -172,20 +173,20 @@ class PolicyBundle:
                 hand=check_reference(meta["hand"]),
                 layout=tuple((str(name), int(size)) for name, size in meta["layout"]),
                 action_size=int(meta["action_size"]),
-                network=_dataclass(NetworkConfig, with_older_critic(meta["network"])),
-                privileged=tuple((str(name), int(size)) for name, size in meta.get("privileged", ())),
+                network=_dataclass(NetworkConfig, meta["network"]),
+                privileged=tuple((str(name), int(size)) for name, size in meta["privileged"]),
             )
-            task = _dataclass(TaskConfig, with_older_physics(meta["task"]))
-            version, run_id, transitions = int(meta["version"]), str(meta["epoch"]), int(meta["transitions"])
+            task = _dataclass(TaskConfig, meta["task"])
+            version, run_id, transitions = int(meta["version"]), str(meta["run_id"]), int(meta["transitions"])
             inputs = (*spec.layout, *spec.privileged)
             for fault in (*network_faults(spec.network, inputs, spec.action_size), *task_faults(task)):
                 raise ValueError(fault)
             shapes = _shapes(spec)
         except (*_MALFORMED, CongraspError, dacite.DaciteError) as error:
             why = str(error).rstrip(".")[:200]
-            raise CongraspError(f"The policy {source} has bad meta data: {why}.", _REMEDY) from None
+            raise CongraspError(f"The policy {source} has invalid metadata: {why}.", _REMEDY) from None
         if meta.get("schema") != spec.schema:
-            raise CongraspError(f"The policy {source} names a schema that is not its own.", _REMEDY)
+            raise CongraspError(f"The policy {source} has a schema that does not match its content.", _REMEDY)
         _check_arrays(message.arrays, shapes, source)
         tree = flax.traverse_util.unflatten_dict(dict(message.arrays), sep="/")
         names = ("observation", "value", *(["privileged"] if spec.privileged else []))
@@ -196,7 +197,7 @@ class PolicyBundle:
 
 
 def with_critic_of(spec: PolicySpec, bundle: PolicyBundle) -> PolicyBundle:
-    """The bundle with the privileged inputs of another spec of its schema, at zero weight where they are others."""
+    """Returns the bundle with the privileged inputs of another spec of its schema; new inputs get zero weight."""
     if bundle.spec.privileged == spec.privileged:
         return bundle
     params = network.with_privileged(bundle.params, bundle.spec.privileged_size, spec.privileged_size)
@@ -204,7 +205,7 @@ def with_critic_of(spec: PolicySpec, bundle: PolicyBundle) -> PolicyBundle:
 
 
 def content_hash(encoded: bytes) -> str:
-    """Sixteen hex digits that identify an encoded bundle's content."""
+    """Returns sixteen hex digits that identify an encoded bundle's content."""
     return hashlib.sha256(encoded).hexdigest()[:16]
 
 
@@ -218,18 +219,18 @@ def load(path: pathlib.Path) -> PolicyBundle:
     try:
         data = read_file(path, MAX_MESSAGE, _REMEDY)
     except OSError as error:
-        remedy = "Name a policy file (policy.safetensors in a run's folder)."
+        remedy = "Pass a policy file (policy.safetensors in a run's folder)."
         raise CongraspError(f"The policy {path} cannot be read: {error.strerror}.", remedy) from None
     try:
         message = decode(data)
     except CongraspError as error:
-        raise CongraspError(f"The policy {path} is damaged, or no policy at all: {error}") from None
+        raise CongraspError(f"The policy {path} is damaged, or not a policy: {error}") from None
     return PolicyBundle.from_message(message, str(path))
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def mean_action(layout: Layout, parameters: InferenceParameters, observation: Array) -> Array:
-    """The deterministic action (..., A) for raw observations (..., D)."""
+    """Deterministic action (..., A) for raw observations (..., D)."""
     mean, _ = network.policy(parameters.params, layout, normalizer.apply(parameters.normalization, observation))
     return mean
 
@@ -238,25 +239,25 @@ def mean_action(layout: Layout, parameters: InferenceParameters, observation: Ar
 def sample_action(
     layout: Layout, parameters: InferenceParameters, observation: Array, key: Array
 ) -> tuple[Array, Array]:
-    """A drawn action (..., A) for raw observations (..., D), and its log probability (...,)."""
+    """Sampled action (..., A) for raw observations (..., D), and its log probability (...,)."""
     mean, log_std = network.policy(parameters.params, layout, normalizer.apply(parameters.normalization, observation))
     action = network.sample(key, mean, log_std)
     return action, network.log_probability(mean, log_std, action)
 
 
 def act_by_mean(layout: Layout, parameters: InferenceParameters, observation: Array, key: Array) -> tuple[Array, Array]:
-    """`mean_action` in the place of `sample_action`: the key counts for nothing, and the log probability is 0."""
+    """`mean_action` with the signature of `sample_action`: the key is ignored, and the log probability is 0."""
     return mean_action(layout, parameters, observation), jnp.zeros(observation.shape[:-1])
 
 
 def _dataclass(cls: type, fields: Any) -> Any:
-    """A frozen dataclass from JSON's values; unknown keys and wrong types are errors."""
+    """Builds a frozen dataclass from JSON values; unknown keys and wrong types are errors."""
     return dacite.from_dict(cls, fields, dacite.Config(strict=True, cast=[tuple, float]))
 
 
 @functools.lru_cache(maxsize=8)
 def _shapes(spec: PolicySpec) -> dict[str, tuple[int, ...]]:
-    """The shape of every array in a bundle."""
+    """Shapes of a bundle's arrays by name."""
     params = network.shapes(spec.layout, spec.action_size, spec.network, spec.privileged_size)
     size = sum(width for _, width in spec.layout)
     statistics = {"observation": normalizer.empty((size,))._asdict(), "value": normalizer.empty()._asdict()}
@@ -267,13 +268,13 @@ def _shapes(spec: PolicySpec) -> dict[str, tuple[int, ...]]:
 
 
 def _check_arrays(arrays: Mapping[str, Array], expected: Mapping[str, tuple[int, ...]], source: str) -> None:
-    """Raises `CongraspError` unless the arrays have these names and shapes, and finite values."""
+    """Raises a `CongraspError` unless the arrays have these names and shapes, and finite values."""
     if odd := sorted(expected.keys() ^ arrays.keys()):
-        raise CongraspError(f"The policy {source} lacks or should not have '{odd[0]}'.", _REMEDY)
+        raise CongraspError(f"The policy {source} lacks '{odd[0]}', or should not have it.", _REMEDY)
     for name, shape in expected.items():
         array = arrays[name]
         if tuple(array.shape) != shape:
             raise CongraspError(f"The policy {source} has '{name}' of shape {array.shape}, not {shape}.", _REMEDY)
-        # Arrays on a device never left this process; those from a file or the wire are NumPy's.
+        # Arrays on a device never left this process; those from a file or the wire are NumPy arrays.
         if isinstance(array, np.ndarray) and not (array.dtype.kind == "f" and np.isfinite(array).all()):
             raise CongraspError(f"The policy {source} has values in '{name}' that are not finite numbers.", _REMEDY)

@@ -1,15 +1,15 @@
-"""The policy and the critic: two networks that share a shape and no weights, and the policy's diagonal Gaussian.
+"""Policy and critic networks, which have the same structure but share no weights, and the policy's diagonal Gaussian.
 
-State and heading are always active and go straight into the trunk; each optional constraint has an encoder of its own
-whose output is multiplied by the constraint's mask bit, so that an inactive constraint reaches the trunk as zeros.
+State and heading are always active and feed the trunk directly. Each optional constraint has an encoder whose output is
+multiplied by the constraint's mask bit, so that the trunk receives zeros for an inactive constraint.
 
-Everything here is a pure function of its arguments. `params` is a nested dict with the entries `actor` and `critic`;
-observations are already normalised (`common.policy.normalizer`) and have any leading axes.
+All functions are pure. `params` is a nested dict with the entries `actor` and `critic`; observations are already
+normalised (`common.policy.normalizer`) and have any leading axes.
 
-Where an actor process and the learner must agree on a log probability, the policy's matrix products are true float32
-on every backend: an error of the mean is amplified by 1/std and then exponentiated. The critic, whose output is only
-regressed on, and the ratios inside an update, both of whose policies are computed alike, use the backend's default
-(TF32 on NVIDIA GPUs) at half the price.
+Where an actor process and the learner must agree on a log probability, the policy's matrix products are true float32 on
+every backend: an error of the mean is amplified by 1/std and then exponentiated. The critic, which is only regressed,
+and the ratios inside an update, whose two policies are computed in the same way, use the backend's default (TF32 on
+NVIDIA GPUs) at half the cost.
 """
 
 import itertools
@@ -31,28 +31,28 @@ Params = dict[str, Any]
 """Flax parameters: nested dicts of arrays."""
 
 TRUNK = ("state", "heading", "mask")
-"""Blocks that go into the trunk as they are, in this order; the codes of the gated blocks follow."""
+"""Blocks that feed the trunk directly, in this order; the codes of the gated blocks follow."""
 PRIVILEGED = "privileged"
-"""Block of the critic's privileged inputs, which follow the codes into its trunk."""
+"""Block of the critic's privileged inputs, which follow the codes in its trunk."""
 _HIDDEN_GAIN = math.sqrt(2.0)
-_ACTION_GAIN = 0.01  # first actions are noise around zero, whatever the observation
+_ACTION_GAIN = 0.01  # initial actions are noise around zero, independent of the observation
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
 def gated(layout: Layout) -> tuple[str, ...]:
-    """Names of the optional blocks, each of which a bit of the mask gates, in the order of the bits."""
+    """Names of the optional blocks gated by the mask, in the order of its bits."""
     return tuple(name for name, _ in layout if name not in (*TRUNK, PRIVILEGED))
 
 
 def check_layout(layout: Layout) -> None:
-    """Raises `CongraspError` unless the layout has exactly the blocks that the networks are made for."""
+    """Raises a `CongraspError` unless the layout has exactly the blocks of the networks."""
     names = [name for name, _ in layout]
     if len(set(names)) < len(names) or not {*TRUNK} <= {*names} or dict(layout)["mask"] != len(gated(layout)):
-        raise CongraspError(f"The observation layout {names} does not fit the network.", "Use this version's layout.")
+        raise CongraspError(f"The observation layout {names} does not match the network.", "Use this version's layout.")
 
 
 def split(layout: Layout, observation: Array) -> dict[str, Array]:
-    """Blocks of observations (..., D) by name."""
+    """Splits observations (..., D) into blocks by name."""
     ends = itertools.accumulate(size for _, size in layout)
     return {name: observation[..., end - size : end] for (name, size), end in zip(layout, ends, strict=True)}
 
@@ -65,7 +65,7 @@ class GatedNetwork(nn.Module):
       hidden: units of the trunk's layers.
       encoder: units of each optional block's encoder.
       outputs: units of the linear output layer.
-      precision: of the matrix products.
+      precision: precision of the matrix products.
     """
 
     layout: Layout
@@ -90,22 +90,22 @@ class GatedNetwork(nn.Module):
         return self._dense(self.outputs, "output")(x)
 
     def _dense(self, units: int, name: str) -> nn.Dense:
-        """A layer in the network's precision."""
+        """Returns a layer in the network's precision."""
         return nn.Dense(units, precision=self.precision, name=name)
 
 
 def _exact(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
-    """The actor: the same numbers on every device."""
+    """Returns the actor network, with the same results on every device."""
     return GatedNetwork(layout, hidden, encoder, outputs, jax.lax.Precision.HIGHEST)
 
 
 def _fast(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
-    """The critic, in the device's own precision."""
+    """Returns the critic network, in the device's default precision."""
     return GatedNetwork(layout, hidden, encoder, outputs, None)
 
 
 def _sizes(tree: Params) -> tuple[tuple[int, ...], int, int]:
-    """Hidden, encoder and output units of a network, read off its kernels' shapes."""
+    """Hidden, encoder and output units of a network, from its kernels' shapes."""
     depth = sum(name.startswith("trunk_") for name in tree)
     hidden = tuple(tree[f"trunk_{i}"]["kernel"].shape[-1] for i in range(depth))
     encoders = [layer["kernel"].shape[-1] for name, layer in tree.items() if not name.startswith(("trunk_", "output"))]
@@ -113,12 +113,12 @@ def _sizes(tree: Params) -> tuple[tuple[int, ...], int, int]:
 
 
 def _critic_layout(layout: Layout, privileged: int) -> Layout:
-    """Blocks of the critic's input: the observation's, and that of so many privileged inputs."""
+    """Blocks of the critic's input: those of the observation, and one of `privileged` inputs."""
     return (*layout, (PRIVILEGED, privileged)) if privileged else layout
 
 
 def shapes(layout: Layout, action_size: int, config: NetworkConfig, privileged: int = 0) -> Params:
-    """What `init` returns, with `jax.ShapeDtypeStruct` leaves; nothing is computed."""
+    """Shapes of `init`'s result, with `jax.ShapeDtypeStruct` leaves; nothing is computed."""
     check_layout(layout)
     size = sum(size for _, size in layout)
     observation = jax.ShapeDtypeStruct((1, size), jnp.float32)
@@ -136,22 +136,22 @@ def shapes(layout: Layout, action_size: int, config: NetworkConfig, privileged: 
 
 
 def init(seed: int, layout: Layout, action_size: int, config: NetworkConfig, privileged: int = 0) -> Params:
-    """Orthogonal weights and zero biases: `{"actor": {"network", "log_std"}, "critic": {...}}`.
+    """Initial parameters with orthogonal weights and zero biases: `{"actor": {"network", "log_std"}, "critic": {...}}`.
 
-    Drawn with NumPy: compiling a QR decomposition for each kernel's shape would take seconds.
+    Weights are drawn with NumPy, since compiling a QR decomposition for each kernel's shape would take seconds.
 
     Args:
-      seed: of the weights; those of the actor do not depend on `privileged`.
-      layout: of the observation.
-      action_size: A.
+      seed: seed of the weights; the actor's do not depend on `privileged`.
+      layout: layout of the observation.
+      action_size: size A of the action.
       config: sizes of the networks.
-      privileged: P, the critic's privileged inputs.
+      privileged: number P of the critic's privileged inputs.
     """
     rng = np.random.default_rng(seed)
     tree = shapes(layout, action_size, config, privileged)
 
     def fill(layers: Params, output_gain: float) -> Params:
-        """Layers of one network, the last with its own gain."""
+        """Initialises the layers of one network, the last with a separate gain."""
         gains = {name: output_gain if name == "output" else _HIDDEN_GAIN for name in layers}
         return {
             name: {
@@ -175,9 +175,10 @@ def _orthogonal(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
 
 
 def policy(params: Params, layout: Layout, observation: Array, *, exact: bool = True) -> tuple[Array, Array]:
-    """Mean (..., A) and log standard deviation (A,), which does not depend on the observation, of the action.
+    """Mean (..., A) and log standard deviation (A,) of the action; the latter does not depend on the observation.
 
-    Without `exact` the matrix products are the backend's default, for means that are only compared with each other.
+    Without `exact`, matrix products have the backend's default precision, for means that are only compared with each
+    other.
     """
     actor = params["actor"]
     build = _exact if exact else _fast
@@ -185,7 +186,7 @@ def policy(params: Params, layout: Layout, observation: Array, *, exact: bool = 
 
 
 def value(params: Params, layout: Layout, observation: Array, privileged: Array | None = None) -> Array:
-    """The critic's estimate (...,) of the normalised return from observations and its privileged inputs (..., P)."""
+    """Estimate (...,) of the normalised return by the critic, from observations and its privileged inputs (..., P)."""
     critic = params["critic"]
     if privileged is not None:
         layout = _critic_layout(layout, privileged.shape[-1])
@@ -195,9 +196,9 @@ def value(params: Params, layout: Layout, observation: Array, privileged: Array 
 
 
 def with_privileged(params: Params, before: int, after: int) -> Params:
-    """The parameters with `after` privileged inputs of the critic in place of its `before`.
+    """Returns the parameters with `after` privileged inputs of the critic instead of `before`.
 
-    The weights of the new ones are zero: a critic that had none estimates the same as before, and learns to use them.
+    New inputs get zero weight: the critic's estimates do not change, and it learns to use them.
     """
     first = params["critic"]["trunk_0"]
     kernel = np.asarray(first["kernel"])

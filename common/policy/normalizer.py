@@ -1,10 +1,10 @@
 """Running statistics of observations and returns.
 
-A batch is summarised on its device as count, mean and M2 (the sum of squared deviations from the mean) in float32;
-these few hundred numbers go to the host, which merges them into the running statistics in float64 (Chan et al. 1979).
-So counts beyond 2^24 stay exact and small updates of an old mean are not lost, without 64-bit mode on the device.
-Merging is associative up to float64 rounding: the deltas of several learner ranks, merged in rank order on every rank,
-give every rank the same bits.
+A batch is summarised on its device as count, mean and M2 (the sum of squared deviations from the mean) in float32; the
+host merges these few hundred numbers into the running statistics in float64 (Chan et al. 1979). Counts beyond 2^24
+therefore stay exact and small updates of an old mean are not lost, without 64-bit mode on the device. Merging is
+associative up to float64 rounding: the deltas of several learner ranks, merged in rank order on every rank, are bitwise
+identical.
 """
 
 import functools
@@ -18,7 +18,7 @@ from congrasp.common.policy.network import TRUNK, Layout
 from congrasp.common.task.types import Array
 
 LIMIT = 10.0
-"""Normalised observations are clipped to plus and minus this."""
+"""Normalised observations are clipped to [-LIMIT, LIMIT]."""
 _SMALLEST_STD = 1e-3
 
 
@@ -41,7 +41,7 @@ class Affine(NamedTuple):
 
 
 def empty(shape: tuple[int, ...] = ()) -> Statistics:
-    """Statistics of nothing."""
+    """Returns statistics without samples."""
     return Statistics(np.zeros(()), np.zeros(shape), np.zeros(shape))
 
 
@@ -78,7 +78,7 @@ def merge(*parts: Statistics) -> Statistics:
 
 
 def _std(statistics: Statistics) -> np.ndarray:
-    """Standard deviations, none of them close to zero."""
+    """Standard deviations, bounded away from zero."""
     return np.maximum(np.sqrt(statistics.m2 / statistics.count), _SMALLEST_STD)
 
 
@@ -86,8 +86,8 @@ def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
     """Normalisation of observations (..., D); the identity while there are no samples.
 
     `state` and `heading` are centred and divided by their standard deviation. Optional blocks are divided by their root
-    mean square and not centred: zero, which stands for "inactive", stays exactly zero, and a feature that hardly varies
-    is not blown up against the clip. Mask bits are left alone.
+    mean square without centring: zero, which means "inactive", stays exactly zero, and a nearly constant feature is not
+    amplified to the clip. Mask bits are unchanged.
     """
     size = sum(width for _, width in layout)
     shift, scale = np.zeros(size), np.ones(size)
@@ -114,7 +114,7 @@ def privileged_affine(statistics: Statistics) -> Affine:
 
 
 def apply(affine: Affine, observation: Array) -> Array:
-    """Normalised observations (..., D) in float32, clipped to `LIMIT`; before gating, so inactive blocks stay zero."""
+    """Normalised observations (..., D) in float32, clipped to `LIMIT`. Zeros of inactive blocks stay zero."""
     return jnp.clip((observation.astype(jnp.float32) - affine.shift) * affine.scale, -LIMIT, LIMIT)
 
 

@@ -1,4 +1,4 @@
-"""Trained policies by their hands: those that come with the package, and the user's own beside the own hands' files."""
+"""Pretrained policies by hand: those of the package, and the user's, stored next to the files of custom hands."""
 
 import os
 import pathlib
@@ -12,9 +12,9 @@ SUFFIX = ".safetensors"
 
 
 def pretrained_file(hand: str) -> pathlib.Path | None:
-    """The file of the policy for this hand that comes with the package, or else the user's own; None if there is none.
+    """Returns the file of the hand's policy: that of the package, or else the user's; None if there is none.
 
-    A hand that is described by a file has a policy of the user's own alone, whatever its name.
+    A hand described by a file can only have a policy of the user, whatever its name.
     """
     found = get_hand(hand)
     packaged, own = _FOLDER / f"{found.name}{SUFFIX}", own_policy_file(found.name)
@@ -22,12 +22,12 @@ def pretrained_file(hand: str) -> pathlib.Path | None:
 
 
 def own_policy_file(name: str) -> pathlib.Path:
-    """Where the user's own policy for the hand of this name is, or would be."""
+    """Path of the user's policy for the hand of this name, whether or not it exists."""
     return hands_folder() / f"{name}{SUFFIX}"
 
 
 def named_policy(name: str | os.PathLike[str]) -> pathlib.Path:
-    """The policy file of this path, or the pretrained one of this name (`allegro-student`) or of this hand.
+    """Returns the policy file of this path, or the pretrained one of this name (`allegro-student`) or hand.
 
     Raises:
       CongraspError: there is no such hand, or no policy for it.
@@ -38,44 +38,44 @@ def named_policy(name: str | os.PathLike[str]) -> pathlib.Path:
 
 
 def _packaged(name: pathlib.Path) -> pathlib.Path | None:
-    """The policy file of this name that comes with the package, unless a file here has that name."""
+    """Returns the package's policy file of this name, unless there is such a file in the working directory."""
     file = _FOLDER / f"{name}{SUFFIX}"
     return file if len(name.parts) == 1 and not name.exists() and file.exists() else None
 
 
 def reference_file(hand: str) -> pathlib.Path | None:
-    """The file of a hand's reference policy, which knows no reference poses and no trajectories; None if none comes."""
+    """Returns the file of a hand's reference policy, without reference poses and trajectories; None if absent."""
     path = _FOLDER / f"{get_hand(hand).name}-reference{SUFFIX}"
     return path if path.exists() else None
 
 
 def pretrained_hands() -> list[str]:
-    """Names of the hands whose policies come with the package, in the package's order: the human hand is the first."""
+    """Names of the hands with a policy in the package, in the package's order: the human hand first."""
     return [name for name in HANDS if (_FOLDER / f"{name}{SUFFIX}").exists()]
 
 
 def hands_with_policy() -> list[str]:
-    """The same, and then the names of the user's own hands that have a policy."""
+    """Names of `pretrained_hands`, followed by the user's custom hands that have a policy."""
     packaged = pretrained_hands()
     return [*packaged, *(name for name in own_hands() if name not in packaged and own_policy_file(name).exists())]
 
 
 def policy_file(given: pathlib.Path | None, hand: str = "human") -> pathlib.Path:
-    """The policy file that a command was given, by path or by a name in the package, or else the pretrained one.
+    """Returns the policy file of a command: the given path or name, or else the pretrained one.
 
     Raises:
-      CongraspError: neither is there, there is no such hand, or the user's own policy is of another hand of its name.
+      CongraspError: there is no such file, policy or hand, or the user's policy belongs to another hand of this name.
     """
     path = (_packaged(given) or given) if given else pretrained_file(hand)
     if not given and path is not None and (own := get_hand(hand)).text and bundles.load(path).spec.hand != own.text:
         raise CongraspError(
-            f"{path} was trained for another hand of this name, or before the hand's file was changed.",
-            "Train it again with 'congrasp hands train', or give --policy FILE.",
+            f"{path} was trained for another hand of this name, or for an earlier version of the hand's file.",
+            "Train it again with 'congrasp hands train', or pass --policy FILE.",
         )
     if path is None:
         raise CongraspError(
-            f"No policy was named, and none comes with this installation for the hand '{get_hand(hand).name}'.",
-            "Train one with 'congrasp hands train', or give --policy FILE: every run of 'congrasp train' has a "
+            f"No policy was given, and this installation has none for the hand '{get_hand(hand).name}'.",
+            "Train one with 'congrasp hands train', or pass --policy FILE: every run of 'congrasp train' has a "
             "policy.safetensors.",
         )
     return path

@@ -1,6 +1,6 @@
-"""Physics engines by name: the one table from which command lines, configurations, evaluation and errors take them.
+"""Registry of physics engines by name, used by command lines, configurations, evaluation and errors.
 
-`actors.physics` registers those of the project; another is added by one more row.
+`actors.physics` registers those of the project; another engine needs one more row.
 """
 
 from collections.abc import Callable
@@ -12,28 +12,28 @@ from congrasp.common.errors import CongraspError
 
 
 class Engine(NamedTuple):
-    """What is known of an engine before it is built."""
+    """Properties of an engine that are known before it is built."""
 
     make: Callable[..., Any]
-    """(hand, task, objects, threads) -> `actors.physics.engine.Physics`; imports what it needs when it is called."""
+    """(hand, task, objects, threads) -> `actors.physics.engine.Physics`; imports its dependencies when called."""
     batch: int
-    """Environments side by side in an evaluation, where nobody names a number."""
+    """Default number of environments in an evaluation."""
     automatic: Callable[[str], bool] = lambda backend: False
-    """JAX backend -> whether `auto` takes this engine there; the first that does is taken."""
+    """JAX backend -> True if `auto` may select this engine there; the first such engine is used."""
     missing: Callable[[str], CongraspError | None] = lambda backend: None
-    """JAX backend -> what this machine lacks for it, or nothing."""
+    """JAX backend -> what this machine lacks for the engine, or an empty string."""
     on_device: bool = False
-    """Whether rollouts stay on the learner's device, so that by default one actor lives in the learner's process."""
+    """True if rollouts stay on the learner's device, so that by default one actor runs in the learner's process."""
     title: str = ""
-    """Its name for people; that of the row if empty."""
+    """Display name; that of the row if empty."""
 
 
 ENGINES: dict[str, Engine] = {}
-"""Engines by the names that `--physics` takes beside `auto`."""
+"""Engines by name; `--physics` accepts these and `auto`."""
 
 
 def engine_title(name: str) -> str:
-    """An engine's name for people."""
+    """Display name of an engine."""
     return (name in ENGINES and ENGINES[name].title) or name
 
 
@@ -43,7 +43,7 @@ PhysicsName = Annotated[
         constructor_factory=lambda: Literal.__getitem__(("auto", *ENGINES)),  # type: ignore[attr-defined]
         help_behavior_hint=lambda default: (
             "(default: " + default.strip("[']") + ")"
-        ),  # such a choice is shown as a list
+        ),  # help shows such a choice as a list
     ),
 ]
-"""`auto` or a key of `ENGINES`; a command line offers those that are registered when it is parsed."""
+"""`auto` or a key of `ENGINES`; a command line offers those registered when it is parsed."""

@@ -1,7 +1,7 @@
-"""Gives NumPy's linear algebra one thread in processes that import this first.
+"""Limits NumPy's linear algebra to one thread in processes that import this first.
 
-Workers that share a machine would otherwise start as many threads each as the machine has cores, which then wait for
-one another: on products as small as those of heading sets that costs several times the work itself.
+Workers that share a machine would otherwise each start as many threads as the machine has cores, which then wait for
+one another. For products as small as those of heading sets this costs several times the work itself.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Where the time until a run's first update goes: stages of its start, timed as they happen, in whatever thread."""
+"""Timing of the stages of a run's start, up to its first update, in any thread."""
 
 import contextlib
 import threading
@@ -10,7 +10,7 @@ import psutil
 
 
 class Stage(NamedTuple):
-    """Something that a start consists of; times in seconds since this process began."""
+    """A stage of the start; times in seconds since this process began."""
 
     name: str
     began: float
@@ -29,7 +29,7 @@ def since_start() -> float:
 
 @contextlib.contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Times the block as the stage of this name, unless there was one: what comes later belongs to no start."""
+    """Times the block as the stage of this name, unless the stage exists: later calls do not belong to the start."""
     began = since_start()
     try:
         yield
@@ -39,12 +39,12 @@ def stage(name: str) -> Iterator[None]:
 
 
 def imported() -> None:
-    """Notes that everything before now was imports."""
+    """Records everything up to now as the stage of imports."""
     with _lock:
         _stages.setdefault("imports", Stage("imports", 0.0, since_start()))
 
 
 def stages() -> list[Stage]:
-    """The stages so far, in the order in which they began; those of different threads overlap."""
+    """Stages so far, ordered by their start; those of different threads overlap."""
     with _lock:
         return sorted(_stages.values(), key=lambda one: one.began)

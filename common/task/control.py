@@ -1,4 +1,4 @@
-"""From actions to joint targets: incremental fingers and feed-forward wrist guidance (paper, section Control Space)."""
+"""Decodes actions to joint targets: incremental fingers and guided wrist (paper, section Control Space)."""
 
 from typing import NamedTuple
 
@@ -33,7 +33,7 @@ jax.tree_util.register_dataclass(
 
 
 def guidance_pose(scene: Scene, control: ControlConfig) -> tuple[Array, Array]:
-    """World wrist pose T^g (B, 3), (B, 4) of the highest active wrist constraint."""
+    """World wrist pose T^g (B, 3), (B, 4) of the strongest active wrist constraint."""
     pose: tuple[Array, Array] | None = None
     for constraint in known(scene.task):
         if not constraint.guides:
@@ -44,16 +44,16 @@ def guidance_pose(scene: Scene, control: ControlConfig) -> tuple[Array, Array]:
         else:
             active = scene.goal.active[constraint.guides][:, None]
             pose = jnp.where(active, own[0], pose[0]), jnp.where(active, own[1], pose[1])
-    assert pose is not None, "the heading guides where nothing else does"
+    assert pose is not None, "the heading guides if nothing else does"
     return pose
 
 
 def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
-    """Joint targets of a residual action (B, M + 6), of the M finger motors and the wrist.
+    """Returns joint targets for a residual action (B, M + 6) of the M finger motors and the wrist.
 
-    m_tgt = clamp(m_tgt_prev + alpha_f a_f, limits) of the motors, which put joints at q_tgt; u_tgt = u_g + alpha_w a_w,
-    nearer to the wrist where it would else become faster or be accelerated harder than the limits allow (`_lead`). When
-    the table is gone, u_tgt also leads by what carries the load (`wrist_load`), around which the limits then hold.
+    Motors: m_tgt = clamp(m_tgt_prev + alpha_f a_f, limits), which gives q_tgt of the joints. Wrist: u_tgt = u_g +
+    alpha_w a_w, moved closer to the wrist if it would exceed the limits of speed or acceleration (`_lead`). After the
+    table is removed, u_tgt also compensates the load (`wrist_load`), and the limits apply relative to that.
     """
     hand, state = scene.hand, scene.state
     fingers = len(hand.motors)
@@ -67,10 +67,11 @@ def decode(scene: Scene, control: ControlConfig, action: Array) -> Action:
 
 
 def _position_limit(scene: Scene, control: ControlConfig) -> Array:
-    """(B,) m, the farthest that the wrist's target is ahead of it.
+    """Greatest distance (B,) of the wrist's target from the wrist, m.
 
-    `guidance_position_limit`; while the table is there it rises from `closing_position_limit` at `closing_distance`
-    from the object to `approach_position_limit` at twice that, so that the hand arrives slowly.
+    The limit is `guidance_position_limit`. While the table is present it is lower near the object, so that the hand
+    arrives slowly: it rises from `closing_position_limit` at `closing_distance` from the object to
+    `approach_position_limit` at twice that.
     """
     gap = jnp.min(jnp.linalg.norm(scene.features.nearest, axis=-1), -1)
     slow, fast = control.closing_position_limit, control.approach_position_limit
@@ -81,15 +82,15 @@ def _position_limit(scene: Scene, control: ControlConfig) -> Array:
 def wrist_target(
     hand: Hand, control: ControlConfig, state: SceneState, limit: Array, ahead: Array, residual: Array
 ) -> Array:
-    """u_tgt (B, 6), see `decode`.
+    """Wrist targets u_tgt (B, 6), see `decode`.
 
     Args:
-      hand: its servos.
+      hand: the hand, for its servos.
       control: limits and scales.
-      state: the present control step.
-      limit: (B,) m, the farthest that the target is ahead of the wrist.
-      ahead: (B, 6) m and rad from the wrist to its guidance.
-      residual: (B, 6) the wrist's part of the action.
+      state: state at the current control step.
+      limit: (B,) greatest distance of the target from the wrist, m.
+      ahead: (B, 6) displacement from the wrist to its guidance, m and rad.
+      residual: (B, 6) wrist part of the action.
     """
     share = jnp.where(state.table, 1.0, control.hold_acceleration)
     carried = jnp.where(state.table[..., None], 0.0, -state.wrist_load)
@@ -111,16 +112,17 @@ def wrist_target(
 
 
 def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array, u_target: Array) -> Array:
-    """Momentum z (B, 6) of the load observer after a control step, m/s and rad/s; zero when an episode begins.
+    """Updates the load observer's momentum z (B, 6) after a control step, m/s and rad/s; initially zero.
 
-    With w = v + damping u, the servos' law is dw/dt = stiffness (u_tgt - u) + d, where d is what everything else
-    gives the wrist. The observer integrates dz/dt = stiffness (u_tgt - u) + rate (w - z), so that rate (w - z) is d
-    behind a low-pass of time constant 1 / rate (De Luca and Mattone 2003, doi 10.1109/ROBOT.2003.1241662). In discrete
-    time the servos act on the mean of u over the step (trapezoidal rule), which changes w alone (`_generalised_speed`).
+    With w = v + damping u, the servos' law is dw/dt = stiffness (u_tgt - u) + d, where d is the acceleration of the
+    wrist by everything else. The observer integrates dz/dt = stiffness (u_tgt - u) + rate (w - z), so that rate (w - z)
+    is d after a low-pass filter of time constant 1 / rate (De Luca and Mattone 2003, doi 10.1109/ROBOT.2003.1241662).
+    In discrete time the servos act on the mean of u over the step (trapezoidal rule), which only changes w
+    (`_generalised_speed`).
 
     Args:
-      hand: its servos.
-      task: length of a control step, and the rate.
+      hand: the hand, for its servos.
+      task: the task, for the length of a control step and the rate.
       momentum: (B, 6) z before the step.
       u: (B, 6) wrist joints after the step.
       u_velocity: (B, 6).
@@ -133,41 +135,41 @@ def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_veloci
 
 
 def wrist_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array) -> Array:
-    """d (B, 6), m/s^2 and rad/s^2, that everything but its servos gives the wrist; see `track_load`."""
+    """Acceleration d (B, 6) of the wrist by everything but its servos, m/s^2 and rad/s^2; see `track_load`."""
     return task.control.load_rate * (_generalised_speed(hand, task, u, u_velocity) - momentum)
 
 
 def _generalised_speed(hand: Hand, task: TaskConfig, u: Array, u_velocity: Array) -> Array:
-    """w (B, 6) of `track_load`: with steps of dt, v + (damping - stiffness dt / 2) u."""
+    """Speed w (B, 6) of `track_load`: with steps of dt, v + (damping - stiffness dt / 2) u."""
     stiffness, damping = hand.wrist_servos
     return u_velocity + (damping - 0.5 * task.control_dt * stiffness) * u
 
 
 class _Servo(NamedTuple):
-    """Three wrist joints' servos: a = stiffness (target - u) - damping v."""
+    """Servos of three wrist joints: a = stiffness (target - u) - damping v."""
 
     stiffness: Array | float
     """kp / m, 1/s^2."""
     damping: Array | float
     """kv / m, 1/s."""
     farthest: Array | float
-    """Greatest lead (B, 1) of the target, m or rad."""
+    """Greatest lead (B, 1) of the target over the joint, m or rad."""
     hardest: float
-    """Greatest acceleration, m/s^2 or rad/s^2; 0 for any."""
+    """Greatest acceleration, m/s^2 or rad/s^2; 0 for no limit."""
 
 
 def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: Array) -> Array:
-    """How far (B, 3) the target is ahead of three wrist joints.
+    """Lead (B, 3) of the target over three wrist joints.
 
-    At a target that is damping v / stiffness ahead a joint goes on at its speed; one r from there accelerates it by
-    stiffness r. By v stiffness / damping it comes to rest along its guidance, however small the share.
+    A target that leads by damping v / stiffness keeps a joint's speed; one r from there accelerates it by stiffness r.
+    Braking along the guidance may use v stiffness / damping, however small the share is.
 
     Args:
-      servo: of the joints.
-      ahead: (B, 3) how far the guidance is ahead.
-      residual: (B, 3) what the action adds.
-      velocity: (B, 3) of the joints.
-      share: (B,) of the greatest acceleration, for all but coming to rest.
+      servo: servos of the joints.
+      ahead: (B, 3) displacement from the joints to the guidance.
+      residual: (B, 3) displacement added by the action.
+      velocity: (B, 3) speeds of the joints.
+      share: (B,) share of the greatest acceleration, except for braking.
     """
     rate, hardest = servo.stiffness / servo.damping, jnp.asarray(servo.hardest)
     steady = velocity / rate
@@ -178,13 +180,13 @@ def _lead(servo: _Servo, ahead: Array, residual: Array, velocity: Array, share: 
 
 
 def _finger_guidance(scene: Scene, rate: float) -> Array:
-    """(B, M) rad by which motors go on to the closed hand, at most `rate`, once half the approach is over."""
+    """(B, M) rad by which motors move towards the closed hand, at most `rate`, from the middle of the approach on."""
     begun = 2.0 * scene.state.time >= scene.task.approach_steps
     ahead = motor_positions(scene.hand, jnp.array(scene.hand.q_closed) - scene.state.q_target)
     return begun[:, None] * jnp.clip(ahead, -rate, rate)
 
 
 def _limit(vector: Array, length: Array | float) -> Array:
-    """Vectors (..., 3) shortened to at most `length`."""
+    """Vectors (..., 3) scaled down to a norm of at most `length`."""
     norm = jnp.sqrt(jnp.sum(vector**2, -1, keepdims=True) + 1e-12)
     return vector * jnp.minimum(1.0, length / norm)

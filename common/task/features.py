@@ -1,6 +1,6 @@
-"""What observation, control, reward and metrics all need of a control step: geometry between hand, object and goal.
+"""Geometry between hand, object and goal in a control step, shared by observation, control, reward and metrics.
 
-Computed once for each control step. All vectors are in the wrist frame unless said otherwise.
+It is computed once for each control step. Vectors are in the wrist frame unless stated otherwise.
 """
 
 from typing import Any, NamedTuple
@@ -20,21 +20,21 @@ from congrasp.common.task.types import Array, Goal, SceneState, Surface
 
 
 class Features(NamedTuple):
-    """Geometry of one control step; batch axis B first."""
+    """Geometry of one control step, with leading batch axis B."""
 
     wrist_position: Array
     """(B, 3) world frame."""
     wrist_quaternion: Array
     """(B, 4) world frame."""
     object_position: Array
-    """(B, 3) object's centre of mass."""
+    """(B, 3) the object's centre of mass."""
     object_quaternion: Array
     """(B, 4) object frame to wrist frame."""
     keypoints: Array
     """(B, P, 3) link origins and fingertips."""
     center: Array
-    """(B, 3) hand centre p: of the present fingers, or in the ablation of those with which the episode began; of those
-    that an active choice of fingers allows."""
+    """(B, 3) hand centre p of the current fingers (in the ablation, of the initial fingers), restricted to those that
+    an active choice of fingers allows."""
     nearest: Array
     """(B, P, 3) d: from each keypoint to the nearest surface point."""
     force: Array
@@ -46,7 +46,7 @@ class Features(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Intermediate results from which constraints make features of their own."""
+    """Intermediate results from which constraints compute their features."""
 
     surface: Surface
     """Labelled surface points, object frame."""
@@ -59,11 +59,11 @@ class Contacts(NamedTuple):
     found: Array
     """(B, L, C) bool."""
     force: Array
-    """(B, L, C, 3) of each contact, wrist frame, N."""
+    """(B, L, C, 3) force of each contact, wrist frame, N."""
 
 
 def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal) -> Features:
-    """Geometry of hand, object and goal in one control step."""
+    """Computes the geometry of hand, object and goal in one control step."""
     wrist_position, wrist_quaternion = wrist_pose(state)
     object_position, object_quaternion = rotations.relative_pose(
         wrist_position, wrist_quaternion, state.object_position, state.object_quaternion
@@ -73,7 +73,7 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
     if not task.dynamic_center:
         fingers = kinematics.keypoints(hand, kinematics.link_transforms(hand, state.q_initial))
 
-    # Distances in the object frame, where coordinates are small and the surface does not move.
+    # Distances are computed in the object frame, where coordinates are small and the surface does not move.
     contact_shape = state.contact_found.shape
     local = rotations.inverse_transform(object_position, object_quaternion, keypoints)
     contacts = rotations.inverse_transform(
@@ -109,5 +109,5 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
 def scene_of(
     hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal, readings: Readings | None = None
 ) -> Scene:
-    """One control step as constraints see it."""
+    """Returns one control step as input of the constraints."""
     return Scene(hand, task, state, features(hand, task, state, surface, goal), goal, readings)

@@ -1,4 +1,4 @@
-"""Frames and distances that control, features, observation and metrics share."""
+"""Frames and distances shared by control, features, observation and metrics."""
 
 import jax
 import jax.numpy as jnp
@@ -9,30 +9,30 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.task.types import Array, SceneState
 
 FAR = 0.3
-"""Metres that stand for "no such surface point"."""
+"""Distance that represents "no such surface point", m."""
 FORCE_SCALE = 5.0
-"""N at which the squashed force is one half."""
+"""Force at which the squashed force is one half, N."""
 
 
 def hand_center(hand: Hand, points: Array, fingers: Array | None = None) -> Array:
-    """(B, 3) hand centre: middle between the thumb's tip and the mean of the other tips that count.
+    """Hand centre (B, 3): midpoint of the thumb's tip and the mean of the other selected tips.
 
     Args:
       hand: the hand.
-      points: (B, P, 3) its keypoints.
-      fingers: (B, G) bool, the fingers that count, thumb first; all by default.
+      points: (B, P, 3) keypoints of the hand.
+      fingers: (B, G) bool, selected fingers, thumb first; all by default.
     """
     whole = kinematics.hand_center(hand, points)
     if fingers is None:
         return whole
     tips, counted = points[..., len(hand.links) :, :], fingers[..., 1:, None].astype(jnp.float32)
     others = jnp.sum(tips[..., 1:, :] * counted, -2) / jnp.maximum(jnp.sum(counted, -2), 1.0)
-    # Where all count, the same formula as without a choice, to the last bit.
+    # If all fingers are selected, the result is bitwise the same as without a selection.
     return jnp.where(jnp.all(fingers, -1, keepdims=True), whole, 0.5 * (tips[..., 0, :] + others))
 
 
 def wrist_pose(state: SceneState) -> tuple[Array, Array]:
-    """The wrist frame's position (B, 3) and quaternion (B, 4) in the world."""
+    """Position (B, 3) and quaternion (B, 4) of the wrist frame in the world frame."""
     return rotations.compose_pose(
         state.base_position,
         state.base_quaternion,
@@ -44,7 +44,7 @@ def wrist_pose(state: SceneState) -> tuple[Array, Array]:
 def wrist_to_joints(state: SceneState, position: Array, quaternion: Array) -> Array:
     """Virtual wrist joints (B, ..., 6) that put the wrist at world poses (B, ..., 3), (B, ..., 4).
 
-    Of the angles that do, those nearest to the present ones: no hinge differs from the state's by more than pi.
+    Among equivalent angles these are nearest to the current ones: no hinge differs from the state's by more than pi.
     """
     extra = position.ndim - 2
     base_position = state.base_position.reshape(-1, *([1] * extra), 3)
@@ -57,7 +57,7 @@ def wrist_to_joints(state: SceneState, position: Array, quaternion: Array) -> Ar
 
 
 def in_world(object_position: Array, object_quaternion: Array, position: Array, quaternion: Array) -> tuple[Array, ...]:
-    """Poses (B, ..., 3), (B, ..., 4) of the object frame in the world, for object poses (B, 3), (B, 4)."""
+    """Transforms poses (B, ..., 3), (B, ..., 4) from object to world frame, for object poses (B, 3), (B, 4)."""
     extra = position.ndim - 2
     origin = object_position.reshape(-1, *([1] * extra), 3)
     turn = jnp.broadcast_to(object_quaternion.reshape(-1, *([1] * extra), 4), quaternion.shape)
@@ -65,16 +65,16 @@ def in_world(object_position: Array, object_quaternion: Array, position: Array, 
 
 
 def squared_distances(a: Array, b: Array) -> Array:
-    """(B, M, N) squared distances between points (B, M, 3) and (B, N, 3)."""
+    """Squared distances (B, M, N) between points (B, M, 3) and (B, N, 3)."""
     x, y, z = jnp.moveaxis(a[..., :, None, :] - b[..., None, :, :], -1, 0)
     return x * x + y * y + z * z
 
 
 def nearest_index(squared: Array) -> Array:
-    """(B, M) index of the least of N squared distances (B, N, M); either of two that differ by less than 0.01 %.
+    """Index (B, M) of the least of N squared distances (B, N, M); ties within 0.01 % are broken arbitrarily.
 
-    Floats that are not negative are ordered as their bits are, and the last bits make room for the index: one
-    minimum along a vector's lanes, several times faster than `argmin`.
+    Non-negative floats are ordered like their bits, and the last bits hold the index: one minimum along a vector's
+    lanes, several times faster than `argmin`.
     """
     n = squared.shape[-2]
     room = (1 << (n - 1).bit_length()) - 1
@@ -83,12 +83,12 @@ def nearest_index(squared: Array) -> Array:
 
 
 def least_distance(points: Array, which: Array, target: Array) -> Array:
-    """(B,) least distance from targets (B, 3) to the points (B, N, 3) that `which` (B, N) selects; inf if none."""
+    """Least distance (B,) from targets (B, 3) to the points (B, N, 3) selected by `which` (B, N); inf if none is."""
     return jnp.min(jnp.where(which, jnp.linalg.norm(points - target[:, None], axis=-1), jnp.inf), -1)
 
 
 def least_distance_to_segment(points: Array, which: Array, start: Array, end: Array) -> Array:
-    """(B,) least distance from the selected points to the segments from start to end (B, 3); inf if none."""
+    """Least distance (B,) from the selected points to segments from start to end (B, 3); inf if none is selected."""
     along = end - start
     length = jnp.sum(along**2, -1)[:, None]
     t = jnp.clip(jnp.einsum("bni,bi->bn", points - start[:, None], along) / length, 0.0, 1.0)
@@ -102,15 +102,15 @@ def square(x: Array) -> Array:
 
 
 def squash(force: Array) -> Array:
-    """Forces (..., 3) in newtons to vectors shorter than one: f / (|f| + 5 N)."""
+    """Squashes forces (..., 3) in newtons to vectors shorter than one: f / (|f| + 5 N)."""
     return force / (jnp.linalg.norm(force, axis=-1, keepdims=True) + FORCE_SCALE)
 
 
 def share(part: Array, whole: Array) -> tuple[Array, Array]:
-    """How many flags (B, N) of a part and of the whole are true, (B,) float each: an error that is a ratio."""
+    """Numerator and denominator (B,) of a ratio error: numbers of true flags in a part (B, N) and in the whole."""
     return jnp.sum(part, -1).astype(jnp.float32), jnp.sum(whole, -1).astype(jnp.float32)
 
 
 def flat(x: Array) -> Array:
-    """(B, n) of an array (B, ...)."""
+    """Reshapes an array (B, ...) to (B, n)."""
     return x.reshape(x.shape[0], -1)

@@ -1,7 +1,7 @@
-"""Methods that are compared: the paper's own, its baselines and its ablations, each as what it changes of a run.
+"""Methods for comparison: the paper's method, its baselines and its ablations, each defined by its changes to a run.
 
-`congrasp train --method NAME` trains those that learn, a policy's task says of which method it is, and
-`congrasp evaluate --method NAME` takes no policy of another one.
+`congrasp train --method NAME` trains those that learn. The task of a policy records its method, and `congrasp evaluate
+--method NAME` rejects policies of other methods.
 """
 
 import dataclasses
@@ -14,31 +14,31 @@ from congrasp.common.errors import CongraspError
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 STUDENT = "student"
-"""The method of policies that see what a robot has; `congrasp train --teacher` distils them."""
+"""Method of policies with a robot's sensors; `congrasp train --teacher` distils them."""
 STATIONARY_SHARE = 0.6
-"""Of the updates of two phases, those with stationary objects: the paper's 15 of 25 hours."""
+"""Share of the updates with stationary objects, in training with two phases: the paper's 15 of 25 hours."""
 
 
 class Method(NamedTuple):
-    """What a method changes, and what it can do without."""
+    """Changes by a method, and its requirements."""
 
     meaning: str
     task: Mapping[str, Any] = _NOTHING
-    """Fields of `TaskConfig`."""
+    """Changed fields of `TaskConfig`."""
     control: Mapping[str, Any] = _NOTHING
-    """Fields of `ControlConfig`."""
+    """Changed fields of `ControlConfig`."""
     weights: Mapping[str, float] = _NOTHING
-    """Fields of `RewardWeights`, those at the end of the curriculum's ramp too."""
+    """Changed fields of `RewardWeights`, also at the end of the curriculum's ramp."""
     schedule: Callable[[RunConfig], RunConfig] = lambda run: run
-    """What becomes of the order of training."""
+    """Changes the curriculum of a run."""
     needs: tuple[str, ...] = ()
-    """Constraints of which its episodes must have one; empty if the heading is enough."""
+    """Constraints of which every episode must have one; empty if the heading is enough."""
     learns: bool = True
-    """Whether there is a policy to train; otherwise the actions count for nothing."""
+    """True if there is a policy to train; otherwise the actions are ignored."""
 
 
 def _two_phases(run: RunConfig) -> RunConfig:
-    """Stationary objects first, then free ones; at the change the weights become those of the ramp's end."""
+    """Stationary objects first, then free ones; the weights of the ramp's end apply from the change on."""
     free, curriculum = max(round(STATIONARY_SHARE * run.updates), 1), run.curriculum
     ramp = (free - 1, free) if curriculum.ramped else curriculum.ramp
     return dataclasses.replace(run, curriculum=dataclasses.replace(curriculum, stationary_updates=free, ramp=ramp))
@@ -51,9 +51,9 @@ def _single_stage(run: RunConfig) -> RunConfig:
 
 
 METHODS = {
-    "ours": Method("one policy for every combination of constraints, objects free from the start, weights on a ramp"),
+    "ours": Method("one policy for every combination of constraints, objects free from the start, weights ramped"),
     "pd": Method(
-        "no learning: the wrist follows its guidance, then the fingers go to the reference pose, or close without one",
+        "no learning: the wrist follows its guidance, then the fingers close, to the reference pose if there is one",
         control={
             "finger_scale": 0.0,
             "wrist_position_scale": 0.0,
@@ -65,37 +65,38 @@ METHODS = {
         learns=False,
     ),
     "graspxl": Method(
-        "heading and affordance alone, with the hand centre fixed at that of the first fingers",
+        "heading and affordance only, with the hand centre fixed at that of the initial fingers",
         task={"constraints": ("heading", "affordance"), "dynamic_center": False},
     ),
     "dgrasp": Method(
-        "a reference pose in every episode, and nothing else: no heading is rewarded beside it",
+        "a reference pose in every episode and no other constraint: the heading is not rewarded",
         task={"constraints": ("heading", "pose"), "p_pose": 1.0, "own_references": False},
         weights={"heading_direction": 0.0, "heading_position": 0.0},
         needs=("pose",),
     ),
-    "no-dynamic-center": Method("the hand centre fixed at that of the first fingers", task={"dynamic_center": False}),
+    "no-dynamic-center": Method("the hand centre fixed at that of the initial fingers", task={"dynamic_center": False}),
     "no-feedforward": Method("the guidance aims at the nearest waypoint, not the next", control={"lookahead": 0}),
     "two-phase": Method(
         "the paper's two phases: stationary objects, then free ones with larger constraint weights",
         schedule=_two_phases,
     ),
     "single-stage": Method(
-        "free objects and the last weights from the start, no ramp",
+        "free objects and the final weights from the start, no ramp",
         schedule=_single_stage,
     ),
     STUDENT: Method(
-        "no privileges: joints, wrist and a tracker's object poses over some steps, no forces and no velocities",
+        "no privileged observations: joints, wrist and a tracker's object poses over some steps, no forces and "
+        "no velocities",
         task={"observation": "tracked"},
     ),
 }
 
 
 def get_method(name: str) -> Method:
-    """The method of this name.
+    """Returns the method of this name.
 
     Raises:
-      CongraspError: there is none.
+      CongraspError: there is no such method.
     """
     if name not in METHODS:
         raise CongraspError(f"There is no method '{name}'.", f"Choose one of: {', '.join(METHODS)}.")
@@ -103,7 +104,7 @@ def get_method(name: str) -> Method:
 
 
 def with_method(run: RunConfig, name: str) -> RunConfig:
-    """The run that trains a method.
+    """Returns the run that trains a method.
 
     Raises:
       CongraspError: there is no such method, or it does not learn.
@@ -120,35 +121,35 @@ def with_method(run: RunConfig, name: str) -> RunConfig:
 
 
 def evaluated_as(task: TaskConfig, name: str, source: str) -> TaskConfig:
-    """The task under which a policy is evaluated as a method.
+    """Returns the task under which a policy is evaluated as a method.
 
     Args:
-      task: the policy's.
-      name: of the method. One that does not learn takes hand and geometry from any policy, whose actions count for
-        nothing.
-      source: what to call the policy in errors.
+      task: task of the policy.
+      name: name of the method. One that does not learn accepts any policy, takes its hand and geometry, and ignores its
+        actions.
+      source: name of the policy in errors.
 
     Raises:
-      CongraspError: there is no such method, or the policy is of another.
+      CongraspError: there is no such method, or the policy has another method.
     """
     if not get_method(name).learns:
         return _task(task, name)
     if task.method != name:
         raise CongraspError(
-            f"The policy {source} is of the method '{task.method}', not '{name}'.",
-            f"Train one with 'congrasp train --method {name}' and name it with --policy.",
+            f"The policy {source} has the method '{task.method}', not '{name}'.",
+            f"Train one with 'congrasp train --method {name}' and pass it with --policy.",
         )
     return task
 
 
 def takes(name: str, row: str) -> bool:
-    """Whether a method can be asked for a row's constraints, which stand with `+` between them."""
+    """True if a method supports the constraints of a row, which are joined by `+`."""
     needs = get_method(name).needs
     return not needs or not set(needs).isdisjoint(row.split("+"))
 
 
 def _task(task: TaskConfig, name: str) -> TaskConfig:
-    """The task with what a method changes of it."""
+    """Returns the task with the changes of a method."""
     method = get_method(name)
     fields: dict[str, Any] = {
         **method.task,

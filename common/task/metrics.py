@@ -1,4 +1,4 @@
-"""Errors of one control step, with the paper's definitions (section Metrics), and what is told of an episode."""
+"""Errors of one control step, with the paper's definitions (section Metrics), and the metrics of an episode."""
 
 from collections.abc import Mapping
 
@@ -11,11 +11,11 @@ from congrasp.common.task.reward import terms
 from congrasp.common.task.types import Array
 
 FORCES = ("force_sum", "force_link_max")
-DIVERGED = "bad"  # the metric's name on the wire and in recordings
+DIVERGED = "bad"  # name of the metric on the wire and in recordings
 
 
 def metric_names(task: TaskConfig) -> tuple[str, ...]:
-    """Metrics of a finished episode: outcome, errors of the constraints, forces, and which blocks were active."""
+    """Metrics of a finished episode: outcome, errors of the constraints, forces, and active blocks."""
     return (
         "success",
         "held",
@@ -32,12 +32,12 @@ def metric_names(task: TaskConfig) -> tuple[str, ...]:
 
 
 def episode_fields(task: TaskConfig) -> tuple[str, ...]:
-    """What an actor reports of a finished episode, by the names on the wire: the metrics, then sums of reward terms."""
+    """Wire names of an actor's report of a finished episode: metrics, then sums of reward terms."""
     return (*(f"episode/{name}" for name in metric_names(task)), *(f"term/{name}" for name in terms(task)))
 
 
 def specs(task: TaskConfig) -> tuple[ErrorSpec, ...]:
-    """The errors of the constraints that a task knows."""
+    """Errors of the constraints supported by a task."""
     return error_specs(known(task))
 
 
@@ -51,14 +51,14 @@ def errors(scene: Scene) -> dict[str, tuple[Array, Array]]:
 def accumulate(
     task: TaskConfig, sums: Mapping[str, Array], step: Mapping[str, tuple[Array, Array]], approach: Array, hold: Array
 ) -> dict[str, Array]:
-    """Sums over an episode with one step more.
+    """Adds one step to the sums of an episode.
 
     Args:
-      task: names the errors.
-      sums: (B,) so far, of numerators and of denominators.
+      task: the task, for its errors.
+      sums: (B,) sums so far, of numerators and of denominators.
       step: `errors` of the step.
-      approach: (B,) bool, the step belongs to the approach.
-      hold: (B,) bool, it belongs to the paper's hold.
+      approach: (B,) bool, True if the step belongs to the approach.
+      hold: (B,) bool, True if the step belongs to the paper's hold.
     """
     total = {}
     for spec in specs(task):
@@ -75,8 +75,8 @@ def empty_sums(task: TaskConfig, batch: int) -> dict[str, Array]:
 
 
 def episode_errors(task: TaskConfig, sums: Mapping[str, Array]) -> dict[str, Array]:
-    """(B,) error of an episode by name: the mean over the steps that were summed, or the ratio of two sums.
+    """Errors (B,) of an episode by name: means over the summed steps, or ratios of two sums.
 
-    Zero where there were none, such as errors of the hold where the table stays.
+    The value is zero if there were no steps, as for errors of the hold when the table stays.
     """
     return {spec.name: sums[spec.name] / jnp.maximum(sums[f"{spec.name}/of"], 1.0) for spec in specs(task)}

@@ -1,4 +1,4 @@
-"""The observation: state and constraint features relative to the hand (paper, section Observation Space)."""
+"""Observation: state and constraint features relative to the hand (paper, section Observation Space)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,8 +21,8 @@ def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
 
 
 def fields(hand: Hand, task: TaskConfig) -> dict[str, tuple[ObservationField, ...]]:
-    """What every block holds, in order; those fields that the task's policy sees."""
-    mask = "1 for each active constraint in the order of 'masks'; else its block is zero"
+    """Fields of every block, in order, restricted to those that the task's policy observes."""
+    mask = "1 for each active constraint in the order of 'masks'; the block of an inactive one is zero"
     past = _past_fields(hand, task) if task.observation == "tracked" else ()
     return {
         "state": (*(field for field in _state_fields(hand) if _is_seen(task, field)), *past),
@@ -38,44 +38,45 @@ def fields(hand: Hand, task: TaskConfig) -> dict[str, tuple[ObservationField, ..
 
 
 def _is_seen(task: TaskConfig, field: ObservationField) -> bool:
-    """Whether a field is part of the task's observation."""
+    """True if a field is part of the task's observation."""
     return task.observation == "full" or not field.privileged
 
 
 def _state_fields(hand: Hand) -> tuple[ObservationField, ...]:
-    """The state of hand and object in the present control step."""
+    """Fields of the state of hand and object in the current control step."""
     f, n, p = len(hand.joints), len(hand.links), len(hand.keypoints)
     state: tuple[tuple[Any, ...], ...] = (
         ("q", f, "rad, finger joints in the order of 'joints'"),
-        ("u", 6, "m and rad, wrist joints in the order of 'wrist_joints', from the wrist's pose at the start"),
-        ("q_target - q", f, "rad, by what the last action's finger targets are ahead"),
-        ("u_target - u", 6, "m and rad, the same for the wrist"),
+        ("u", 6, "m and rad, wrist joints in the order of 'wrist_joints', relative to the wrist's initial pose"),
+        ("q_target - q", f, "rad, lead of the last finger targets over the joints"),
+        ("u_target - u", 6, "m and rad, lead of the last wrist targets over the joints"),
         ("q_velocity", f, "rad/s", True),
         ("u_velocity", 6, "m/s and rad/s", True),
-        ("touching", n, "1 where a link, in the order of 'links', touches the object, else 0", True),
-        ("force", 3 * n, "f / (|f| + force_scale) of the object's net force f on each link, N, wrist frame", True),
+        ("touching", n, "1 if a link, in the order of 'links', touches the object, else 0", True),
+        ("force", 3 * n, "f / (|f| + force_scale) for the object's net force f on each link, N, wrist frame", True),
         ("nearest", 3 * p, "m, from each keypoint to the nearest surface point, wrist frame"),
         ("object_velocity", 3, "m/s of the centre of mass, wrist frame", True),
         ("object_angular_velocity", 3, "rad/s, wrist frame", True),
         ("object_displacement", 3, "m since the start, wrist frame"),
         ("object_rotation", 3, "twice the vector part of the rotation since the start (w >= 0), wrist frame"),
-        # It saturates: how long a hold lasts is hidden from the policy, which must hold for ever, not until a deadline.
-        ("time", 1, "control steps over (approach_steps + hold_steps), at most 1; the hold that remains is hidden"),
-        ("table", 1, "1 while the table is there"),
+        # It saturates: the length of a hold is hidden from the policy, which must hold indefinitely, not until a
+        # deadline.
+        ("time", 1, "control steps over (approach_steps + hold_steps), at most 1; the remaining hold is hidden"),
+        ("table", 1, "1 while the table is present"),
     )
     return tuple(ObservationField(*field) for field in state)
 
 
 def _past_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
-    """What a tracked observation holds of the control steps before the present one."""
+    """Fields of a tracked observation for earlier control steps."""
     f, past = len(hand.joints), task.history - 1
-    order = f"of each of the last {past} control steps, newest first"
+    order = f"for each of the last {past} control steps, newest first"
     return (
-        ObservationField("past q - q", past * f, f"rad, {order}, less the present angles"),
-        ObservationField("past u - u", past * 6, f"m and rad, {order}, less the present wrist joints"),
+        ObservationField("past q - q", past * f, f"rad, {order}, minus the current angles"),
+        ObservationField("past u - u", past * 6, f"m and rad, {order}, minus the current wrist joints"),
         ObservationField("past q_target - past q", past * f, f"rad, {order}"),
         ObservationField("past u_target - past u", past * 6, f"m and rad, {order}"),
-        ObservationField("past object_position", past * 3, f"m, {order}, less the present one, present wrist frame"),
+        ObservationField("past object_position", past * 3, f"m, {order}, minus the current one, current wrist frame"),
         ObservationField(
             "past object_rotation", past * 3, f"{order}: twice the vector part of the rotation since then (w >= 0)"
         ),
@@ -83,8 +84,8 @@ def _past_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
 
 
 def _past(scene: Scene) -> list[Array]:
-    """The arrays (B, ...) of `_past_fields`."""
-    assert scene.readings is not None, "a tracked observation is of readings"
+    """Arrays (B, ...) of `_past_fields`."""
+    assert scene.readings is not None, "a tracked observation needs readings"
     now = Readings(*(field[:, :1] for field in scene.readings))
     past = Readings(*(field[:, 1:] for field in scene.readings))
     to_wrist = rotations.conjugate(scene.features.wrist_quaternion)[:, None]
@@ -99,13 +100,13 @@ def _past(scene: Scene) -> list[Array]:
 
 
 def _turn(start: Array, end: Array) -> Array:
-    """Twice the vector part (..., 3) of the rotation from one quaternion to another, whose w is positive."""
+    """Twice the vector part (..., 3) of the rotation from one quaternion to another, with positive w."""
     turned = rotations.multiply(end, rotations.conjugate(start))
     return 2.0 * turned[..., 1:] * jnp.where(turned[..., :1] < 0, -1.0, 1.0)
 
 
 def observe(scene: Scene) -> Array:
-    """(B, D) observation, laid out as `fields` says; blocks of inactive constraints are zero."""
+    """Observation (B, D), laid out like `fields`; blocks of inactive constraints are zero."""
     hand, task, state, features = scene.hand, scene.task, scene.state, scene.features
     to_wrist = rotations.conjugate(features.wrist_quaternion)
     horizon = task.approach_steps + task.hold_steps
@@ -142,5 +143,5 @@ def observe(scene: Scene) -> Array:
 
 
 def _seen(task: TaskConfig, values: Sequence[Array], content: Sequence[ObservationField]) -> list[Array]:
-    """Of the values (B, ...) of fields those that are part of the task's observation."""
+    """Selects the values (B, ...) of fields that are part of the task's observation."""
     return [value for value, field in zip(values, content, strict=True) if _is_seen(task, field)]

@@ -1,8 +1,8 @@
-"""Whether a motion could be one of a real hand: penetration, speed, jerk and effort, from samples of control steps.
+"""Plausibility of a motion: penetration, speed, jerk and effort, from samples of control steps.
 
-All of it is computed from joint angles, poses and contact forces, so that it means the same in every engine. The hand's
-links are capsules; of a hand of the user's own, points on the meshes of its file are held against the object beside
-them. What is sampled in a control step is the state after it.
+Everything is computed from joint angles, poses and contact forces, so that it means the same in every engine. The
+hand's links are capsules; for a custom hand, points on the meshes of its file are tested against the object as well. A
+sample is the state after a control step.
 """
 
 import functools
@@ -26,7 +26,7 @@ from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.types import Array
 
 CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}
-"""Deepest penetrations below which an episode is clean; `hand_mesh_mm` is measured of hands with meshes alone."""
+"""Greatest penetrations of a clean episode; `hand_mesh_mm` is only measured for hands with meshes."""
 MEASURES = (
     *CLEAN_MM,
     *(f"wrist_{of}{which}" for of in ("speed", "acceleration") for which in ("", "_mean", "_p95")),
@@ -34,24 +34,24 @@ MEASURES = (
 )
 """Names of the `measures` of an episode."""
 _SPACING = 0.004
-"""Metres between points on a capsule's axis: a sharp edge 7 mm from the axis seems at most 0.3 mm further away."""
+"""Spacing of points on a capsule's axis, m: a sharp edge 7 mm from the axis appears at most 0.3 mm farther away."""
 _CELL, _MOST = 0.004, 2048
-"""Metres between points on a hand's meshes, and most of them."""
+"""Spacing of points on a hand's meshes, m, and their greatest number."""
 
 
 class Sample(NamedTuple):
-    """What is kept of a control step of B environments."""
+    """Sample of a control step of B environments."""
 
     hand_hand: Array
-    """(B,) deepest penetration of two links that are not neighbours, m; 0 where there is none, as below."""
+    """(B,) deepest penetration of two links that are not neighbours, m; 0 if there is none, also below."""
     hand_table: Array
-    """(B,) deepest point of the hand below the table's top, m; 0 where it is removed."""
+    """(B,) deepest point of the hand below the table's top, m; 0 after the table is removed."""
     hand_object: Array
-    """(B,) deepest penetration of a link and the object's real surface, m."""
+    """(B,) deepest penetration of a link and the object's surface, m."""
     hand_mesh: Array
-    """(B,) how deep the hand's own surface is in the object's, m; NaN for hands without meshes."""
+    """(B,) deepest penetration of the hand's meshes and the object's surface, m; NaN for hands without meshes."""
     wrist_velocity: Array
-    """(B, 3) of the wrist's origin, m/s."""
+    """(B, 3) velocity of the wrist's origin, m/s."""
     finger_velocity: Array
     """(B, F) rad/s."""
     link_force: Array
@@ -59,33 +59,33 @@ class Sample(NamedTuple):
     torque_share: Array
     """(B, M) torques of the fingers' motors as shares of their limits."""
     object_position: Array
-    """(B, 3) of the object, wrist frame, m."""
+    """(B, 3) position of the object, wrist frame, m."""
     object_quaternion: Array
     """(B, 4) object frame to wrist frame."""
 
 
 class _Capsules(NamedTuple):
-    """Which of a hand's capsules must not overlap, and points on axes or on solids, in the wrist frame at zero."""
+    """Pairs of capsules that must not overlap, and points on axes or on solids, in the wrist frame at zero."""
 
     pairs: np.ndarray  # (2, Q) capsules that must not overlap
-    links: np.ndarray  # (P,) the link of each point
+    links: np.ndarray  # (P,) link of each point
     points: np.ndarray  # (P, 3)
-    radii: np.ndarray  # (P,) 0 on solids
+    radii: np.ndarray  # (P,) radius, 0 on solids
 
 
 def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
-    """What is kept of a control step.
+    """Samples a control step.
 
     Args:
-      scene: the scene after it.
-      index: (B,) int, the objects' rows in `field`.
+      scene: scene after the step.
+      index: (B,) int, rows of the objects in `field`.
       field: signed distances from the objects' surfaces.
     """
     hand, state, features = scene.hand, scene.state, scene.features
     transforms = kinematics.link_transforms(hand, state.q)
     wrist = features.wrist_position, features.wrist_quaternion
     seen = features.object_position, features.object_quaternion, index, field
-    half = jnp.float16  # of what is averaged
+    half = jnp.float16  # unit of what is averaged
     return Sample(
         hand_hand=hand_hand(hand, transforms),
         hand_table=jnp.where(state.table, hand_table(hand, transforms, *wrist), 0.0),
@@ -101,19 +101,19 @@ def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
 
 
 def hand_hand(hand: Hand, transforms: tuple[Array, Array]) -> Array:
-    """(B,) deepest of the `overlaps` in metres; 0 where there is none."""
+    """Deepest overlap (B,) of `overlaps` in metres; 0 if there is none."""
     return jnp.maximum(jnp.max(overlaps(hand, transforms), -1), 0.0)
 
 
 def overlaps(hand: Hand, transforms: tuple[Array, Array]) -> Array:
-    """(..., Q) by how much two capsules of different links overlap, in metres; negative where they are apart.
+    """Overlap (..., Q) of pairs of capsules of different links in metres; negative if they are apart.
 
-    Pairs are those that collide in the hand's model with `hand_self_collision`: not a link with its parent, nor those
-    whose capsules nest in one another while the hand is open or at zero (`common.hands.mjcf.overlapping`).
+    Pairs are those that collide in the hand's model with `hand_self_collision`: not a link and its parent, nor those
+    whose capsules nest in the open pose or at zero (`common.hands.mjcf.overlapping`).
 
     Args:
       hand: the hand.
-      transforms: of `common.hands.kinematics.link_transforms`.
+      transforms: result of `common.hands.kinematics.link_transforms`.
     """
     radii, ends = hand.capsule_radii, kinematics.capsules(hand, transforms)
     first, second = _capsules(hand).pairs
@@ -124,13 +124,13 @@ def overlaps(hand: Hand, transforms: tuple[Array, Array]) -> Array:
 
 
 def hand_table(hand: Hand, transforms: tuple[Array, Array], wrist_position: Array, wrist_quaternion: Array) -> Array:
-    """(B,) how far in metres the hand's lowest point is below the plane z = 0.
+    """Depth (B,) in metres of the hand's lowest point below the plane z = 0.
 
     Args:
       hand: the hand.
-      transforms: of `common.hands.kinematics.link_transforms`.
-      wrist_position: (B, 3) world.
-      wrist_quaternion: (B, 4) world.
+      transforms: result of `common.hands.kinematics.link_transforms`.
+      wrist_position: (B, 3) world frame.
+      wrist_quaternion: (B, 4) wrist frame to world frame.
     """
     ends = kinematics.capsules(hand, transforms)
     ends = rotations.transform(wrist_position, wrist_quaternion, ends.reshape(*ends.shape[:-3], -1, 3))
@@ -145,17 +145,17 @@ def hand_object(
     index: Array,
     field: DistanceField,
 ) -> Array:
-    """(B,) how deep in metres a link's capsule is in the object: its radius less the axis's distance from the surface.
+    """Penetration (B,) in m of the object by a capsule: its radius minus its axis's distance from the surface.
 
-    So a finger that goes through a thin blade counts with its own thickness, not with the blade's. Of links that
-    collide by solids points on these count, with the blade's.
+    A finger through a thin blade therefore counts with the thickness of the finger, not of the blade. Links that
+    collide as solids are represented by points on these, and count with the thickness of the blade.
 
     Args:
       hand: the hand.
-      transforms: of `common.hands.kinematics.link_transforms`.
+      transforms: result of `common.hands.kinematics.link_transforms`.
       object_position: (B, 3) wrist frame.
       object_quaternion: (B, 4) object frame to wrist frame.
-      index: (B,) int, the objects' rows in `field`.
+      index: (B,) int, rows of the objects in `field`.
       field: signed distances from the objects' surfaces.
     """
     capsules = _capsules(hand)
@@ -172,7 +172,7 @@ def hand_mesh(
     index: Array,
     field: DistanceField,
 ) -> Array:
-    """(B,) how deep in metres points on the hand's meshes (`common.hands.meshes`) are in the object; NaN without any.
+    """Penetration (B,) in m of the object by points on the hand's meshes (`common.hands.meshes`); NaN without any.
 
     Arguments are those of `hand_object`. A finger through a thin blade counts with the blade's thickness.
     """
@@ -193,7 +193,7 @@ def torque_share(scene: Scene) -> Array:
 
 
 def segment_distance(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """(...,) distance between the segments from a to b and from c to d (..., 3).
+    """Distances (...,) between the segments from a to b and from c to d (..., 3).
 
     Ericson, "Real-Time Collision Detection" (2005), section 5.1.9.
     """
@@ -211,18 +211,18 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
     """Measures (B,) of episodes, over all of their control steps.
 
     Accelerations are differences of successive velocities over the control step, the first from rest; jerks are second
-    differences, likewise.
+    differences.
 
     Args:
       samples: with leading axis T, NumPy arrays (T, B, ...).
       control_dt: seconds of a control step.
 
     Returns:
-      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, of hands with meshes, `hand_mesh_mm`: the deepest, mm.
-      `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over the episode's steps.
-      `finger_jerk`: root mean square over joints and steps, rad/s^3. `link_force_peak` (N) of the hardest
-      pressing link, `link_force` the mean of links that touch (0 where none ever does). `torque_share` and
-      `torque_share_peak`: over joints and steps.
+      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, for hands with meshes, `hand_mesh_mm`: the maximum, mm.
+        `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over the episode's
+        steps. `finger_jerk`: root mean square over joints and steps, rad/s^3. `link_force_peak` (N): that of the link
+        with the highest force; `link_force`: the mean over touching links (0 if none touches). `torque_share` and
+        `torque_share_peak`: mean and peak over joints and steps.
     """
     wrist, fingers = (np.asarray(x, np.float32) for x in (samples.wrist_velocity, samples.finger_velocity))
     force, torque = (np.asarray(x, np.float32) for x in (samples.link_force, samples.torque_share))
@@ -245,11 +245,11 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
 
 
 def is_clean(held: np.ndarray, found: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(B,) bool: the object was held for two seconds without the table, and nothing penetrated deeper than `CLEAN_MM`.
+    """(B,) bool: the object was held for two seconds without the table, and no penetration exceeds `CLEAN_MM`.
 
     Args:
-      held: (B,) bool.
-      found: the `measures`.
+      held: (B,) bool, True if the object was held.
+      found: result of `measures`.
     """
     return np.all([held, *(found[name] < limit for name, limit in CLEAN_MM.items() if name in found)], 0)
 
@@ -260,7 +260,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarray) -> Array:
-    """Points (P, 3) of links (P,) at zero, (..., P, 3) where the links are now, wrist frame."""
+    """Positions (..., P, 3) of points (P, 3) fixed to links (P,) at zero, wrist frame."""
     rotation, translation = transforms
     turned = rotations.apply(rotation[..., links, :, :], jnp.asarray(points)[:, None])[..., 0, :]
     return turned + translation[..., links, :]
@@ -268,17 +268,17 @@ def _moved(transforms: tuple[Array, Array], links: np.ndarray, points: np.ndarra
 
 @functools.cache
 def _surface(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
-    """The link of each point on the hand's meshes (P,), and the points (P, 3) in the wrist frame at zero."""
+    """Links (P,) of the points on the hand's meshes, and the points (P, 3) in the wrist frame at zero."""
     names = [link.name for link in hand.links]
     return _spread({names.index(name): mesh for name, mesh in own_meshes(hand).items()})
 
 
 def _spread(meshes: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """The link of each point on meshes (P,), and the points (P, 3).
+    """Links (P,) of points on meshes, and the points (P, 3).
 
-    Of what lies in one cell of a grid the point farthest from its link's middle is kept, so that corners are; cells are
-    `_CELL` wide, or wider where that leaves more than `_MOST` points. They begin at sqrt(area / `_MOST`), which bounds
-    how many points are sampled.
+    In each cell of a grid the point farthest from its link's centre is kept, so that corners are preserved. Cells are
+    `_CELL` wide, or wider if more than `_MOST` points would remain. The initial spacing sqrt(area / `_MOST`) bounds the
+    number of samples.
     """
     area = sum(float(trimesh.Trimesh(*mesh, process=False).area) for mesh in meshes.values())
     cell = max(_CELL, float(np.sqrt(area / _MOST)))
@@ -292,7 +292,7 @@ def _spread(meshes: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> tuple[np.nda
 
 
 def _thinned(vertices: np.ndarray, faces: np.ndarray, cell: float) -> np.ndarray:
-    """(P, 3) points on a mesh, one in each cell of a grid: the farthest from the middle."""
+    """Points (P, 3) on a mesh, one in each cell of a grid: the farthest from the centre."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     samples = trimesh.sample.sample_surface(mesh, max(1, int(8 * mesh.area / cell**2)), seed=0)[0]
     points = np.concatenate([vertices[np.unique(faces)], samples])
@@ -302,7 +302,7 @@ def _thinned(vertices: np.ndarray, faces: np.ndarray, cell: float) -> np.ndarray
 
 @functools.cache
 def _capsules(hand: Hand) -> _Capsules:
-    """Which of the hand's capsules must not overlap, and points on the axes of those that collide, or on solids."""
+    """Pairs of the hand's capsules that must not overlap, and points on the axes of colliding ones or on solids."""
     links, radii = hand.capsule_links, hand.capsule_radii
     names = [link.name for link in hand.links]
     nested = {frozenset(pair) for pair in (*overlapping(hand), *((link.name, link.parent) for link in hand.links))}

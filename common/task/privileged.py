@@ -1,6 +1,6 @@
-"""Privileged inputs of the critic: true parameters of an episode, and the true state where the policy has sensors.
+"""Privileged inputs of the critic: true parameters of an episode, and the true state if the policy has sensors.
 
-The critic is used in training alone, so that it may see what the actor and the robot lack (asymmetric actor-critic,
+The critic is only used in training, so it may observe what the actor and the robot cannot (asymmetric actor-critic,
 Pinto et al. 2018, arXiv 1710.06542). Actors record these inputs; no policy acts on them.
 """
 
@@ -27,17 +27,17 @@ class Parameters(NamedTuple):
     """True parameters of B episodes."""
 
     mass: Array
-    """(B,) kg, of the object."""
+    """(B,) mass of the object, kg."""
     friction: Array
     """(B,) sliding friction between the hand and the object."""
     gain_scale: Array
-    """(B,) factor of the finger servos' gains."""
+    """(B,) factor on the finger servos' gains."""
     stationary: Array
-    """(B,) bool: the object is held in place."""
+    """(B,) bool: the object is fixed."""
     hold: Array
-    """(B,) control steps without the table."""
+    """(B,) control steps of the hold, without the table."""
     sensors: Sensors | None
-    """The trackers; None where the policy sees the true poses."""
+    """The trackers; None if the policy observes the true poses."""
 
 
 def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
@@ -48,14 +48,14 @@ def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
 def fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
     """Description of the critic's privileged inputs, in order."""
     episode = (
-        ObservationField("mass", 1, "kg, of the object"),
+        ObservationField("mass", 1, "kg, mass of the object"),
         ObservationField("friction", 1, "sliding friction between the hand and the object"),
-        ObservationField("gain_scale", 1, "factor of the finger servos' gains"),
+        ObservationField("gain_scale", 1, "factor on the finger servos' gains"),
         ObservationField(
             "load", 1, "object's weight over friction times the sum of the fingertips' forces, at most 10"
         ),
-        ObservationField("stationary", 1, "1 while the object is held in place"),
-        ObservationField("hold_remaining", 1, "control steps of the hold to come over the longest hold"),
+        ObservationField("stationary", 1, "1 if the object is fixed"),
+        ObservationField("hold_remaining", 1, "remaining control steps of the hold over the longest hold"),
     )
     if not task.sensed:
         return episode
@@ -65,21 +65,21 @@ def fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
         ObservationField("period", 1, "control steps between two samples of the tracker"),
         ObservationField("delay", 1, "control steps until a sample arrives"),
         ObservationField("position_noise", 1, "m, standard deviation of each coordinate of a sample"),
-        ObservationField("rotation_noise", 1, "rad, standard deviation of a sample's turn about each axis"),
-        ObservationField("dropout", 1, "probability that a sample never arrives"),
+        ObservationField("rotation_noise", 1, "rad, standard deviation of a sample's rotation about each axis"),
+        ObservationField("dropout", 1, "probability that a sample is lost"),
         ObservationField("observation", size, "full observation of the true state, without noise"),
     )
 
 
 def observe(scene: Scene, parameters: Parameters) -> Array:
-    """(B, P) privileged inputs, laid out as `fields` says.
+    """Privileged inputs (B, P), laid out like `fields`.
 
-    With the control step t and the sum F of `tip_forces`, load = min(m g / (mu F), 10) and
-    hold_remaining = max(min(approach_steps + hold - t, hold), 0) / max(hold_steps, hold_steps_max).
+    With the control step t and the sum F of `tip_forces`, load = min(m g / (mu F), 10) and hold_remaining =
+    max(min(approach_steps + hold - t, hold), 0) / max(hold_steps, hold_steps_max).
 
     Args:
       scene: the true control step, with the task of the policy.
-      parameters: of the episodes.
+      parameters: parameters of the episodes.
     """
     hand, task = scene.hand, scene.task
     strength = jnp.maximum(parameters.friction * float(tip_forces(hand).sum()), 1e-6)
@@ -102,5 +102,5 @@ def observe(scene: Scene, parameters: Parameters) -> Array:
 
 
 def _full(task: TaskConfig) -> TaskConfig:
-    """The task of a policy that sees all of the simulator."""
+    """Returns the task with a policy that observes the full state."""
     return dataclasses.replace(task, observation="full")

@@ -1,4 +1,4 @@
-"""The reward, term by term (paper, section Reward Function): those of the grasp here, and those of the constraints."""
+"""Reward terms (paper, section Reward Function): those of the grasp are here, those of constraints in their files."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Earning(NamedTuple):
-    """What contacts may earn: what an active constraint forbids earns nothing."""
+    """Contacts that may earn reward: those forbidden by an active constraint earn nothing."""
 
     touching: Array
     """(B, L) bool."""
@@ -31,13 +31,13 @@ class Term(NamedTuple):
     """One term of the grasp reward."""
 
     name: str
-    """Of the term, of its weight and of its option, `--task.reward.NAME`."""
+    """Name of the term, of its weight and of its option, `--task.reward.NAME`."""
     default: float
-    """The weight, in units of reward per control step."""
+    """Default weight, in units of reward per control step."""
     meaning: str
     """Symbol in the paper, and unit."""
     value: Callable[[Scene, Earning], Array] | None
-    """(B,) before the weight, signed and bounded; None for a number that other terms share."""
+    """Value (B,) before the weight, signed and bounded; None for a parameter that other terms share."""
 
 
 def _distance(scene: Scene, earning: Earning) -> Array:
@@ -71,7 +71,7 @@ def _object_position(scene: Scene, earning: Earning) -> Array:
 
 
 def _object_rotation(scene: Scene, earning: Earning) -> Array:
-    """Squared rotation of the object since the start."""
+    """Weighted count of the links in contact."""
     turned = rotations.angle(scene.state.object_quaternion, scene.state.object_quaternion_initial)
     return -jnp.minimum(turned**2, 1.0)
 
@@ -85,16 +85,16 @@ GRASP: tuple[Term, ...] = (
     Term(
         "distance",
         0.3,
-        "w_dis: per metre of the weighted distance from the hand's keypoints to the object's surface (0.3 m at most).",
+        "Weighted forces of the links in contact, as shares of f_max.",
         _distance,
     ),
     Term(
         "contact",
         1.0,
-        "w_c: for all links in contact (shared out by the links' contact weights, which sum to one).",
+        "w_c: for all links in contact (weighted by the links' contact weights, which sum to one).",
         _contact,
     ),
-    Term("force", 0.5, "w_f: for all links pressing with `force_max` or more.", _force),
+    Term("force", 0.5, "Force in newtons beyond f_max, anywhere on the object.", _force),
     Term("force_max", 5.0, "f_max, N per link: force beyond it earns nothing.", None),
     Term(
         "force_excess",
@@ -117,7 +117,7 @@ GRASP: tuple[Term, ...] = (
     Term(
         "wrist_velocity",
         0.01,
-        "w_u: per squared velocity of the six wrist joints (m/s and rad/s).",
+        "Drop indicator I_drop.",
         lambda scene, earning: -jnp.minimum(square(scene.state.u_velocity), 100.0),
     ),
     Term(
@@ -128,17 +128,17 @@ GRASP: tuple[Term, ...] = (
     ),
     Term("drop", 1.0, "w_drop: per step with the object fallen.", _drop),
 )
-"""The grasp's terms r^grasp; `RewardWeights` (`common.config`) and all names of terms are made of them."""
+"""Terms of r^grasp; `RewardWeights` (`common.config`) and the names of all terms derive from them."""
 
 
 def terms(task: "TaskConfig") -> tuple[str, ...]:
-    """Names of the terms, each of which has the name of its weight: the grasp's, then those of the constraints."""
+    """Names of the terms, which are those of their weights: the grasp's, then those of the constraints."""
     grasp = (term.name for term in GRASP if term.value is not None)
     return (*grasp, *(weight.name for constraint in known(task) for weight in constraint.weights))
 
 
 def fallen(task: "TaskConfig", state: SceneState) -> Array:
-    """(B,) bool I_drop: the object is `drop_height` below where it started."""
+    """(B,) bool I_drop: the object is `drop_height` below its initial height."""
     return state.object_position[..., 2] < state.object_position_initial[..., 2] - task.drop_height
 
 

@@ -1,9 +1,9 @@
-"""What a robot has instead of the simulator's state: a tracker's samples of the object's pose, and its own joints.
+"""Sensors of a robot instead of the simulator's state: a tracker's samples of the object's pose, and joint encoders.
 
-A tracker samples the object's pose now and then; a sample arrives some control steps later, with errors, or never, and
-the newest that has arrived is shown until the next one. A policy without the simulator's privileges
-(`TaskConfig.observation` "tracked") sees the last control steps of that beside its joints and their targets, which
-stand in for contact forces and velocities.
+A tracker samples the object's pose periodically. A sample arrives some control steps later, with errors, or is lost;
+the newest arrived sample is shown until the next one. A policy without privileged observations
+(`TaskConfig.observation` "tracked") observes the last control steps of it, with its joints and their targets, which
+substitute for contact forces and velocities.
 """
 
 import math
@@ -18,38 +18,38 @@ from congrasp.common.task.types import Array, SceneState
 
 
 class Sensors(NamedTuple):
-    """The trackers of B episodes, drawn at their beginning."""
+    """Trackers of B episodes, drawn at their start."""
 
     key: Array
     """(B, 2) uint32 random key of errors and losses."""
     period: Array
     """(B,) control steps between two samples, at least 1."""
     phase: Array
-    """(B,) share of a period that has passed since the last sample when the episode begins."""
+    """(B,) share of a period passed since the last sample at the start of the episode."""
     delay: Array
     """(B,) int control steps until a sample arrives."""
     position_noise: Array
     """(B,) m, standard deviation of each coordinate."""
     rotation_noise: Array
-    """(B,) rad, standard deviation of the turn about each world axis."""
+    """(B,) rad, standard deviation of the rotation about each axis of the world frame."""
     dropout: Array
-    """(B,) probability that a sample never arrives."""
+    """(B,) probability that a sample is lost."""
 
 
 class Tracker(NamedTuple):
-    """The trackers after a control step; world frame."""
+    """State of the trackers after a control step; world frame."""
 
     sensors: Sensors
     poses: Array
-    """(B, K, 7) the object's true positions and quaternions in the last K control steps, newest first."""
+    """(B, K, 7) true positions and quaternions of the object in the last K control steps, newest first."""
     first: Array
-    """(B, 7) the pose that was shown when the episode began."""
+    """(B, 7) pose shown at the start of the episode."""
     shown: Array
-    """(B, 7) the pose that is shown now."""
+    """(B, 7) pose shown now."""
 
 
 class Readings(NamedTuple):
-    """What sensors and controller said in the last H control steps, newest first; fields as in `SceneState`."""
+    """Readings of sensors and controller in the last H control steps, newest first; fields as in `SceneState`."""
 
     q: Array
     """(B, H, F)."""
@@ -60,19 +60,19 @@ class Readings(NamedTuple):
     u_target: Array
     """(B, H, 6)."""
     object_position: Array
-    """(B, H, 3) as the tracker shows it."""
+    """(B, H, 3) as shown by the tracker."""
     object_quaternion: Array
     """(B, H, 4)."""
 
 
 def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: int) -> Sensors:
-    """Trackers of B episodes, each number uniform in its range.
+    """Draws trackers for B episodes, each parameter uniform in its range.
 
     Args:
-      config: the ranges.
+      config: ranges of the parameters.
       control_dt: seconds of a control step.
       key: random key.
-      batch: B.
+      batch: number B of episodes.
     """
     keys = jax.random.split(key, 7)
 
@@ -91,27 +91,27 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
 
 
 def longest(config: SensingConfig, control_dt: float) -> int:
-    """K, control steps whose poses may still be on their way."""
+    """K, the most control steps for which a pose may be in transit."""
     return math.ceil(config.delay[1] / control_dt) + 1
 
 
 def begin(sensors: Sensors, steps: int, position: Array, quaternion: Array) -> Tracker:
-    """Trackers of objects that have rested at poses (B, 3), (B, 4), with `steps` (K) of them on their way."""
+    """Returns trackers of objects that have rested at poses (B, 3), (B, 4), with `steps` (K) samples in transit."""
     pose = jnp.concatenate([position, quaternion], -1)
     shown = _sampled(sensors, jnp.zeros(pose.shape[0], jnp.int32), pose)[0]
     return Tracker(sensors, jnp.broadcast_to(pose[:, None], (len(pose), steps, 7)), shown, shown)
 
 
 def track(tracker: Tracker, time: Array, position: Array, quaternion: Array) -> Tracker:
-    """The trackers one control step later.
+    """Advances the trackers by one control step.
 
     A sample is taken in control step n where floor(n / period + phase) rises, and is shown from step n + delay on.
 
     Args:
-      tracker: after the step before.
-      time: (B,) int control steps since the episodes began, this one counted.
-      position: (B, 3) the object's true position after this step.
-      quaternion: (B, 4).
+      tracker: state after the previous step.
+      time: (B,) int control steps since the start of the episodes, including this one.
+      position: (B, 3) true position of the object after this step.
+      quaternion: (B, 4) true orientation of the object.
     """
     sensors = tracker.sensors
     pose = jnp.concatenate([position, quaternion], -1)
@@ -125,7 +125,7 @@ def track(tracker: Tracker, time: Array, position: Array, quaternion: Array) -> 
 
 
 def _sampled(sensors: Sensors, time: Array, pose: Array) -> tuple[Array, Array]:
-    """Samples (B, 7) of true poses, with their errors, and whether (B,) they are lost."""
+    """Samples (B, 7) of true poses with errors, and a mask (B,) of lost ones."""
 
     def noise(key: Array, time: Array) -> tuple[Array, Array]:
         errors, loss = jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key), time))
@@ -138,26 +138,26 @@ def _sampled(sensors: Sensors, time: Array, pose: Array) -> tuple[Array, Array]:
 
 
 def still(reading: Readings, steps: int) -> Readings:
-    """The readings of an episode that begins: the same (B, ...) in all H `steps`."""
+    """Readings at the start of an episode: the same (B, ...) in all H `steps`."""
     return Readings(*(jnp.repeat(field[:, None], steps, 1) for field in reading))
 
 
 def push(readings: Readings, newest: Readings) -> Readings:
-    """The readings with the newest (B, ...) in front, the oldest left out."""
+    """Prepends the newest readings (B, ...) and drops the oldest."""
     return Readings(
         *(jnp.concatenate([new[:, None], old[:, :-1]], 1) for new, old in zip(newest, readings, strict=True))
     )
 
 
 def seen_by(task: TaskConfig, state: SceneState, readings: Readings) -> SceneState:
-    """A control step as the policy sees it: with the pose that the tracker shows.
+    """Returns a control step as observed by the policy, with the pose that the tracker shows.
 
-    In a tracked observation forces and velocities are unknown, but that of the wrist, on which its targets depend
-    (`common.task.control`): it is the wrist's way in the last control step over its time.
+    In a tracked observation, forces and velocities are unknown except the wrist's velocity, on which its targets depend
+    (`common.task.control`): it is the wrist's displacement in the last control step over its duration.
 
     Args:
       task: the task.
-      state: the true state, but for the object's initial pose, which must be what the tracker showed first.
+      state: the true state, except for the object's initial pose, which must be the first shown by the tracker.
       readings: the last control steps.
     """
     state = state._replace(

@@ -1,8 +1,8 @@
-"""The arrays that the task's formulas speak about.
+"""Arrays used in the formulas of the task.
 
-Every array has leading batch axis B. World-frame unless said otherwise; the world's z axis points up and the table's
-top is at z = 0. Quaternions are (w, x, y, z) and rotate from the named body's frame into the world (or object) frame.
-F finger joints, L links, P keypoints, C contacts kept per link, N surface points, K waypoints.
+Every array has a leading batch axis B. Quantities are in the world frame unless stated otherwise; its z axis points up
+and the table's top is at z = 0. Quaternions are (w, x, y, z) and rotate from the named body's frame into the world (or
+object) frame. F finger joints, L links, P keypoints, C contacts kept per link, N surface points, K waypoints.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ CONTACTS_PER_LINK = 3
 
 
 class SceneState(NamedTuple):
-    """Hand and object in one control step, with what the episode started from."""
+    """Hand and object in one control step, and the initial state of the episode."""
 
     q: Array
     """(B, F) finger joint angles, rad."""
@@ -34,7 +34,7 @@ class SceneState(NamedTuple):
     u_target: Array
     """(B, 6) wrist targets of the previous control step."""
     object_position: Array
-    """(B, 3) object's centre of mass, m."""
+    """(B, 3) the object's centre of mass, m."""
     object_quaternion: Array
     """(B, 4)."""
     object_velocity: Array
@@ -54,15 +54,16 @@ class SceneState(NamedTuple):
     q_initial: Array
     """(B, F) finger angles at the start of the episode."""
     object_position_initial: Array
-    """(B, 3) object's position at the start of the episode."""
+    """(B, 3) the object's position at the start of the episode."""
     object_quaternion_initial: Array
     """(B, 4)."""
     wrist_load: Array
-    """(B, 6) m/s^2 and rad/s^2 that what the hand carries gives the wrist joints (`common.task.control.wrist_load`)."""
+    """(B, 6) acceleration of the wrist joints by the carried load, m/s^2 and rad/s^2
+    (`common.task.control.wrist_load`)."""
     time: Array
-    """(B,) control steps since the episode began, float."""
+    """(B,) float, control steps since the start of the episode."""
     table: Array
-    """(B,) bool, whether the table is present."""
+    """(B,) bool, True if the table is present."""
 
 
 class Surface(NamedTuple):
@@ -77,24 +78,24 @@ class Surface(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """What an episode asks for, by the names of its constraints (`common.task.constraints`); object frame."""
+    """Goal of an episode by constraint (`common.task.constraints`); object frame."""
 
     values: dict[str, Any]
-    """Of each constraint its goal arrays (B, ...), as the NamedTuple that the constraint names `goal`."""
+    """Goal arrays (B, ...) of each constraint, as the NamedTuple that the constraint names `goal`."""
     active: dict[str, Array]
-    """(B,) bool for each optional block of the observation: whether its constraint is active after the priority rules.
-    What an inactive block gates is ignored."""
+    """(B,) bool for each optional block of the observation: True if its constraint is active after the priority rules.
+    Values gated by an inactive block are ignored."""
 
     def __getitem__(self, constraint: str) -> Any:
-        """The goal arrays of a constraint."""
+        """Returns the goal arrays of a constraint."""
         return self.values[constraint]
 
     def replace(self, constraint: str, **arrays: Array) -> "Goal":
-        """The goal with other arrays of one constraint."""
+        """Returns the goal with other arrays of one constraint."""
         return dataclasses.replace(self, values={**self.values, constraint: self.values[constraint]._replace(**arrays)})
 
     def where(self, mask: Array, constraint: str, **arrays: Array) -> "Goal":
-        """The goal with other arrays of one constraint in the masked environments (B,)."""
+        """Returns the goal with other arrays of one constraint in the masked environments (B,)."""
         own = self.values[constraint]
         chosen = {
             name: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, getattr(own, name))
@@ -103,7 +104,7 @@ class Goal:
         return self.replace(constraint, **chosen)
 
     def flat(self) -> dict[str, Array]:
-        """All goal arrays by the names that messages give them: `heading_direction`, `pose_q` and so on."""
+        """All goal arrays by their names in messages: `heading_direction`, `pose_q` and so on."""
         return {
             f"{constraint}_{name}": array
             for constraint, arrays in self.values.items()
@@ -111,7 +112,7 @@ class Goal:
         }
 
     def row(self, index: int) -> "Goal":
-        """The goal of one environment, without the batch axis, as NumPy."""
+        """Returns the goal of one environment, without the batch axis, as NumPy arrays."""
         return jax.tree.map(lambda array: np.asarray(array)[index], self)
 
 

@@ -1,4 +1,4 @@
-"""What a transport does, whatever carries the messages."""
+"""Interface of transports."""
 
 import collections
 import threading
@@ -13,25 +13,25 @@ from congrasp.common.wire.codec import Message
 Handler = Callable[[str, Message], Message]
 """(key, request) -> reply."""
 Answerer = Callable[[str, Message], "Message | Future[Message]"]
-"""A handler that may also return a future of the reply: its thread then goes on with the next request."""
+"""A handler that may also return a future of the reply: its thread then continues with the next request."""
 Damage = Callable[[str, CongraspError], None]
-"""(key, what is wrong): a request arrived that could not be decoded."""
+"""(key, fault): called for a request that could not be decoded."""
 Admission = Callable[[str], Message | None]
-"""key -> the reply, or raised error, with which a request is turned away unseen; None lets it pass."""
+"""key -> reply, or raised error, that rejects a request before it is decoded; None admits it."""
 
 
 def join(threads: Iterable[threading.Thread], deadline: float) -> None:
-    """Waits for threads, but this one, until `deadline` on the monotonic clock."""
+    """Joins threads, except the current one, until `deadline` on the monotonic clock."""
     for thread in threads:
         if thread is not threading.current_thread():
             thread.join(max(0.0, deadline - time.monotonic()))
 
 
 class Subscription:
-    """What was published under a key expression: a ring that keeps the newest and counts what it lost.
+    """Messages published under a key expression: a ring buffer that keeps the newest and counts lost ones.
 
     Attributes:
-      dropped: messages lost so far, on the way or because `receive` was called too rarely.
+      dropped: messages lost so far, in transit or because `receive` was called too rarely.
     """
 
     def __init__(self, depth: int, on_close: Callable[[], None] = lambda: None):
@@ -43,7 +43,7 @@ class Subscription:
         self._closed = False
 
     def push(self, key: str, message: Callable[[], Message], lost: int = 0) -> None:
-        """Adds a message, which is decoded when it is received; `lost` ones before it never arrived."""
+        """Adds a message, to be decoded on receipt; `lost` messages before it never arrived."""
         with self._changed:
             self.dropped += lost
             if len(self._ring) == self._depth:
@@ -53,7 +53,7 @@ class Subscription:
             self._changed.notify()
 
     def receive(self, timeout: float) -> tuple[str, Message] | None:
-        """The oldest message that is kept, with its key; None if none comes within `timeout` seconds.
+        """Returns the oldest buffered message with its key; None if none arrives within `timeout` seconds.
 
         A message that cannot be decoded counts as dropped.
         """
@@ -72,7 +72,7 @@ class Subscription:
                 self.dropped += 1
 
     def close(self) -> None:
-        """Ends the subscription; a waiting `receive` returns."""
+        """Closes the subscription; a waiting `receive` returns."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -80,7 +80,7 @@ class Subscription:
 
 
 class Transport(Protocol):
-    """One process's end of the wire."""
+    """Endpoint of a process."""
 
     def serve(
         self,
@@ -96,46 +96,47 @@ class Transport(Protocol):
 
         Args:
           key: key or key expression.
-          handler: makes the reply, in a daemon thread of its own; message and code of its CongraspError are sent.
+          handler: returns the reply; called in a separate daemon thread. Message and code of its CongraspError are
+            sent.
           workers: threads that run the handler.
-          depth: queries that wait; further ones wait at their senders.
-          on_damage: told about requests that cannot be decoded, which are refused without asking the handler.
-          admission: asked before a request is decoded; it may send it away with a reply.
+          depth: length of the queue; further queries wait at their senders.
+          on_damage: called for requests that cannot be decoded; these are refused without calling the handler.
+          admission: called before a request is decoded; it may reject it with a reply.
         """
         ...
 
     def query(self, key: str, request: Message, *, timeout: float) -> Message:
-        """Asks whoever serves a key.
+        """Sends a query to the peer that serves a key.
 
         Args:
           key: the key.
-          request: the question.
-          timeout: seconds to wait for the answer, and for each further piece of a long one.
+          request: the request.
+          timeout: seconds to wait for the reply, and for each further chunk of a long one.
 
         Raises:
-          RefusedError: the peer answered with an error; a subclass where its code names one (`common.errors`).
-          TransportError: nobody serves the key, or there was no response in time.
+          RefusedError: the peer answered with an error; of the subclass that its code names (`common.errors`).
+          TransportError: no peer serves the key, or there was no response in time.
         """
         ...
 
     def publish(self, key: str, message: Message) -> None:
-        """Sends to whoever listens; never waits long, and may lose the message."""
+        """Publishes a message to all subscribers; does not block for long, and may lose the message."""
         ...
 
     def subscribe(self, key_expression: str, *, depth: int) -> Subscription:
-        """Listens; `depth` messages are kept."""
+        """Subscribes to a key expression; `depth` messages are buffered."""
         ...
 
     def declare_alive(self, key: str) -> None:
-        """Shows a token to everyone until this transport closes or its process dies."""
+        """Declares a liveliness token until this transport closes or its process dies."""
         ...
 
     def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
-        """Calls back, in a daemon thread, for each token that is there, comes or goes."""
+        """Calls `on_change`, in a daemon thread, for each token that exists, appears or disappears."""
         ...
 
     def close(self) -> None:
-        """Ends everything that was declared; may be called again."""
+        """Closes all declarations; may be called repeatedly."""
         ...
 
     def __enter__(self) -> Self: ...

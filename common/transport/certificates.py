@@ -1,4 +1,4 @@
-"""Reads certificates, and finds the credentials of a role in a folder of them."""
+"""Reads certificates, and finds the credentials of a role in a folder."""
 
 import datetime
 import os
@@ -17,13 +17,13 @@ class Certificate(NamedTuple):
     """Content of a certificate."""
 
     identity: Identity | None
-    """Whose it is; None for the authority."""
+    """Owner of the certificate; None for the authority."""
     run: str
-    """The run that it is for; of the authority, that for which it issues where no other is named."""
+    """Run of the certificate; for the authority, its default run."""
     hosts: tuple[str, ...]
-    """Names and addresses under which its owner may listen."""
+    """Names and addresses at which its owner may listen."""
     expires: datetime.datetime
-    """In UTC."""
+    """End of its validity, UTC."""
 
     @property
     def name(self) -> str:
@@ -32,25 +32,25 @@ class Certificate(NamedTuple):
 
     @property
     def days(self) -> float:
-        """Days that are left; negative once it has expired."""
+        """Days until it expires; negative once it has expired."""
         return (self.expires - datetime.datetime.now(datetime.UTC)).total_seconds() / 86400
 
 
 def load(path: pathlib.Path) -> x509.Certificate:
-    """A certificate's file; a CongraspError if it is none."""
+    """Loads a certificate file; raises a CongraspError if it is not one."""
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
     except (OSError, ValueError):
         raise CongraspError(
-            f"{path} is missing or is no certificate.", "Make it with 'congrasp certs', or correct the path."
+            f"{path} is missing or is not a certificate.", "Create it with 'congrasp certs', or correct the path."
         ) from None
 
 
 def read(path: pathlib.Path) -> Certificate:
-    """Reads a certificate's file.
+    """Reads a certificate file.
 
     Raises:
-      CongraspError: it cannot be read, or is no certificate of this project.
+      CongraspError: the file cannot be read, or is not a certificate of this project.
     """
     made = load(path)
     names = made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
@@ -68,10 +68,10 @@ def read(path: pathlib.Path) -> Certificate:
 
 
 def find(folder: pathlib.Path, role: str) -> Credentials:
-    """The credentials of a role.
+    """Returns the credentials of a role.
 
     Args:
-      folder: one that was issued for the role, or the authority's, whose number 0 is then taken.
+      folder: folder issued for the role, or that of the authority, from which number 0 is used.
       role: one of `ROLES`.
 
     Raises:
@@ -87,7 +87,7 @@ def find(folder: pathlib.Path, role: str) -> Credentials:
     actual = certificate.identity.role if certificate.identity else "ca"
     if actual != role:
         raise CongraspError(
-            f"{credentials.certificate} is for the role {actual}, not {role}.", f"Run: {_hint(folder, role)}"
+            f"{credentials.certificate} has the role {actual}, not {role}.", f"Run: {_hint(folder, role)}"
         )
     for expires, path in (
         (certificate.expires, credentials.certificate),
@@ -105,6 +105,6 @@ def find(folder: pathlib.Path, role: str) -> Credentials:
 
 
 def _hint(folder: pathlib.Path, role: str) -> str:
-    """The command that makes what is missing."""
+    """Command that creates the missing file."""
     where = folder.parent if folder.name.partition(".")[0] in ROLES else folder
     return f"congrasp certs issue {where} --role {role}"

@@ -1,4 +1,4 @@
-"""Keys on the wire: `congrasp/<run>/...`, and which flow each belongs to."""
+"""Keys on the wire, `congrasp/<run>/...`, and the flow of each."""
 
 import dataclasses
 import os
@@ -11,15 +11,15 @@ from congrasp.common.errors import CongraspError
 ROOT = "congrasp"
 Flow = Literal["control", "bulk", "log", "policy"]
 FLOWS: tuple[Flow, ...] = ("control", "bulk", "log", "policy")
-"""Kinds of traffic that must not wait for one another, in the order of their ports."""
+"""Kinds of traffic that must not delay one another, in the order of their ports."""
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 
 
 def check_name(what: str, name: str) -> str:
-    """Returns a name that may stand in a key.
+    """Returns a name that is valid within a key.
 
     Raises:
-      CongraspError: it is empty, too long, or has other characters than letters, digits, `_`, `.` and `-`.
+      CongraspError: it is empty, too long, or has characters other than letters, digits, `_`, `.` and `-`.
     """
     if not _NAME.fullmatch(name):
         raise CongraspError(
@@ -30,21 +30,21 @@ def check_name(what: str, name: str) -> str:
 
 
 def process_name(role: str) -> str:
-    """A name for this process where none was given: the machine's and the process's number."""
+    """Default name of this process: the names of the machine and of the process."""
     return re.sub(r"[^\w.-]", "-", f"{platform.node() or role}-{os.getpid()}", flags=re.ASCII)[-64:].lstrip(".-")
 
 
 def flow(key: str) -> Flow:
-    """The flow of a key or key expression: the part below the run decides."""
+    """Flow of a key or key expression, determined by the part below the run."""
     part, *rest = (*key.split("/")[2:], "")
     if part in ("rollout", "weights"):
-        # The notice is tiny and urgent, the weights themselves are neither.
+        # The announcement is tiny and urgent, the weights themselves are neither.
         return "control" if (part, rest[0]) == ("weights", "announce") else "bulk"
     return "log" if part == "log" else "policy" if part == "policy" else "control"
 
 
 class Alive(NamedTuple):
-    """Whose liveliness token it is."""
+    """Owner of a liveliness token."""
 
     role: str
     id: str
@@ -52,14 +52,14 @@ class Alive(NamedTuple):
 
 
 def parse_alive(key: str) -> Alive | None:
-    """The owner of a liveliness token; None if the key is none, or holds what is no name."""
+    """Returns the owner of a liveliness token; None if the key is not one, or contains an invalid name."""
     parts = key.split("/")
     named = len(parts) == 6 and parts[2] == "alive" and all(map(_NAME.fullmatch, parts[3:]))
     return Alive(*parts[3:]) if named else None
 
 
 def matches(expression: str, key: str) -> bool:
-    """Whether a key is one of those that an expression names: `*` stands for one part, `**` for any number of them."""
+    """True if an expression matches a key: `*` matches one part, `**` any number of parts."""
     pattern = "".join(
         "(?:/[^/]+)*" if part == "**" else "/[^/]+" if part == "*" else "/" + re.escape(part)
         for part in expression.split("/")
@@ -68,12 +68,12 @@ def matches(expression: str, key: str) -> bool:
 
 
 def below(key: str) -> str:
-    """Expression of a key and of all below it."""
+    """Expression that matches a key and all keys below it."""
     return f"{key}/**"
 
 
 def account(key: str) -> str:
-    """What the keys of all peers with one certificate have in common: the number that their names begin with."""
+    """Common part of the keys of all peers with one certificate: the number at the start of their names."""
     before, slash, name = key.rpartition("/")
     return before + slash + name.partition(".")[0]
 
@@ -98,11 +98,11 @@ class Keys:
 
     @property
     def tickets(self) -> str:
-        """Expression of the keys under which actors ask for permission to make a rollout."""
+        """Expression of the keys under which actors request a ticket for a rollout."""
         return self._key("ticket", "*")
 
     def ticket(self, actor: str) -> str:
-        """Query: permission for an actor to make a rollout."""
+        """Query: a ticket for a rollout of an actor."""
         return self._key("ticket", check_name("actor", actor))
 
     @property
@@ -111,7 +111,7 @@ class Keys:
         return self._key("rollout", "*")
 
     def rollout(self, actor: str) -> str:
-        """Query: takes a rollout of an actor and acknowledges it."""
+        """Query: sends a rollout of an actor and returns the acknowledgement."""
         return self._key("rollout", check_name("actor", actor))
 
     @property
@@ -125,7 +125,7 @@ class Keys:
 
     @property
     def announcement(self) -> str:
-        """Publication: a new policy version is there."""
+        """Publication: a new policy version is available."""
         return self._key("weights", "announce")
 
     @property
@@ -135,21 +135,21 @@ class Keys:
 
     @property
     def act(self) -> str:
-        """Query: an action of the live policy, for a client without a name."""
+        """Query: an action of the current policy, for a client without a name."""
         return self._key("policy", "act")
 
     def act_for(self, client: str) -> str:
-        """Query: an action of the live policy, for a client of this name."""
+        """Query: an action of the current policy, for a client of this name."""
         return self._key("policy", "act", check_name("client", client))
 
     @property
     def health(self) -> str:
-        """Query: whether the policy server is ready."""
+        """Query: readiness of the policy server."""
         return self._key("policy", "health")
 
     @property
     def logs(self) -> str:
-        """Expression of everything that is published for logs."""
+        """Expression of all publications for logs."""
         return self._key("log", "**")
 
     @property

@@ -1,4 +1,4 @@
-"""Messages within one process: the same behaviour as over the wire, and nothing is copied.
+"""In-process transport: the same behaviour as over the wire, without copies.
 
 Arrays may stay on a device. All endpoints of a `MemoryHub` see each other.
 """
@@ -21,7 +21,7 @@ from congrasp.common.wire.codec import Message
 
 _log = logging.getLogger(__name__)
 _GRACE = 5.0
-"""Seconds for which `close` waits for handlers that still work."""
+"""Seconds that `close` waits for running handlers."""
 
 
 class _Question(NamedTuple):
@@ -43,7 +43,7 @@ class _Watcher(NamedTuple):
 
 
 class MemoryHub:
-    """What the endpoints of one process share."""
+    """State shared by the endpoints of one process."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -64,7 +64,7 @@ class MemoryTransport:
     """A `Transport` between the endpoints of a hub."""
 
     def __init__(self, hub: MemoryHub, on_close: Callable[[], None] = lambda: None):
-        """Makes an endpoint; `on_close` is called once, when it closes."""
+        """Creates an endpoint; `on_close` is called once, when it closes."""
         self._hub, self._on_close = hub, on_close
         self._servers: list[_Server] = []
         self._subscriptions: list[Subscription] = []
@@ -83,7 +83,7 @@ class MemoryTransport:
         on_damage: Damage | None = None,
         admission: Admission | None = None,
     ) -> None:
-        """See `Transport.serve`; nothing is ever damaged here."""
+        """See `Transport.serve`; messages are never damaged here."""
         self._check_open()
         server = _Server(key, queue.Queue(depth), workers, threading.Event())
         with self._hub.lock:
@@ -153,7 +153,7 @@ class MemoryTransport:
     def close(self) -> None:
         """See `Transport.close`.
 
-        Waits for its threads: one that lets go of a device's array while the interpreter ends kills the process.
+        Waits for its threads: one that releases a device array while the interpreter shuts down kills the process.
         """
         if self._closed:
             return
@@ -183,7 +183,7 @@ class MemoryTransport:
         self.close()
 
     def _check_open(self) -> None:
-        """Raises `TransportError` once it is closed."""
+        """Raises a `TransportError` if the endpoint is closed."""
         if self._closed:
             raise TransportError("The transport is closed.")
 
@@ -200,7 +200,7 @@ _listening = threading.Condition()
 
 
 def listen_in_memory(name: str) -> MemoryTransport:
-    """The endpoint of a named hub that the others connect to; a CongraspError if there is one already."""
+    """Creates the listening endpoint of a named hub; raises a CongraspError if there is one already."""
     with _listening:
         hub = _named.setdefault(name, MemoryHub())
         if hub.listening:
@@ -211,7 +211,7 @@ def listen_in_memory(name: str) -> MemoryTransport:
 
 
 def connect_in_memory(name: str, wait: float) -> MemoryTransport:
-    """An endpoint of a named hub; a TransportError if there is no listener within `wait` seconds."""
+    """Creates an endpoint of a named hub; raises a TransportError if there is no listener within `wait` seconds."""
 
     def found() -> MemoryHub | None:
         hub = _named.get(name)
@@ -220,11 +220,11 @@ def connect_in_memory(name: str, wait: float) -> MemoryTransport:
     with _listening:
         if hub := _listening.wait_for(found, wait):
             return MemoryTransport(hub)
-    raise TransportError(f"No response from memory/{name}.", "It is reached from within its own process only.")
+    raise TransportError(f"No response from memory/{name}.", "It can only be reached within its process.")
 
 
 def _refuse_waiting(server: _Server) -> None:
-    """Answers what waits at a server that ended, and wakes its workers."""
+    """Fails the queued queries of a closed server, and wakes its workers."""
     while True:
         try:
             question = server.questions.get_nowait()
@@ -238,7 +238,7 @@ def _refuse_waiting(server: _Server) -> None:
 
 
 def _serve(server: _Server, handler: Answerer, admission: Admission) -> None:
-    """Answers questions, in a thread of its own, until the server ends."""
+    """Answers queries until the server closes; runs in a separate thread."""
     while not server.ended.is_set():
         question = server.questions.get()
         if question is not None:
@@ -246,12 +246,12 @@ def _serve(server: _Server, handler: Answerer, admission: Admission) -> None:
 
 
 def _ask(question: _Question, handler: Answerer, admission: Admission) -> "Message | Future[Message]":
-    """The handler's answer to a question that admission lets pass."""
+    """Returns the handler's reply to an admitted query."""
     return admission(question.key) or handler(question.key, question.request)
 
 
 def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message]]") -> None:
-    """Gives a question the outcome of a function, or what it raises."""
+    """Sets a query's result to the outcome of a function, or to its exception."""
     try:
         result = outcome()
         if isinstance(result, Future):
@@ -261,14 +261,14 @@ def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message
     except CongraspError as error:
         question.answer.set_exception(error_of(error.code, str(error)))
     except Exception as error:
-        _log.exception("The answer to %s failed.", question.key)
+        _log.exception("The reply to %s failed.", question.key)
         question.answer.set_exception(RefusedError(f"The peer failed on {question.key}: {type(error).__name__}."))
 
 
 def _watch(watcher: _Watcher, on_change: Callable[[str, bool], None]) -> None:
-    """Reports liveliness tokens, in a thread of its own."""
+    """Reports liveliness tokens; runs in a separate thread."""
     while (change := watcher.changes.get()) is not None:
         try:
             on_change(*change)
         except Exception:
-            _log.exception("Could not take notice of %s.", change[0])
+            _log.exception("Handling the token %s failed.", change[0])

@@ -1,4 +1,4 @@
-"""Two transports as one: for a learner that also has an actor in its own process."""
+"""Two transports combined, for a learner with an actor in its process."""
 
 from collections.abc import Callable
 from typing import Any, Self
@@ -8,14 +8,14 @@ from congrasp.common.wire.codec import Message
 
 
 class PairTransport:
-    """Serves, shows itself and publishes on two transports, which stay the caller's; asks and listens on the first."""
+    """Serves, publishes and declares tokens on two transports of the caller; queries and subscribes on the first."""
 
     def __init__(self, first: Transport, second: Transport):
-        """`query` and `subscribe` use the first alone."""
+        """Combines two transports; `query` and `subscribe` use only the first."""
         self._first, self._both = first, (first, second)
 
     def serve(self, key: str, handler: Answerer, **options: Any) -> None:
-        """See `Transport.serve`; each of the two has workers of its own."""
+        """See `Transport.serve`; each of the two has separate workers."""
         for transport in self._both:
             transport.serve(key, handler, **options)
 
@@ -43,7 +43,7 @@ class PairTransport:
             transport.watch_alive(key_expression, on_change)
 
     def close(self) -> None:
-        """Leaves both open."""
+        """Does nothing: both transports belong to the caller."""
 
     def __enter__(self) -> Self:
         return self

@@ -1,9 +1,9 @@
-"""Long replies in pieces, which whoever asked fetches one after another, at the pace of its own link.
+"""Long replies in chunks, fetched one after another by the client at the speed of its link.
 
-The first piece is short, or as long as the asker wishes who has had pieces of that length before: a reply that is no
-longer comes whole. The attachment of any other holds a token and the length of the whole. The rest is asked for under
-the same key, by token, offset and length. So nothing that is sent at once is longer than the asker's link takes in a
-moment, and a reader who is slow or stopped costs the process that serves it nothing but pieces that are dropped.
+The first chunk is short, or as long as requested by a client that has received chunks of that length before. A reply no
+longer than that is complete. Otherwise its attachment holds a token and the total length, and the client queries the
+rest under the same key, by token, offset and length. No message is therefore longer than the client's link transfers in
+a moment, and a slow or stopped client costs the server nothing but dropped chunks.
 """
 
 import contextlib
@@ -16,40 +16,40 @@ from collections.abc import Callable, Iterator
 
 from congrasp.common.errors import TransportError
 
-_SHORTEST, _FIRST, _LONGEST = 8 << 10, 32 << 10, 4 << 20  # bytes of a piece
-_FAST, _SLOW = 0.1, 0.4  # seconds of a piece below which the next is longer, and above which it is shorter
+_SHORTEST, _FIRST, _LONGEST = 8 << 10, 32 << 10, 4 << 20  # bytes of a chunk
+_FAST, _SLOW = 0.1, 0.4  # seconds of a chunk below which the next is longer, and above which it is shorter
 TIMEOUT = 1.0
-"""Seconds until a piece counts as lost."""
-_PAUSE = 0.05  # seconds to wait after a piece that was lost or put off
+"""Seconds until a chunk counts as lost."""
+_PAUSE = 0.05  # seconds to wait after a chunk that was lost or deferred
 _TOKEN = 8
 _HEAD = struct.Struct(f"<{_TOKEN}sQ")
 _REQUEST = struct.Struct(f"<{_TOKEN}sQI")
 _WISH = struct.Struct("<I")
 
 Ask = Callable[[bytes, float], bytes | None]
-"""(request, seconds) -> the piece, or None if there is none now."""
+"""(request, seconds) -> the chunk, or None if it is not available now."""
 
 
 class Pace:
-    """How long pieces may be: longer while they come quickly, and remembered from one reply to the next."""
+    """Chunk length of a link: longer while chunks arrive quickly, and kept between replies."""
 
     def __init__(self) -> None:
         self._length = _FIRST
 
     def wish(self) -> bytes | None:
-        """Attachment of a query whose reply may begin with a longer piece; None before there has been one."""
+        """Attachment of a query that requests a longer first chunk; None before the first long reply."""
         return _WISH.pack(self._length) if self._length > _FIRST else None
 
     def lost(self) -> None:
-        """Takes in that a longer first piece did not come: begins anew."""
+        """Records that a longer first chunk was lost: restarts from the shortest length."""
         self._length = _FIRST
 
     def request(self, token: bytes, offset: int) -> bytes:
-        """Attachment of a query for a further piece."""
+        """Attachment of a query for a further chunk."""
         return _REQUEST.pack(token, offset, self._length)
 
     def note(self, seconds: float, *, came: bool) -> None:
-        """Takes in how long a piece took, and whether it came; one that was only put off says nothing."""
+        """Records the duration of a chunk and whether it arrived; a deferred one changes nothing."""
         if seconds > _SLOW:
             self._length = max(_SHORTEST, self._length // 2)
         elif came and seconds < _FAST:
@@ -57,10 +57,10 @@ class Pace:
 
 
 class Outbox:
-    """Long replies that are being fetched: the same bytes are kept once, and of others the latest that were used."""
+    """Long replies being fetched: equal replies are stored once, and only the most recently used are kept."""
 
     def __init__(self, most: int = 8, at_once: int = 2):
-        """Keeps `most` replies; so many pieces are on their way to one account `at_once`."""
+        """Keeps `most` replies, and sends at most `at_once` chunks to one account at a time."""
         self._most, self._at_once = most, at_once
         self._sending: Counter[str] = Counter()
         self._lock = threading.Lock()
@@ -68,12 +68,12 @@ class Outbox:
 
     @contextlib.contextmanager
     def first(self, payload: bytes, attachment: bytes, account: str) -> Iterator[tuple[bytes, bytes | None]]:
-        """Around the sending of a reply: its first piece, and the attachment of that; None if it is the whole.
+        """Context of sending a reply: yields its first chunk and the chunk's attachment, None if the reply is complete.
 
         Args:
-          payload: the whole.
-          attachment: of the query.
-          account: whose it is. It has no long first piece while it has others on their way.
+          payload: the whole reply.
+          attachment: attachment of the query.
+          account: account of the client. Its first chunk is short while others are being sent to it.
         """
         longest = min(_WISH.unpack(attachment)[0], _LONGEST) if len(attachment) == _WISH.size else 0
         if len(payload) <= _FIRST or longest <= _FIRST:
@@ -83,7 +83,7 @@ class Outbox:
             yield self._cut(payload, longest if mine else _FIRST)
 
     def _cut(self, payload: bytes, longest: int) -> tuple[bytes, bytes | None]:
-        """The first piece of a reply, which is kept if that is not the whole, and its attachment."""
+        """Returns the first chunk of a reply and its attachment; stores the reply if that is not all of it."""
         if len(payload) <= longest:
             return payload, None
         with self._lock:
@@ -97,7 +97,7 @@ class Outbox:
 
     @contextlib.contextmanager
     def turn(self, account: str) -> Iterator[bool]:
-        """Around the sending of a piece: whether the account has none too many on their way."""
+        """Context of sending a chunk: yields True unless too many are being sent to the account."""
         with self._lock:
             mine = self._sending[account] < self._at_once
             self._sending[account] += mine
@@ -106,10 +106,10 @@ class Outbox:
         finally:
             with self._lock:
                 self._sending[account] -= mine
-                self._sending += Counter()  # keeps what is above zero
+                self._sending += Counter()  # drops counts of zero
 
     def piece(self, request: bytes) -> bytes:
-        """What a request asks for; empty if the reply is not kept any more."""
+        """Returns the requested chunk; empty if the reply is no longer stored."""
         token, offset, length = _REQUEST.unpack(request)
         with self._lock:
             payload = self._kept.get(token, b"")
@@ -119,7 +119,7 @@ class Outbox:
 
 
 def is_request(attachment: bytes) -> bool:
-    """Whether a query with this attachment asks for a further piece."""
+    """True if a query with this attachment requests a further chunk."""
     return len(attachment) == _REQUEST.size
 
 
@@ -127,29 +127,29 @@ def fetch(head: bytes, first: bytes, ask: Ask, pace: Pace, *, most: int, timeout
     """Fetches the rest of a reply.
 
     Args:
-      head: attachment of the first piece.
-      first: the first piece.
-      ask: asks for a piece.
-      pace: of the link.
-      most: bytes of the longest reply that is taken.
-      timeout: seconds that each piece may take.
+      head: attachment of the first chunk.
+      first: the first chunk.
+      ask: queries a chunk.
+      pace: pace of the link.
+      most: limit of the reply's length in bytes.
+      timeout: deadline of each chunk in seconds.
 
     Returns:
       The whole reply.
 
     Raises:
-      TransportError: it is too long or gone, or a piece did not come in time.
+      TransportError: the reply is too long or no longer stored, or a chunk did not arrive in time.
     """
     if len(head) != _HEAD.size:
-        raise TransportError("A reply has an attachment that is none of a piece.")
+        raise TransportError("A reply has an invalid attachment.")
     token, size = _HEAD.unpack(head)
     if size > most:
-        raise TransportError(f"A reply of {size} bytes is longer than the {most} that are allowed.")
+        raise TransportError(f"A reply has {size} bytes; the limit is {most}.")
     parts, have, deadline = [first], len(first), time.monotonic() + timeout
     while have < size:
         began = time.monotonic()
         if began >= deadline:
-            raise TransportError(f"Only {have} of {size} bytes of a reply came in time.")
+            raise TransportError(f"Only {have} of {size} bytes of a reply arrived in time.")
         piece = ask(pace.request(token, have), min(TIMEOUT, deadline - began))
         ended = time.monotonic()
         pace.note(ended - began, came=piece is not None)
@@ -157,7 +157,7 @@ def fetch(head: bytes, first: bytes, ask: Ask, pace: Pace, *, most: int, timeout
             time.sleep(max(0.0, min(_PAUSE, deadline - ended)))
             continue
         if not piece or have + len(piece) > size:
-            raise TransportError("The rest of a reply is not kept any more.", "Ask again.")
+            raise TransportError("The rest of a reply is no longer available.", "Send the query again.")
         parts.append(piece)
         have, deadline = have + len(piece), ended + timeout
     return b"".join(parts)

@@ -1,4 +1,4 @@
-"""TCP ports: where roles listen by default, the ports after a given one, and free ones of this machine."""
+"""TCP ports: defaults of the roles, neighbouring ports, and free ports of this machine."""
 
 import contextlib
 import fcntl
@@ -15,22 +15,22 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.keys import FLOWS
 
 LEARNER_URL = "tcp/127.0.0.1:7447"
-"""Where a learner listens unless told otherwise: on this machine only, and on as many ports from this one on as there
-are flows."""
+"""Default address of a learner: only this machine, on one port for each flow from this one on."""
 SERVER_URL = "tcp/127.0.0.1:7457"
-"""Where a policy server listens unless told otherwise."""
+"""Default address of a policy server."""
 _URL = re.compile(r"(?P<address>[a-z]+/[^/]+):(?P<port>\d{1,5})(?P<rest>[?#].*)?")
 _LOWEST, _COUNT = 15000, 15000
-"""Below the ports that systems give to outgoing connections (from 32768 on Linux): none of those gets in between."""
+"""First port for free ports: below the system's range for outgoing connections (from 32768 on Linux), which cannot take
+them."""
 _ATTEMPTS = 1000
 _lock, _reserved = threading.Lock(), set[int]()
 
 
 def shifted(url: str, offset: int) -> str:
-    """The URL with a port `offset` above.
+    """Returns the URL with its port increased by `offset`.
 
     Raises:
-      CongraspError: it has no port, or there is none so far above.
+      CongraspError: the URL has no port, or the resulting port does not exist.
     """
     match = _URL.fullmatch(url)
     if not match or not 0 < int(match["port"]) + offset < 1 << 16:
@@ -39,17 +39,17 @@ def shifted(url: str, offset: int) -> str:
 
 
 def rank_url(url: str, rank: int) -> str:
-    """Where a learner rank listens, if rank 0 listens at `url`: each takes one port a flow."""
+    """Address of a learner rank if rank 0 listens at `url`: each rank takes one port per flow."""
     return shifted(url, rank * len(FLOWS)) if rank else url
 
 
 def local_url(listeners: int = 1) -> str:
-    """A URL of the loopback interface where so many learners or servers, one after another, can listen."""
+    """Returns a loopback URL with free ports for `listeners` learners or servers."""
     return f"tcp/127.0.0.1:{free_port(listeners * len(FLOWS))}"
 
 
 def reachable_url(url: str) -> str:
-    """Where this machine reaches what listens on a URL that names all its interfaces."""
+    """Returns the address at which this machine reaches a listener on all its interfaces."""
     for everywhere in ("/0.0.0.0:", "/[::]:"):
         if everywhere in url:
             return url.replace(everywhere, "/127.0.0.1:")
@@ -57,12 +57,12 @@ def reachable_url(url: str) -> str:
 
 
 def free_port(count: int = len(FLOWS)) -> int:
-    """A port of the loopback interface that is free together with the `count` - 1 after it.
+    """Returns a free loopback port such that the `count` - 1 following ones are free as well.
 
-    As long as this process lives, none of them is returned again: not here, and not to another process of this user.
+    While this process lives, none of them is returned again, neither here nor in another process of this user.
 
     Raises:
-      OSError: there seems to be none, or reservations cannot be kept in the folder for temporary files.
+      OSError: no such ports are free, or reservations cannot be stored in the folder for temporary files.
     """
     file = _reservations()
     for _ in range(_ATTEMPTS):
@@ -76,10 +76,10 @@ def free_port(count: int = len(FLOWS)) -> int:
 
 
 def _reserve(file: int, ports: range) -> None:
-    """Locks a byte of the file for each port; the system takes the locks back when the process ends.
+    """Locks a byte of the file for each port; the system releases the locks when the process ends.
 
     Raises:
-      OSError: one is reserved already.
+      OSError: a port is already reserved.
     """
     with _lock:
         if not _reserved.isdisjoint(ports):
@@ -90,6 +90,6 @@ def _reserve(file: int, ports: range) -> None:
 
 @functools.cache
 def _reservations() -> int:
-    """Descriptor of this user's file of locks, open until the process ends: closing it would give up every lock."""
+    """Descriptor of this user's lock file, open until the process ends: closing it would release every lock."""
     path = pathlib.Path(tempfile.gettempdir()) / f"congrasp-ports-{os.getuid()}"
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)

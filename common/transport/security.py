@@ -1,13 +1,12 @@
-"""Who may do what on the wire: mutual TLS, and what each role is allowed by the process that listens.
+"""Authentication and authorisation on the wire: mutual TLS, and the rights of each role at a listener.
 
-Everyone shows a certificate of the authority whose common name is `<run>.<role>.<number>`. The listening process (the
-learner, or a policy server) denies everything but what `RIGHTS` gives that name, for its own end and for what it would
-forward. A peer's names on the wire begin with its certificate's number, so it cannot speak for another certificate's.
-The connecting process denies everything to a listener that is not its run's learner or policy server.
+Every peer presents a certificate of the authority with the common name `<run>.<role>.<number>`. The listening process
+(the learner, or a policy server) denies everything except what `RIGHTS` grants that name, both for its endpoint and for
+what it would forward. A peer's names on the wire begin with its certificate's number, so it cannot impersonate another
+certificate. The connecting process denies everything to a listener that is not its run's learner or policy server.
 
-Zenoh reads its rules once and compares common names as a whole; so all numbers are written into the rules, whether
-their certificates exist yet or not, except those that the file `revoked` names. When that file changes, the sessions
-are opened anew.
+Zenoh reads its rules once and compares whole common names. The rules therefore contain all numbers, whether or not
+their certificates exist yet, except those in the file `revoked`. When that file changes, the sessions are reopened.
 """
 
 import contextlib
@@ -26,46 +25,46 @@ from congrasp.common.transport.keys import ROOT, Flow, flow
 ROLES = ("learner", "actor", "server", "client", "observer")
 """Certificate roles."""
 LISTENERS = ("learner", "server")
-"""Roles whose certificates others connect to."""
+"""Roles to whose certificates others connect."""
 NUMBERS = 256
-"""Certificates of one role."""
+"""Number of certificates of a role."""
 CA_FILE, CERTIFICATE_FILE, KEY_FILE, REVOKED_FILE = "ca.crt", "tls.crt", "tls.key", "revoked"
 _PROBE_SECONDS = 1.0
 _ENDPOINT = re.compile(r"(?P<protocol>[a-z-]+)/(?P<host>\[[^]]*\]|[^/:]*)(:(?P<port>\d+))?.*")
 
 
 class Identity(NamedTuple):
-    """What a certificate's common name says."""
+    """Identity in a certificate's common name."""
 
     run: str
-    """Name of the run that it is for."""
+    """Name of the run."""
     role: str
     """One of `ROLES`."""
     number: int
-    """Tells the certificates of a role apart; below `NUMBERS`."""
+    """Distinguishes the certificates of a role; below `NUMBERS`."""
 
     def __str__(self) -> str:
         return f"{self.run}.{self.role}.{self.number}"
 
 
 def parse_identity(common_name: str) -> Identity | None:
-    """The identity that a common name spells; None if it spells none."""
+    """Parses a common name; returns None if it is not an identity."""
     run, role, number = ("", "", *common_name.rsplit(".", 2))[-3:]
     fits = run and role in ROLES and number.isascii() and number.isdigit() and int(number) < NUMBERS
     return Identity(run, role, int(number)) if fits else None
 
 
 def not_ours(path: pathlib.Path, common_name: str) -> CongraspError:
-    """The error of a certificate whose common name spells no identity."""
+    """Error for a certificate whose common name is not an identity."""
     return CongraspError(
-        f"{path} is a certificate for {ascii(common_name)[:90]}, which is no run, role and number.",
+        f"{path} is a certificate for {ascii(common_name)[:90]}, which is not a run, role and number.",
         "Issue one with 'congrasp certs issue'.",
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class Credentials:
-    """A folder with the authority's certificate, one's own, and its key, under the names that Kubernetes gives them."""
+    """A folder with the authority's certificate, a peer's certificate and its key, under Kubernetes file names."""
 
     folder: pathlib.Path
     role: str
@@ -78,21 +77,23 @@ class Credentials:
 
     @property
     def certificate(self) -> pathlib.Path:
-        """One's own certificate."""
+        """The peer's certificate."""
         return self.folder / CERTIFICATE_FILE
 
     @property
     def key(self) -> pathlib.Path:
-        """Its private key."""
+        """Private key of the certificate."""
         return self.folder / KEY_FILE
 
     @property
     def identity(self) -> Identity:
-        """Whose certificate it is; a CongraspError if it cannot be read, or names no run and role."""
+        """Identity of the certificate; raises a CongraspError if it cannot be read or does not name run and role."""
         try:
             decoded: Any = ssl._ssl._test_decode_cert(str(self.certificate))  # type: ignore[attr-defined]
         except (OSError, ValueError):
-            raise CongraspError(f"The credentials in {self.folder} cannot be used.", "Issue them anew.") from None
+            raise CongraspError(
+                f"The credentials in {self.folder} cannot be used.", "Issue new ones with 'congrasp certs issue'."
+            ) from None
         names = [value for entry in decoded["subject"] for key, value in entry if key == "commonName"]
         found = parse_identity(names[0]) if names else None
         if found is None:
@@ -100,10 +101,10 @@ class Credentials:
         return found
 
     def revoked(self) -> frozenset[str]:
-        """Common names in the list of revoked certificates beside these; none without a list.
+        """Common names in the list of revoked certificates; empty without a list.
 
         Raises:
-          CongraspError: there is a list that cannot be read: without it nobody is to be let in.
+          CongraspError: the list cannot be read; no peer may be admitted without it.
         """
         try:
             return frozenset((self.folder / REVOKED_FILE).read_text().split())
@@ -113,18 +114,18 @@ class Credentials:
             raise CongraspError(f"{self.folder / REVOKED_FILE} cannot be read.", "Copy it again.") from None
 
     def expects(self, name: Flow, common_name: str | None) -> bool:
-        """Whether a certificate of this common name may listen to these in a flow."""
+        """True if a certificate with this common name may listen to these credentials in a flow."""
         return common_name in self._listeners(name)
 
     def _listeners(self, name: Flow) -> list[str]:
-        """Common names that may listen to these in a flow: the learner's, and for queries of a policy the server's."""
+        """Common names that may listen to these credentials: the learner's, in some flows also the server's."""
         run, revoked = self.identity.run, self.revoked()
         roles = LISTENERS if name == "policy" else LISTENERS[:1]
         names = [str(Identity(run, role, number)) for role in roles for number in range(NUMBERS)]
         return [one for one in names if one not in revoked]
 
     def settings(self, name: Flow, *, listens: bool) -> dict[str, Any]:
-        """Zenoh's configuration for the session of one flow that listens or connects with these."""
+        """Zenoh configuration of the session of one flow that listens or connects with these credentials."""
         side = "listen" if listens else "connect"
         tls = {
             "root_ca_certificate": str(self.ca),
@@ -141,16 +142,16 @@ class Credentials:
 
 @dataclasses.dataclass(frozen=True)
 class Rights:
-    """What a role may do at a listener; key expressions below the run, where `{name}` stands for names of its own."""
+    """Rights of a role at a listener, as key expressions below the run; `{name}` matches the certificate's names."""
 
     ask: tuple[str, ...] = ()
-    """Keys that it may query."""
+    """Keys it may query."""
     publish: tuple[str, ...] = ()
-    """Keys under which it may publish."""
+    """Keys it may publish."""
     hear: tuple[str, ...] = ()
-    """Expressions to which it may subscribe."""
+    """Expressions it may subscribe to."""
     show: tuple[str, ...] = ()
-    """Liveliness tokens that it may declare."""
+    """Liveliness tokens it may declare."""
 
 
 RIGHTS: dict[str, dict[str, Rights]] = {
@@ -171,74 +172,74 @@ RIGHTS: dict[str, dict[str, Rights]] = {
         "observer": Rights(ask=("policy/health",)),
     },
 }
-"""By the role that listens and the role that connects; what is not here is denied."""
+"""Rights by listening and connecting role; everything else is denied."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Limit:
-    """What one connection may send under an expression; what exceeds it is dropped, and a query then has no answer."""
+    """Limit of what one connection may send under an expression; excess is dropped, and such a query gets no reply."""
 
     keys: str
     """Expression below the run."""
     size: int
-    """Bytes of a message."""
+    """Largest message in bytes."""
     rate: float
-    """With certificates: messages a second, evenly spaced; those that come sooner after the one before are dropped. 0
-    for no limit."""
+    """With certificates: most messages per second. They must be evenly spaced; one that follows another too soon is
+    dropped. 0 for no limit."""
 
 
 _SMALL, _LOG = 64 << 10, 16 << 20
 LIMITS: tuple[Limit, ...] = (
     Limit("config", _SMALL, 100.0),
     Limit("status", _SMALL, 100.0),
-    Limit("weights/latest/**", _SMALL, 0.0),  # the hub counts these by peer
-    Limit("ticket/*", _SMALL, 0.0),  # and these by actor
+    Limit("weights/latest/**", _SMALL, 0.0),  # counted per peer by the hub
+    Limit("ticket/*", _SMALL, 0.0),  # counted per actor by the hub
     *(Limit(f"log/{channel}/**", _LOG, 100.0) for channel in ("metrics", "event", "version", "episode", "rollout")),
-    # The policy server's own queue refuses what is too much, with a message.
+    # The policy server's queue refuses excess with a message.
     Limit("policy/act/**", 1 << 20, 0.0),
     Limit("policy/health", _SMALL, 100.0),
 )
-"""Rollouts are limited by the longest message and by the learner's hub."""
+"""Rollouts are limited by their size and by the learner's hub."""
 
 
 def numbered(number: int, name: str) -> str:
-    """The name on the wire of who has the certificate of this number."""
+    """Name on the wire of the owner of the certificate with this number."""
     return f"{number}.{name}"
 
 
 def secured(endpoint: str, credentials: Credentials | None) -> str:
-    """The endpoint that is used: with credentials always TLS.
+    """Returns the endpoint to use: with credentials always TLS.
 
     Raises:
-      CongraspError: the endpoint wants TLS and there are no credentials, or the other way round.
+      CongraspError: a TLS endpoint has no credentials, or one without TLS has some.
     """
     protocol, _, rest = endpoint.partition("/")
     if credentials is None:
         if protocol in ("tls", "quic"):
-            raise CongraspError(f"'{endpoint}' needs certificates.", "Give --certs; 'congrasp certs' makes them.")
+            raise CongraspError(f"'{endpoint}' needs certificates.", "Pass --certs; 'congrasp certs' creates them.")
         return endpoint
     if protocol not in ("tcp", "tls"):
-        raise CongraspError(f"'{endpoint}' does not go with certificates.", "Write it like tls/10.0.0.5:7447.")
+        raise CongraspError(f"'{endpoint}' cannot be used with certificates.", "Write it like tls/10.0.0.5:7447.")
     return f"tls/{rest}"
 
 
 def check_exposure(endpoint: str, credentials: Credentials | None, *, insecure: bool) -> None:
-    """Refuses to listen where other machines can connect when nothing protects it.
+    """Refuses to listen without protection where other machines can connect.
 
     Raises:
-      CongraspError: it would.
+      CongraspError: the endpoint would be exposed.
     """
     if credentials is None and not insecure and not _is_loopback(endpoint):
         raise CongraspError(
-            f"'{endpoint}' could be reached from other machines, and nothing would protect it.",
-            "Give --certs ('congrasp certs' makes them), or --insecure in a network where you trust everyone.",
+            f"'{endpoint}' would be reachable from other machines without protection.",
+            "Pass --certs ('congrasp certs' creates them), or --insecure in a network where every machine is trusted.",
         )
 
 
 def refusal(endpoint: str, credentials: Credentials | None) -> CongraspError | None:
-    """Why a connection cannot be made, if the reason is the certificates: takes one attempt, of a second or two.
+    """Returns the error of a connection if its certificates cause it; takes one attempt of one or two seconds.
 
-    Zenoh reports every failure alike: that it could not connect.
+    Zenoh reports every failure in the same way: that it could not connect.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if not match or not match["port"]:
@@ -252,7 +253,7 @@ def refusal(endpoint: str, credentials: Credentials | None) -> CongraspError | N
 
 
 def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Credentials | None) -> CongraspError | None:
-    """What a TLS handshake fails with, if it is the certificates."""
+    """Returns the error of a TLS handshake if it is caused by the certificates."""
     context = ssl.create_default_context()
     if credentials is None:
         context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
@@ -260,32 +261,33 @@ def _handshake(raw: socket.socket, host: str, endpoint: str, credentials: Creden
         try:
             context = ssl.create_default_context(cafile=str(credentials.ca))
             context.load_cert_chain(credentials.certificate, credentials.key)
-        except OSError:  # an SSLError is one, too
-            return CongraspError(f"The credentials in {credentials.folder} cannot be used.", "Issue them anew.")
+        except OSError:  # SSLError is an OSError
+            return CongraspError(
+                f"The credentials in {credentials.folder} cannot be used.",
+                "Issue new ones with 'congrasp certs issue'.",
+            )
     try:
         with context.wrap_socket(raw, server_hostname=host) as connection:
             if credentials is None:
                 return CongraspError(
-                    f"{endpoint} asks for certificates.", "Give --certs; 'congrasp certs' makes them on its machine."
+                    f"{endpoint} requires certificates.", "Pass --certs; 'congrasp certs' creates them on its machine."
                 )
             with contextlib.suppress(TimeoutError):
-                connection.recv(1)  # in TLS 1.3 the other side judges our certificate after the handshake
+                connection.recv(1)  # in TLS 1.3 the peer checks our certificate after the handshake
             return None
     except ssl.SSLCertVerificationError as error:
-        what = f"{endpoint} shows a certificate that is not to be trusted: {error.verify_message}."
-        return CongraspError(what, "Use certificates of one authority, and name the host with --host when issuing.")
+        what = f"{endpoint} presents a certificate that is not trusted: {error.verify_message}."
+        return CongraspError(what, "Use certificates of one authority, and pass --host with the host when issuing.")
     except ssl.SSLError as error:
         if "ALERT" not in (error.reason or ""):
             return None
         why = "expired" if "EXPIRED" in error.reason else "missing" if "REQUIRED" in error.reason else "not accepted"
         where = credentials.certificate if credentials else "none"
-        return CongraspError(
-            f"{endpoint} refuses: the certificate ({where}) is {why}.", "Issue one with its authority."
-        )
+        return CongraspError(f"{endpoint} refuses the certificate ({where}): {why}.", "Issue one with its authority.")
 
 
 def _is_loopback(endpoint: str) -> bool:
-    """Whether only this machine reaches an endpoint."""
+    """True if only this machine can reach an endpoint."""
     match = _ENDPOINT.fullmatch(endpoint)
     if not match:
         return False
@@ -299,7 +301,7 @@ def _is_loopback(endpoint: str) -> bool:
 
 
 def _only(names: list[str]) -> dict[str, Any]:
-    """Who connects takes everything from these, and nothing from anybody else."""
+    """Access control of a connecting process: everything from these names, nothing from others."""
     messages = ["put", "delete", "query", "reply", "declare_subscriber", "declare_queryable"]
     liveliness = ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"]
     rule = {
@@ -314,7 +316,7 @@ def _only(names: list[str]) -> dict[str, Any]:
 
 
 def _access_control(mine: Identity, name_of_flow: Flow, revoked: Set[str]) -> dict[str, Any]:
-    """What a listener allows each certificate to do in one flow; nothing else passes."""
+    """Access control of a listener in one flow: the rights of each certificate; everything else is denied."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -327,7 +329,7 @@ def _access_control(mine: Identity, name_of_flow: Flow, revoked: Set[str]) -> di
         subjects.append({"id": who, "cert_common_names": names})
         policies.append({"rules": [rule["id"] for rule in allowed], "subjects": [who]})
 
-    run = mine.run if mine.role == "learner" else "*"  # a server's clients know the policy by a name of its own
+    run = mine.run if mine.role == "learner" else "*"  # clients of a server use other names for the policy
     for other, rights in RIGHTS.get(mine.role, {}).items():
         shared, own = _split(rights)
         peers = [Identity(mine.run, other, number) for number in range(NUMBERS)]
@@ -342,7 +344,7 @@ def _access_control(mine: Identity, name_of_flow: Flow, revoked: Set[str]) -> di
 
 
 def _rules(who: str, rights: Rights, name: Flow, run: str) -> Iterator[dict[str, Any]]:
-    """Zenoh's rules for one flow: what comes in, and what goes out in answer to it."""
+    """Zenoh rules of one flow: for incoming messages, and for outgoing replies."""
     kinds = (
         (rights.ask, "query", "reply"),
         (rights.publish, "put", None),
@@ -363,13 +365,13 @@ def _rules(who: str, rights: Rights, name: Flow, run: str) -> Iterator[dict[str,
 
 
 def _of_flow(parts: Iterable[str], name: Flow, run: str = "*") -> list[str]:
-    """The keys of a run, or of any, among these that belong to a flow."""
+    """Keys of a run, or of any run, that belong to a flow."""
     keys = [f"{ROOT}/{run}/{part}" for part in parts]
     return [key for key in keys if flow(key) == name]
 
 
 def _split(rights: Rights) -> tuple[Rights, Rights]:
-    """The rights that all of a role share, and those that hold for own names."""
+    """Splits rights into those shared by a role and those restricted to names."""
     parts = dataclasses.asdict(rights)
     return (
         Rights(**{kind: tuple(key for key in keys if "{name}" not in key) for kind, keys in parts.items()}),
@@ -378,13 +380,13 @@ def _split(rights: Rights) -> tuple[Rights, Rights]:
 
 
 def _filled(rights: Rights, name: str) -> Rights:
-    """The rights of one name, in place of `{name}`."""
+    """Replaces `{name}` in rights by a name."""
     parts = dataclasses.asdict(rights)
     return Rights(**{kind: tuple(key.replace("{name}", name) for key in keys) for kind, keys in parts.items()})
 
 
 def limits(name: Flow, *, rates: bool) -> dict[str, Any]:
-    """Zenoh's configuration of the size of the messages that a listener takes in one flow, and of their rate."""
+    """Zenoh configuration of the size and rate limits of a listener in one flow."""
     both = {"flows": ["ingress"], "messages": ["query", "put"]}
     found = [(key, limit) for limit in LIMITS for key in _of_flow([limit.keys], name)]
     sizes = [{"id": key, **both, "key_exprs": [key], "size_limit": limit.size} for key, limit in found]

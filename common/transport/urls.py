@@ -1,7 +1,7 @@
-"""Opens transports by URL and role; ports, flows and certificates of a role are decided here alone.
+"""Opens transports by URL and role; the only place that decides ports, flows and certificates of a role.
 
 A URL is `SCHEME/ADDRESS`: `tcp/HOST:PORT` and `tls/HOST:PORT` over Zenoh, `memory/NAME` within a process. `SCHEMES`
-has their factories; a transport from elsewhere adds a row to it.
+maps schemes to factories; an external transport adds a row.
 """
 
 import importlib.util
@@ -20,22 +20,22 @@ from congrasp.common.transport.security import Credentials, check_exposure, numb
 Listener = Literal["learner", "server"]
 Peer = Literal["actor", "server", "client", "observer"]
 Certs = str | os.PathLike[str] | None
-"""A folder that 'congrasp certs' made: a role's own, or the authority's."""
+"""A folder created by 'congrasp certs': that of a role, or of the authority."""
 
 LISTENER_FLOWS: dict[Listener, tuple[Flow, ...]] = {"learner": FLOWS, "server": ("policy",)}
-"""By role: the flows that it listens on, which take a port each, from the URL's on."""
+"""Flows that each role listens on, each with a port, starting at the URL's."""
 PEER_FLOWS: dict[Peer, tuple[Flow, ...]] = {
     "actor": FLOWS[:3],
     "server": FLOWS[:2],
     "observer": FLOWS[:3],
     "client": ("policy",),
 }
-"""By role: the flows that it needs at its listener (a client's is a policy server, the others' a learner), of whose
-flows they are the first."""
+"""Flows that each role needs at its listener (a client's is a policy server, all others' a learner): the first of the
+listener's flows."""
 
 
 class Endpoint(NamedTuple):
-    """What a scheme's factory is told."""
+    """Arguments of a scheme's factory."""
 
     url: str
     role: str
@@ -43,34 +43,34 @@ class Endpoint(NamedTuple):
     listens: bool
     certs: Certs = None
     insecure: bool = False
-    """May listen where other machines reach it although nothing protects it."""
+    """Allows listening without protection where other machines can connect."""
     wait: float = 0.0
-    """Seconds to wait for somebody to listen."""
+    """Seconds to wait for a listener."""
     run: str | None = None
-    """The run that certificates must be for; None for any."""
+    """Run of the certificates; None for any."""
     longest_rollout: int | None = None
-    """Bytes of the longest rollout that a learner takes; None for that of any message."""
+    """Longest rollout accepted by a learner, in bytes; None for the limit of all messages."""
 
     @property
     def address(self) -> str:
-        """What follows the scheme."""
+        """Part after the scheme."""
         return self.url.partition("/")[2]
 
 
 def connect(url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0, run: str | None = None) -> Transport:
-    """Connects to who listens at a URL.
+    """Connects to the listener at a URL.
 
     Args:
-      url: `SCHEME/ADDRESS` of a learner, or for a client of a policy server.
-      role: what this process is to its peer.
+      url: `SCHEME/ADDRESS` of a learner or, for a client, of a policy server.
+      role: role of this process.
       certs: folder of the role's certificate, for mutual TLS.
-      wait: seconds to wait for somebody to listen.
-      run: name of the run that the certificate must be for.
+      wait: seconds to wait for a listener.
+      run: required run of the certificate.
 
     Raises:
-      CongraspError: the URL is malformed, or the certificates are missing, expired, another role's or run's, or not
-        accepted, or those of who listens are not for that.
-      TransportError: there is no response.
+      CongraspError: the URL is malformed; or the certificates are missing, expired, not accepted, or of another role or
+        run; or the listener's certificate does not allow it to listen.
+      TransportError: no listener responds.
     """
     return _open(Endpoint(url, role, listens=False, certs=certs, wait=wait, run=run))
 
@@ -88,27 +88,26 @@ def listen(
 
     Args:
       url: `SCHEME/ADDRESS`.
-      role: a learner, or a policy server.
-      certs: folder of the role's certificate: mutual TLS, and each role may do only what is its own.
-      insecure: listen beyond loopback without certificates.
-      run: name of the run that the certificate must be for.
-      longest_rollout: bytes of the longest rollout that a learner takes; longer ones are refused unseen.
+      role: learner or policy server.
+      certs: folder of the role's certificate: enables mutual TLS, and restricts each role to its rights.
+      insecure: allows listening beyond loopback without certificates.
+      run: required run of the certificate.
+      longest_rollout: longest rollout accepted by a learner, in bytes; longer ones are dropped undecoded.
 
     Raises:
-      CongraspError: the URL is malformed or in use, other machines could connect and nothing would protect it, or the
-        certificates are missing, expired, or another role's or run's.
+      CongraspError: the URL is malformed or in use; or it is exposed to other machines without protection; or the
+        certificates are missing, expired, or of another role or run.
     """
     return _open(Endpoint(url, role, True, certs, insecure, run=run, longest_rollout=longest_rollout))
 
 
 def find_credentials(certs: Certs, role: str, run: str | None = None) -> Credentials | None:
-    """The credentials of a role, for a run if it is named; None without a folder of certificates.
+    """Returns the credentials of a role, for a run if one is given; None without a folder of certificates.
 
-    Where the package cryptography is absent, as beside a client that needs numpy and Zenoh alone, it is only the peer
-    who judges them.
+    Without the package cryptography, as for a client that needs only NumPy and Zenoh, only the peer checks them.
 
     Raises:
-      CongraspError: they are missing, damaged, expired, or another role's or run's.
+      CongraspError: they are missing, damaged, expired, or of another role or run.
     """
     if certs is None:
         return None
@@ -119,14 +118,14 @@ def find_credentials(certs: Certs, role: str, run: str | None = None) -> Credent
     credentials = find(pathlib.Path(certs), role)
     if run is not None and credentials.identity.run != run:
         raise CongraspError(
-            f"{credentials.certificate} is for the run '{credentials.identity.run}', not '{run}'.",
-            f"Name that run, or issue one for this: congrasp certs issue --run {run} --role {role}",
+            f"{credentials.certificate} belongs to the run '{credentials.identity.run}', not '{run}'.",
+            f"Connect to that run, or issue a certificate for this one: congrasp certs issue --run {run} --role {role}",
         )
     return credentials
 
 
 def name_on_wire(name: str, certs: Certs, role: str = "actor") -> str:
-    """The name of an actor, server or client on the wire: it begins with its certificate's number, if it has one."""
+    """Name of an actor, server or client on the wire: it begins with its certificate's number, if it has one."""
     credentials = find_credentials(certs, role)
     return name if credentials is None else numbered(credentials.identity.number, name)
 
@@ -141,7 +140,7 @@ def _open(endpoint: Endpoint) -> Transport:
 
 
 def _open_memory(endpoint: Endpoint) -> Transport:
-    """Nothing leaves the process: every role has all flows, and certificates have nothing to protect."""
+    """Opens an in-process transport: every role has all flows, and certificates are ignored."""
     if endpoint.listens:
         return listen_in_memory(endpoint.address)
     return connect_in_memory(endpoint.address, endpoint.wait)
@@ -166,4 +165,4 @@ SCHEMES: dict[str, Factory] = {
     "memory": _open_memory,
     **dict.fromkeys(("tcp", "tls", "quic", "udp", "ws"), _open_zenoh),
 }
-"""Who opens the URLs of a scheme."""
+"""Factories of transports by scheme."""

@@ -1,8 +1,8 @@
-"""Zenoh's sessions: how they are configured and limited, and the threads that work inside them.
+"""Zenoh sessions: their configuration and limits, and the threads that work inside them.
 
-A listener bounds what a stranger can hold: connections that say nothing, messages that are never whole, and answers
-that nobody reads. An answer is dropped, and waited for no longer than some milliseconds, when its reader's link has no
-room: Zenoh answers with the congestion control of the query, which everyone here overwrites on arrival.
+A listener bounds the resources of untrusted peers: silent connections, incomplete messages, and replies that are not
+read. If a reader's link is full, a reply waits a few milliseconds and is then dropped: Zenoh replies with the
+congestion control of the query, which every process here overwrites on arrival.
 """
 
 import contextlib
@@ -23,13 +23,13 @@ from congrasp.common.transport.keys import FLOWS, Flow
 from congrasp.common.transport.security import Credentials, limits, refusal
 
 LONGEST: dict[Flow, int] = {"control": 2 << 20, "log": 32 << 20, "policy": 2 << 20}
-"""Bytes of a message that is put together at all; every connection may have several in the making."""
+"""Largest message that is reassembled, in bytes; each connection may reassemble several at once."""
 _LEASE_MS: dict[Flow, int] = {"control": 2500, "bulk": 10000, "log": 10000, "policy": 2500}
 _BLOCK_US: dict[Flow, int] = {"control": 2_000_000, "bulk": 5_000_000, "log": 1_000_000, "policy": 2_000_000}
-_OVERHEAD = 64 << 10  # bytes that Zenoh may add to a message
-_ATTEMPT = 1.0  # seconds of one attempt to connect; signals are seen between two
-_CLOSE = 2.0  # seconds that closing may take: with thousands of tokens on a busy machine it takes more than one
-_REOPEN = 10.0  # seconds that opening anew may take
+_OVERHEAD = 64 << 10  # bytes of Zenoh's overhead for a message
+_ATTEMPT = 1.0  # seconds of one attempt to connect; signals are handled between two
+_CLOSE = 2.0  # deadline of closing, s; with thousands of tokens on a busy machine it takes more than one
+_REOPEN = 10.0  # deadline of reopening, s
 _ROOM_US: dict[Flow, int] = {"control": 10_000, "bulk": 50_000, "log": 10_000, "policy": 5_000}
 """Microseconds that an answer waits for room in its reader's link; then all are dropped until there is some."""
 _ROOM_LONG_US = 200_000  # that a piece of a long answer waits in all
@@ -44,7 +44,7 @@ _log = logging.getLogger(__name__)
 def configuration(
     name: Flow, endpoints: list[str], listens: bool, max_message: int, credentials: Credentials | None
 ) -> zenoh.Config:
-    """Zenoh's configuration of one flow's session."""
+    """Returns the Zenoh configuration of one flow's session."""
     longest = min(max_message, LONGEST.get(name, max_message))
     files = _open_files() if listens else _FILES
     answers = {"id": "patience", "messages": ["query"], "key_exprs": ["**"], "flows": ["ingress"]}
@@ -76,7 +76,7 @@ def configuration(
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
-            raise CongraspError(f"Zenoh does not take the setting {key}: {first_line(error)}.") from None
+            raise CongraspError(f"Zenoh rejects the setting {key}: {first_line(error)}.") from None
     return config
 
 
@@ -98,7 +98,8 @@ def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
         if "in use" in str(error):
             raise CongraspError(
                 f"The port of {where} is in use.",
-                f"Stop what listens there, or choose another ({', '.join(FLOWS)} take a port each, from it on).",
+                f"Stop the process that listens there, or use another port ({', '.join(FLOWS)} take one each, in "
+                "this order).",
             ) from None
         raise CongraspError(f"Cannot listen on {where}: {first_line(error)}.") from None
 
@@ -106,11 +107,11 @@ def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
 def connect(
     config: zenoh.Config, endpoints: list[str], deadline: float, name: Flow, credentials: Credentials | None
 ) -> zenoh.Session:
-    """A session that is connected.
+    """Opens a connected session.
 
     Raises:
-      TransportError: there is no response until the deadline.
-      CongraspError: who listens does not take our certificate, or has one that is not for listening to this run.
+      TransportError: there is no response before the deadline.
+      CongraspError: the listener rejects our certificate, or its certificate does not allow it to listen for this run.
     """
     while True:
         try:
@@ -130,20 +131,20 @@ def connect(
     if credentials and shown and not any(credentials.expects(name, one) for one in shown):
         session.close()
         raise CongraspError(
-            f"{', '.join(endpoints)} shows the certificate {ascii(shown[0])[:90]}, which may not listen to "
+            f"{', '.join(endpoints)} presents the certificate {ascii(shown[0])[:90]}, which may not listen for "
             f"{credentials.identity}.",
-            "Connect to a learner or server of the same run, and see that its certificate is not revoked.",
+            "Connect to a learner or server of the same run whose certificate is not revoked.",
         )
     return session
 
 
 def first_line(error: Exception) -> str:
-    """Zenoh's words without the places in its source."""
+    """First line of a Zenoh error, without positions in its source."""
     return re.split(r" at /|\n", str(error))[0][:200].rstrip(". ")
 
 
 class _Declaration:
-    """What was declared in a flow, and again whenever its session is opened anew."""
+    """A declaration in a flow, repeated whenever its session is reopened."""
 
     def __init__(self, name: Flow, declare: Callable[[zenoh.Session], Any], works: tuple[Callable[[Any], None], ...]):
         self.name, self.declare, self.works = name, declare, works
@@ -151,13 +152,13 @@ class _Declaration:
 
 
 class Sessions:
-    """The sessions of a transport, what was declared in them, and the threads that are inside them.
+    """Sessions of a transport, their declarations, and the threads inside them.
 
-    A thread that is inside Zenoh when the interpreter ends aborts the process, so closing waits for all of them.
+    A thread that is inside Zenoh when the interpreter exits aborts the process, so closing waits for all threads.
 
     Attributes:
-      closed: set once they are closed.
-      failure: why, if nobody asked for it.
+      closed: set once the sessions are closed.
+      failure: the reason, if they were not closed on request.
     """
 
     def __init__(self) -> None:
@@ -177,16 +178,16 @@ class Sessions:
         self._open[name] = opener()
 
     def get(self, name: Flow) -> zenoh.Session | None:
-        """A flow's session; None if there is none, or they are closed or being opened anew."""
+        """Returns a flow's session; None if there is none, or while it is closed or being reopened."""
         return self._open.get(name)
 
     def declare(
         self, name: Flow, declare: Callable[[zenoh.Session], Any], *works: Callable[[Any], None]
     ) -> Callable[[], None]:
-        """Declares something in a session; `works` run with its channel, in a daemon thread each.
+        """Declares something in a session; each of `works` runs with its channel in a daemon thread.
 
         Returns:
-          What takes it back.
+          A function that undeclares it.
         """
         declaration = _Declaration(name, declare, works)
         with self._reopening:
@@ -201,10 +202,10 @@ class Sessions:
         return undeclare
 
     def reopen(self) -> None:
-        """Opens all sessions anew, with everything that was declared; peers connect again by themselves.
+        """Reopens all sessions with all declarations; peers reconnect by themselves.
 
         Raises:
-          CongraspError: one cannot be opened.
+          CongraspError: a session cannot be opened.
         """
         with self._reopening:
             sessions = list(self._open.values())
@@ -215,14 +216,14 @@ class Sessions:
             for name, opener in self._openers.items():
                 if not self.closed.is_set():
                     self._open[name] = opener()
-            if self.closed.is_set():  # by another thread, which saw no more than the sessions that were open then
+            if self.closed.is_set():  # by another thread, which only saw the sessions open at that time
                 self.close()
                 return
             for declaration in self._declarations:
                 self._start_all(declaration)
 
     def start(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Runs a function in a daemon thread of its own; it returns when the sessions are closed."""
+        """Runs a function in a separate daemon thread; it must return when the sessions are closed."""
         what = getattr(function, "func", function).__name__
         thread = threading.Thread(target=function, args=arguments, daemon=True, name=f"zenoh-{what}")
         thread.start()
@@ -230,7 +231,7 @@ class Sessions:
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
-        """Around a call that a thread of the caller makes."""
+        """Context of a call into Zenoh by a thread of the caller."""
         with self._changed:
             self._inside += 1
         try:
@@ -241,7 +242,7 @@ class Sessions:
                 self._changed.notify_all()
 
     def close(self) -> None:
-        """Closes the sessions, and waits a moment for the threads."""
+        """Closes the sessions, and waits briefly for the threads."""
         self.closed.set()
         deadline = time.monotonic() + _CLOSE
         if self._reopening.acquire(timeout=_CLOSE):
@@ -251,18 +252,18 @@ class Sessions:
         for session in sessions:
             try:
                 self.start(session.close)
-            except RuntimeError:  # the interpreter is ending and starts no threads
+            except RuntimeError:  # the interpreter is shutting down and starts no threads
                 session.close()
         join(self._threads, deadline)
         with self._changed:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
     def peers(self) -> set[str]:
-        """Common names of the certificates that those at the other ends show."""
+        """Common names of the certificates of connected peers."""
         return {str(link.auth_identifier) for session in list(self._open.values()) for link in session.info.links()}
 
     def _start_all(self, declaration: _Declaration) -> None:
-        """Declares in the present session, and starts the threads; a TransportError if there is no session."""
+        """Declares in the current session, and starts the threads; raises a TransportError if there is no session."""
         session = self._open.get(declaration.name)
         if session is None:
             raise TransportError("The transport is closed." if self.closed.is_set() else "There is no such flow.")
@@ -272,44 +273,44 @@ class Sessions:
 
 
 def follow_revocations(sessions: Sessions, credentials: Credentials, known: frozenset[str], period: float) -> None:
-    """Opens a listener's sessions anew whenever the list of revoked certificates changes, until they are closed.
+    """Reopens a listener's sessions whenever the list of revoked certificates changes, until they are closed.
 
     Args:
-      sessions: of the listener.
-      credentials: the listener's.
-      known: the list with which they were opened.
-      period: seconds between two looks.
+      sessions: sessions of the listener.
+      credentials: credentials of the listener.
+      known: the list when they were opened.
+      period: seconds between two checks.
     """
     while not sessions.closed.wait(period):
         try:
             listed = credentials.revoked()
             if listed == known:
                 continue
-            _log.warning("The list of revoked certificates has changed: all connections are made anew.")
+            _log.warning("The list of revoked certificates has changed: all connections are reopened.")
             sessions.reopen()
             known = listed
-        except CongraspError as error:  # tried again at the next look
+        except CongraspError as error:  # retried at the next check
             _log.error("The list of revoked certificates is not in effect: %s", error)
 
 
 def heed_revocations(sessions: Sessions, credentials: Credentials, period: float) -> None:
-    """Closes the sessions of one that connects once who listens there shows a revoked certificate.
+    """Closes the sessions of a connecting process once its listener presents a revoked certificate.
 
     Args:
-      sessions: of the one that connects.
-      credentials: its own.
-      period: seconds between two looks.
+      sessions: sessions of the connecting process.
+      credentials: credentials of the connecting process.
+      period: seconds between two checks.
     """
     while not sessions.closed.wait(period):
         try:
             with sessions.inside(), contextlib.suppress(zenoh.ZError):
                 if found := sorted(sessions.peers() & credentials.revoked()):
                     sessions.failure = CongraspError(
-                        f"The certificate {found[0]} of who listens there is revoked.",
-                        "Connect anew once it has another one (congrasp certs issue).",
+                        f"The listener's certificate {found[0]} is revoked.",
+                        "Connect again once it has a new one (congrasp certs issue).",
                     )
-        except CongraspError as error:  # tried again at the next look
-            _log.error("Whether the other end is revoked cannot be seen: %s", error)
+        except CongraspError as error:  # retried at the next check
+            _log.error("Cannot check whether the listener's certificate is revoked: %s", error)
         if sessions.failure:
             _log.error("%s", sessions.failure)
             sessions.close()

@@ -1,11 +1,11 @@
-"""Messages over Zenoh.
+"""Transport over Zenoh.
 
-One process listens (the learner or a policy server), the others connect to it, and it forwards between them. Each flow
-has a session, so a TCP connection, of its own: on one shared link a rollout of some megabytes would delay a ticket, and
-a recorder that reads slowly would delay both. Flow number i uses the port i above the one that was given.
+One process listens (the learner or a policy server); the others connect to it, and it forwards between them. Each flow
+has a separate session and thus a separate TCP connection: on one shared link, a rollout of some megabytes would delay a
+ticket, and a slow recorder would delay both. Flow number i uses the port i above the given one.
 
-Replies longer than a piece are fetched in pieces (`common.transport.pieces`). Everything is received through channels
-that own daemon threads drain; a callback would keep the process from ending.
+Long replies are fetched in chunks (`common.transport.pieces`). Everything is received through channels drained by
+daemon threads; a callback would keep the process from exiting.
 """
 
 import contextlib
@@ -33,19 +33,19 @@ from congrasp.common.transport.security import Credentials, secured
 from congrasp.common.transport.zenoh_session import Sessions, first_line
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
-_QUEUE = 256  # samples that wait for a thread that only moves them on
-_FEW = 4 << 10  # bytes of a query that may be sent twice
-_STAMP = struct.Struct("<8sQ")  # sender and count, by which a listener sees gaps
-_REVOCATION_SECONDS = 5.0  # between two looks at the list of revoked certificates
+_QUEUE = 256  # samples queued for a thread that only moves them on
+_FEW = 4 << 10  # longest query that may be sent twice, bytes
+_STAMP = struct.Struct("<8sQ")  # sender and count, by which a subscriber detects gaps
+_REVOCATION_SECONDS = 5.0  # between two checks of the list of revoked certificates
 _log = logging.getLogger(__name__)
 
 
 class _Reply(NamedTuple):
-    """What came back of a query."""
+    """A reply to a query, or its first chunk."""
 
     payload: bytes
     head: bytes
-    """Attachment of the first piece of a longer reply; empty for a whole one."""
+    """Attachment of the first chunk of a longer reply; empty for a complete one."""
 
 
 class ZenohTransport:
@@ -66,21 +66,21 @@ class ZenohTransport:
         """Opens the sessions.
 
         Args:
-          connect: endpoints to connect to, such as `tcp/192.168.0.5:7447`; the first that answers is taken, and found
-            again whenever it comes back.
-          listen: endpoints to listen on, instead.
-          flows: which flows to open; flow i uses the port i above the endpoint's, so both ends must start alike.
-          max_message: bytes of the longest message; `zenoh_session.LONGEST` limits some flows to less.
-          wait: seconds to wait for somebody to listen at `connect`.
-          credentials: everything goes over mutual TLS with these; one that listens allows each role what
-            `common.transport.security` gives it, and nothing else.
-          longest_rollout: bytes of the longest rollout that one that listens takes; by default `max_message`.
-          revocation_seconds: how often it looks whether certificates have been revoked. One that listens then makes
-            all connections anew; one that connects is closed if it is connected to the owner of one of these.
+          connect: endpoints to connect to, such as `tcp/192.168.0.5:7447`; the first that responds is used, and
+            reconnected whenever it returns.
+          listen: endpoints to listen on instead.
+          flows: flows to open; flow i uses the port i above the endpoint's, so the flows of both ends must start alike.
+          max_message: limit of a message's length in bytes; `zenoh_session.LONGEST` has lower limits for some flows.
+          wait: seconds to wait for a listener at `connect`.
+          credentials: credentials for mutual TLS; a listener restricts each role to its rights in
+            `common.transport.security`. None uses plain TCP.
+          longest_rollout: longest rollout accepted by a listener, in bytes; by default `max_message`.
+          revocation_seconds: period of the checks for revoked certificates. A listener then reopens all connections; a
+            connecting transport closes if its listener's certificate is revoked.
 
         Raises:
           CongraspError: an endpoint or key is malformed, a port is in use, or the certificates are not accepted.
-          TransportError: there is no response.
+          TransportError: no listener responds.
         """
         if bool(connect) == bool(listen):
             raise CongraspError("A transport needs endpoints either to connect to or to listen on.")
@@ -146,9 +146,9 @@ class ZenohTransport:
         return decode(whole, max_bytes=self._max_message)
 
     def _first(self, key: str, payload: bytes, timeout: float) -> _Reply:
-        """Asks for a reply, or for its first piece; raises as `query` does.
+        """Queries a reply, or its first chunk; raises like `query`.
 
-        What is asked in few words is asked again if a longer piece than the shortest does not come.
+        A short query is repeated if a first chunk longer than the shortest does not arrive.
         """
         wish = self._pace.wish() if len(payload) <= _FEW else None
         if wish is not None:
@@ -165,7 +165,7 @@ class ZenohTransport:
         return self._ask(key, payload, None, timeout)
 
     def _ask(self, key: str, payload: bytes | None, attachment: bytes | None, timeout: float) -> _Reply:
-        """Asks once; raises as `query` does."""
+        """Sends one query; raises like `query`."""
         refused: zenoh.ReplyError | None = None
         try:
             with self._sessions.inside():
@@ -194,7 +194,7 @@ class ZenohTransport:
         raise TransportError(f"No response for {key}.", f"The process that serves it may have ended{revoked}.")
 
     def publish(self, key: str, message: Message) -> None:
-        """See `Transport.publish`; once closed, or while the sessions are opened anew, it does nothing."""
+        """See `Transport.publish`; does nothing once closed, or while the sessions are being reopened."""
         payload = self._encode(message)
         name = flow(key)
         with self._counts_lock:
@@ -243,7 +243,7 @@ class ZenohTransport:
         self._sessions.declare(flow(key_expression), declare, watch)
 
     def close(self) -> None:
-        """See `Transport.close`; takes two seconds at most."""
+        """See `Transport.close`; takes at most two seconds."""
         self._finalizer()
 
     def __enter__(self) -> Self:
@@ -253,7 +253,7 @@ class ZenohTransport:
         self.close()
 
     def _session(self, key: str) -> zenoh.Session:
-        """The session of the flow that a key belongs to."""
+        """Returns the session of a key's flow."""
         session = self._sessions.get(flow(key))
         if self._sessions.failure:
             raise self._sessions.failure
@@ -266,25 +266,25 @@ class ZenohTransport:
         return session
 
     def _encode(self, message: Message) -> bytes:
-        """A message as bytes; a CongraspError if it is too long."""
+        """Encodes a message; raises a CongraspError if it is too long."""
         payload = encode(message)
         if len(payload) > self._max_message:
             raise CongraspError(
-                f"A message of {len(payload)} bytes is longer than the {self._max_message} that are allowed.",
+                f"A message has {len(payload)} bytes; the limit is {self._max_message}.",
                 "Send fewer environments or steps in one rollout.",
             )
         return payload
 
 
 def _received(channel: Any) -> Iterator[Any]:
-    """What comes out of a channel until it is closed."""
+    """Yields the items of a channel until it is closed."""
     with contextlib.suppress(zenoh.ZError):
         while True:
             yield channel.recv()
 
 
 class _Server(NamedTuple):
-    """Who answers the queries of a key."""
+    """Handler of the queries of a key, with its options."""
 
     handler: Answerer
     on_damage: Damage
@@ -294,7 +294,7 @@ class _Server(NamedTuple):
 
 
 def _serve(queries: Any, server: _Server) -> None:
-    """Answers queries, in a thread of its own, until the session closes."""
+    """Answers queries until the session closes; runs in a separate thread."""
     for query in _received(queries):
         key = str(query.key_expr)
         wanted = query.attachment.to_bytes() if query.attachment else b""
@@ -307,7 +307,7 @@ def _serve(queries: Any, server: _Server) -> None:
 
 
 def _answer(query: Any, key: str, server: _Server) -> Message | Future[Message]:
-    """The handler's answer to a query, unless admission or damage keeps it from the handler."""
+    """Returns the handler's reply to a query, unless it is rejected or damaged."""
     if (turned_away := server.admission(key)) is not None:
         return turned_away
     try:
@@ -321,7 +321,7 @@ def _answer(query: Any, key: str, server: _Server) -> Message | Future[Message]:
 def _reply(
     query: Any, key: str, outcome: Callable[[], Message | Future[Message]], outbox: Outbox, attachment: bytes
 ) -> None:
-    """Answers a query with what a function returns, once it is there, or with message and code of what it raises.
+    """Replies to a query with the result of a function once it is available, or with message and code of its error.
 
     The message is the error's payload, and the code the schema of its encoding.
     """
@@ -335,7 +335,7 @@ def _reply(
     except CongraspError as error:
         message, code = str(error), error.code
     except Exception as error:
-        _log.exception("The answer to %s failed.", key)
+        _log.exception("The reply to %s failed.", key)
         message = f"The peer failed on {key}: {type(error).__name__}."
     with contextlib.suppress(zenoh.ZError), query:
         if message:
@@ -347,7 +347,7 @@ def _reply(
 
 
 def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:
-    """Moves samples to a subscription, with the number of those lost before each."""
+    """Moves samples to a subscription, with the number of lost ones before each."""
     last: dict[str, tuple[bytes, int]] = {}
     for sample in _received(samples):
         key, lost = str(sample.key_expr), 0
@@ -361,14 +361,15 @@ def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> No
 
 
 def _decoded(payload: zenoh.ZBytes, max_message: int) -> Message:
-    """A message of a payload."""
+    """Decodes the message of a payload."""
     return decode(payload.to_bytes(), max_bytes=max_message)
 
 
 def _watch(samples: Any, on_change: Callable[[str, bool], None], closed: threading.Event) -> None:
-    """Reports liveliness tokens, in a thread of its own, until the session closes.
+    """Reports liveliness tokens until the session closes; runs in a separate thread.
 
-    When it is opened anew, all that were there are gone first: who has left meanwhile would not be missed otherwise.
+    When the session is reopened, all known tokens are reported as gone first; otherwise peers that left meanwhile would
+    not be noticed.
     """
     shown: set[str] = set()
 
@@ -377,7 +378,7 @@ def _watch(samples: Any, on_change: Callable[[str, bool], None], closed: threadi
         try:
             on_change(key, alive)
         except Exception:
-            _log.exception("Could not take notice of %s.", key)
+            _log.exception("Handling the token %s failed.", key)
 
     for sample in _received(samples):
         report(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)

@@ -1,9 +1,9 @@
-"""Messages as bytes: named arrays and meta data in the safetensors format, checked strictly on arrival.
+"""Encodes messages as bytes: named arrays and metadata in the safetensors format, checked strictly on arrival.
 
 The layout is that of https://github.com/huggingface/safetensors: eight bytes with the header's length, a JSON header
-that gives each array's dtype, shape and byte range, then the arrays. Encoding joins the arrays' memory once; decoding
-copies nothing, its arrays are read-only views of the message. The header's `__metadata__` holds the message's meta data
-as JSON text (`meta`) and the CRC-32 of the data section (`crc32`).
+that gives each array's dtype, shape and byte range, then the arrays. Encoding copies each array once; decoding copies
+nothing, its arrays are read-only views of the message. The header's `__metadata__` holds the CRC-32 of the data section
+and the header with zeros in its place (`checksum`), and the message's metadata as JSON text (`meta`).
 """
 
 import dataclasses
@@ -17,15 +17,15 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 
-try:  # the same checksum, seven times as fast where it is installed
+try:  # the same checksum, seven times as fast if installed
     from isal.isal_zlib import crc32
 except ImportError:
     from zlib import crc32
 
 MAX_MESSAGE = 256 << 20
-"""Bytes that a message may have unless the caller says otherwise."""
+"""Default limit of a message's length in bytes."""
 MAX_HEADER = 1 << 20
-"""Bytes that a header may have."""
+"""Limit of a header's length in bytes."""
 _BEGIN, _DIGITS = b'{"__metadata__":{"checksum":"', 8
 _MAX_DIMENSIONS = 8
 _MAX_ITEMS = 1 << 40
@@ -51,28 +51,28 @@ _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Message:
-    """What travels between processes; never changed once made."""
+    """Message between processes; immutable."""
 
     arrays: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """NumPy arrays by name, or device arrays inside one process."""
     meta: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """What JSON can hold."""
+    """Metadata, as JSON values."""
 
 
 class SharedMessage(Message):
-    """A message that is sent more than once; its bytes are made on first use and kept."""
+    """A message that is sent more than once; its bytes are encoded on first use and kept."""
 
     @functools.cached_property
     def encoded(self) -> bytes:
-        """The message's bytes."""
+        """The encoded message."""
         return _encode(self)
 
 
 def encode(message: Message) -> bytes:
-    """A message as safetensors bytes.
+    """Encodes a message as safetensors bytes.
 
     Raises:
-      CongraspError: an array's dtype or name, or the meta data, cannot be represented.
+      CongraspError: an array's dtype or name, or the metadata, cannot be represented.
     """
     return message.encoded if isinstance(message, SharedMessage) else _encode(message)
 
@@ -81,7 +81,7 @@ def _encode(message: Message) -> bytes:
     try:
         meta = json.dumps(dict(message.meta), allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
-        raise CongraspError(f"A message's meta data cannot be written as JSON: {error}.") from None
+        raise CongraspError(f"A message's metadata cannot be written as JSON: {error}.") from None
     arrays = {name: _portable(name, array) for name, array in message.arrays.items()}
     # Wide dtypes first, so that every array starts at a multiple of its item's size.
     order = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
@@ -98,49 +98,47 @@ def _encode(message: Message) -> bytes:
     text += b" " * (-len(text) % 8)
     if len(text) > MAX_HEADER:
         raise CongraspError(
-            f"A message's header has {len(text)} bytes.", f"At most {MAX_HEADER} fit: send less meta data."
+            f"A message's header has {len(text)} bytes.", f"The limit is {MAX_HEADER}: send less metadata."
         )
     text = b"%s%08x%s" % (_BEGIN, crc32(text, crc), text[len(_BEGIN) + _DIGITS :])
     return b"".join([len(text).to_bytes(8, "little"), text, *parts])
 
 
 def decode(data: bytes, *, max_bytes: int = MAX_MESSAGE) -> Message:
-    """The inverse of `encode`, for bytes that anyone may have sent.
+    """Decodes bytes from an untrusted peer; the inverse of `encode`.
 
     Args:
-      data: the bytes; the arrays of the result are views of them, and `encode` of it gives them back.
-      max_bytes: longer messages are refused.
+      data: the bytes; the arrays of the result are views of them, and `encode` of the result returns the same bytes.
+      max_bytes: limit of the message's length.
 
     Raises:
-      CongraspError: the bytes are not an intact message; the text says what is wrong with them.
+      CongraspError: the bytes are not an intact message; the message names the fault.
     """
     if len(data) > max_bytes:
-        raise CongraspError(f"The message has {len(data)} bytes, more than the {max_bytes} that are allowed.")
+        raise CongraspError(f"The message has {len(data)} bytes; the limit is {max_bytes}.")
     if len(data) < 8:
         raise CongraspError(f"The message is cut: it has only {len(data)} bytes.")
     length = int.from_bytes(data[:8], "little")
     if length > MAX_HEADER:
-        raise CongraspError(f"The message's header claims {length} bytes, more than the {MAX_HEADER} that are allowed.")
+        raise CongraspError(f"The message's header claims {length} bytes; the limit is {MAX_HEADER}.")
     if 8 + length > len(data):
         raise CongraspError(f"The message is cut inside its header: {len(data)} bytes of {8 + length} or more.")
     text, section = data[8 : 8 + length], memoryview(data)[8 + length :]
-    crc, covers_header = crc32(section), text.startswith(_BEGIN)
-    if covers_header:
-        digits = slice(len(_BEGIN), len(_BEGIN) + _DIGITS)
-        crc = crc32(text[: digits.start] + b"0" * _DIGITS + text[digits.stop :], crc)
-        if text[digits] != b"%08x" % crc:
-            raise CongraspError("The message does not match its checksum.")
+    if not text.startswith(_BEGIN):
+        raise CongraspError("The message does not begin with its checksum.")
+    digits = slice(len(_BEGIN), len(_BEGIN) + _DIGITS)
+    crc = crc32(text[: digits.start] + b"0" * _DIGITS + text[digits.stop :], crc32(section))
+    if text[digits] != b"%08x" % crc:
+        raise CongraspError("The message does not match its checksum.")
     header = _header(text)
-    meta, older = _metadata(header.pop("__metadata__", None), "checksum" if covers_header else "crc32")
-    if not covers_header and older != f"{crc:08x}":
-        raise CongraspError("The message's data do not match their checksum.")
+    meta = _metadata(header.pop("__metadata__"))
     message = SharedMessage(_arrays(header, section), meta)
     vars(message)["encoded"] = data
     return message
 
 
 def finite(value: Mapping[str, Any]) -> dict[str, Any]:
-    """A JSON object without its numbers that are NaN or infinite, at any depth: meta data cannot hold them."""
+    """Returns a JSON object without numbers that are NaN or infinite, at any depth, since metadata cannot hold them."""
     result: dict[str, Any] = {}
     for name, item in value.items():
         if isinstance(item, Mapping):
@@ -151,7 +149,7 @@ def finite(value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def checksum(message: Message) -> str:
-    """A checksum of a message's arrays with their names, dtypes and shapes; the same at both ends of a link."""
+    """Checksum of a message's arrays with their names, dtypes and shapes; the same at both ends of a link."""
     crc = 0
     for name in sorted(message.arrays):
         array = _portable(name, message.arrays[name])
@@ -161,7 +159,7 @@ def checksum(message: Message) -> str:
 
 
 def _portable(name: str, value: Any) -> np.ndarray:
-    """A contiguous little-endian array of a known dtype."""
+    """Returns the array as contiguous and little-endian; raises an error for an unsupported dtype."""
     array = np.asarray(value)
     array = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False)).reshape(array.shape)
     if array.dtype not in _NAMES:
@@ -190,7 +188,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _number(text: str) -> float:
     if not math.isfinite(number := float(text)):
-        raise CongraspError(f"The message's header holds {text[:30]}, which is no number that fits.")
+        raise CongraspError(f"The message's header holds {text[:30]}, which is not a number in range.")
     return number
 
 
@@ -198,13 +196,11 @@ def _no_constant(name: str) -> Any:
     raise CongraspError(f"The message's header holds {name}, which is not JSON.")
 
 
-def _metadata(entry: Any, checked_by: str) -> tuple[dict[str, Any], str]:
-    """The meta data, and the checksum as it stands there under its name."""
-    if not isinstance(entry, dict) or entry.keys() != {"meta", checked_by}:
-        raise CongraspError("The message lacks its meta data or its checksum.")
-    if not isinstance(entry["meta"], str) or not isinstance(entry[checked_by], str):
-        raise CongraspError("The message's meta data or checksum is no text.")
-    return _header(entry["meta"].encode(errors="replace")), entry[checked_by]
+def _metadata(entry: Any) -> dict[str, Any]:
+    """Parses the metadata."""
+    if not isinstance(entry, dict) or entry.keys() != {"checksum", "meta"} or not isinstance(entry["meta"], str):
+        raise CongraspError("The message lacks its metadata.")
+    return _header(entry["meta"].encode(errors="replace"))
 
 
 def _arrays(header: dict[str, Any], section: memoryview) -> dict[str, np.ndarray]:
@@ -244,9 +240,9 @@ def _entry(name: str, entry: Any) -> tuple[np.dtype, tuple[int, ...], int, int]:
             f"The array {_short(name)} has dtype {_short(dtype)}.", f"Messages hold {', '.join(_DTYPES)}."
         )
     if not _is_counts(shape) or len(shape) > _MAX_DIMENSIONS or math.prod(size or 1 for size in shape) >= _MAX_ITEMS:
-        raise CongraspError(f"The array {_short(name)} has shape {_short(shape)}, which is none.")
+        raise CongraspError(f"The array {_short(name)} has shape {_short(shape)}, which is not valid.")
     if not _is_counts(offsets) or len(offsets) != 2:
-        raise CongraspError(f"The array {_short(name)} has data_offsets {_short(offsets)}, which is no range.")
+        raise CongraspError(f"The array {_short(name)} has data_offsets {_short(offsets)}, which is not a valid range.")
     return _DTYPES[dtype], tuple(shape), offsets[0], offsets[1]
 
 
@@ -255,5 +251,5 @@ def _is_counts(value: Any) -> bool:
 
 
 def _short(value: Any) -> str:
-    """A stranger's value as printable text of bounded length."""
+    """Untrusted value as printable text of bounded length."""
     return ascii(value)[:60]

@@ -1,7 +1,7 @@
-"""What each kind of message must hold, and the check that it does.
+"""Specification of each kind of message, and its validation.
 
-A spec names arrays with their dtypes and shapes. A shape is made of numbers and of symbols such as T; a symbol stands
-for one size throughout a message. Values must be finite wherever they are floating-point numbers.
+A spec names arrays with their dtypes and shapes. A shape consists of numbers and of symbols such as T; a symbol has one
+size throughout a message. Floating-point values must be finite.
 """
 
 import dataclasses
@@ -16,23 +16,23 @@ from congrasp.common.wire.codec import Message
 from congrasp.common.wire.schema import F32, RECORDABLE, ArraySpec, RolloutForm
 
 LONGEST_TEXT = 4096
-"""Characters of a text in the meta data; a hand's own text has its own limit (`common.hands.files`)."""
+"""Limit of a text in the metadata, in characters; the text of a hand has a separate limit (`common.hands.files`)."""
 REAL = ("float32", "float64")
-_INFINITE_HALF = 0x7C00  # exponent bits of a float16 that is infinite or not a number
+_INFINITE_HALF = 0x7C00  # exponent bits of a float16 that is infinite or NaN
 _BLOCK = 1 << 16
 _COUNTS = 1 << 53
 
 
 @dataclasses.dataclass(frozen=True)
 class MessageSpec:
-    """One kind of message."""
+    """Specification of one kind of message."""
 
     kind: str
-    """What errors call it."""
+    """Name in errors."""
     arrays: Mapping[str, ArraySpec] = dataclasses.field(default_factory=dict)
-    """Specs by name; a name that ends in `/*` stands for any number of arrays below it."""
+    """Specs by name; a name that ends in `/*` matches any number of arrays below it."""
     meta: Mapping[str, type | tuple[type, ...]] = dataclasses.field(default_factory=dict)
-    """Types of the entries of the meta data that must be there; others may be."""
+    """Types of the required entries of the metadata; others are allowed."""
 
 
 _INDEX = ("int32", "int64")
@@ -47,14 +47,14 @@ ROLLOUT = MessageSpec(
         "incarnation": str,
         "sequence": int,
         "version": int,
-        "epoch": str,
+        "run_id": str,
         "schema": str,
         "steps": int,
     },
 )
-"""Actor to learner: T control steps of B worlds, D observation and A action sizes, P and S of what the critic and a
-teacher see, E episodes that ended. Of the arrays of the steps there are those that the run's algorithm learns from.
-`epoch` is the run's id."""
+"""Actor to learner: T control steps of B worlds, D observation and A action sizes, P inputs of the critic and S of a
+teacher, E finished episodes. Of the per-step arrays it holds those that the run's algorithm learns from. `run_id` is
+the run's id."""
 
 BUNDLE = MessageSpec(
     "bundle",
@@ -71,9 +71,9 @@ BUNDLE = MessageSpec(
         "value/m2": ArraySpec(REAL, ()),
         "value/count": ArraySpec(REAL, ()),
     },
-    {"version": int, "epoch": str, "schema": str, "hand": str, "layout": list, "action_size": int, "format": int},
+    {"version": int, "run_id": str, "schema": str, "hand": str, "layout": list, "action_size": int, "format": int},
 )
-"""Learner to everyone: weights and normalisers of one version."""
+"""Learner to all: weights and normalisers of one version."""
 
 EPISODE = MessageSpec(
     "episode",
@@ -103,34 +103,33 @@ EPISODE = MessageSpec(
         "colour_points": ArraySpec(REAL, ("P", 3), optional=True),
         "colour_values": ArraySpec(("uint8",), ("P", 3), optional=True),
         "surface_points": ArraySpec(REAL, ("N", 3)),
-        "surface_minus": ArraySpec(("bool",), ("N",)),
+        "surface_avoid": ArraySpec(("bool",), ("N",)),
     },
     {"hand": str, "object": str, "control_dt": float, "version": int, "actor": str, "success": bool, "metrics": dict},
 )
-"""Actor to whoever listens: one world for T steps, for drawing."""
+"""Actor to subscribers: one world for T steps, for drawing."""
 
 METRICS = MessageSpec("metrics", meta={"time": (int, float), "values": dict})
 EVENT = MessageSpec("event", meta={"time": (int, float), "level": str, "text": str})
 TICKET = MessageSpec("ticket request", meta={"actor": str, "incarnation": str, "ticket": str})
-ANNOUNCEMENT = MessageSpec("announcement", meta={"version": int, "epoch": str, "life": str})
-"""Learner to everyone: there is a new version. `epoch` is the run's id, another one when training starts from scratch;
-`life` is the session's, another one each time the learner's process starts."""
+ANNOUNCEMENT = MessageSpec("announcement", meta={"version": int, "run_id": str, "session_id": str})
+"""Learner to all: a new version is available. `run_id` changes when training starts from scratch, `session_id` each
+time that the learner's process starts."""
 
 
 def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int]:
-    """Checks a message against its kind.
+    """Validates a message of a known kind.
 
     Args:
-      message: the message; arrays that live on a device are not checked for finite values, as they never left this
-        process.
-      spec: the kind.
-      **sizes: values of symbols that are known beforehand.
+      message: the message; device arrays are not checked for finite values, since they never left this process.
+      spec: specification of the kind.
+      **sizes: sizes of symbols known beforehand.
 
     Returns:
-      The values of all symbols.
+      The sizes of all symbols.
 
     Raises:
-      CongraspError: naming the array or the entry, and the rule that it breaks.
+      CongraspError: the message is invalid; the text names the array or the entry, and the violated rule.
     """
     for name, kind in spec.meta.items():
         value = message.meta.get(name)
@@ -140,10 +139,10 @@ def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int
             )
         if isinstance(value, str) and name != "hand" and len(value) > LONGEST_TEXT:
             raise CongraspError(
-                f"The {spec.kind}'s meta entry '{name}' has {len(value)} characters, more than {LONGEST_TEXT}."
+                f"The {spec.kind}'s meta entry '{name}' has {len(value)} characters; the limit is {LONGEST_TEXT}."
             )
         if isinstance(value, int) and abs(value) > _COUNTS:
-            raise CongraspError(f"The {spec.kind}'s meta entry '{name}' is beyond all counts.")
+            raise CongraspError(f"The {spec.kind}'s meta entry '{name}' is too large for a count.")
     for name, array_spec in spec.arrays.items():
         if not name.endswith("/*") and not array_spec.optional and name not in message.arrays:
             raise CongraspError(f"The {spec.kind} lacks the array '{name}'.")
@@ -173,7 +172,7 @@ def _check(what: str, array: Any, spec: ArraySpec, known: dict[str, int]) -> Non
 
 
 def is_finite(array: np.ndarray) -> bool:
-    """Whether every value is a finite number; four times as fast for float16 as `np.isfinite`."""
+    """True if every value is finite; four times as fast as `np.isfinite` for float16."""
     if array.dtype != np.float16:
         return bool(np.isfinite(array).all())
     bits = array.reshape(-1).view(np.uint16)
@@ -185,17 +184,17 @@ def _type_name(kind: type | tuple[type, ...]) -> str:
 
 
 class RolloutHeader(NamedTuple):
-    """Who made a rollout, and under which policy: the meta entries of `ROLLOUT`, in their order."""
+    """Origin and policy of a rollout: the metadata entries of `ROLLOUT`, in order."""
 
     actor: str
     incarnation: str
-    """Random, one for each start of the actor's process."""
+    """Random identifier of one start of the actor's process."""
     sequence: int
-    """Counts the rollouts of an incarnation from zero."""
+    """Number of the rollout within the incarnation, from zero."""
     version: int
-    """Version of the policy that acted."""
+    """Version of the behaviour policy."""
     run_id: str
-    """Identifies the training; the meta entry `epoch`."""
+    """Id of the run; the metadata entry `run_id`."""
     schema: str
     steps: int
     """T*B."""
@@ -207,15 +206,15 @@ class RolloutHeader(NamedTuple):
 
 
 def validate_rollout(message: Message, form: RolloutForm, *, schema: str | None = None) -> RolloutHeader:
-    """Checks a rollout.
+    """Validates a rollout.
 
     Args:
       message: a rollout.
-      form: arrays, sizes and types that it must have.
-      schema: the policy schema that it must have been made with, if that matters.
+      form: required arrays, sizes and types.
+      schema: required policy schema; None for any.
 
     Raises:
-      CongraspError: naming the array or the entry, and the rule that it breaks.
+      CongraspError: the rollout is invalid; the text names the array or the entry, and the violated rule.
     """
     validate(message, dataclasses.replace(ROLLOUT, arrays={**form.specs, **_EPISODES}), **form.sizes)
     header = RolloutHeader(*(message.meta[name] for name in ROLLOUT.meta))
@@ -230,20 +229,20 @@ def validate_rollout(message: Message, form: RolloutForm, *, schema: str | None 
     if schema is not None and header.schema != schema:
         raise CongraspError(
             f"The rollout was made with the policy schema {ascii(header.schema)[:40]}, not {schema}.",
-            "Start the actor anew, with the version of congrasp that the learner has.",
+            "Restart the actor with the learner's version of congrasp.",
         )
     return header
 
 
 def validate_bundle(message: Message, *, schema: str | None = None) -> None:
-    """Checks a policy bundle as far as that needs no network.
+    """Validates a policy bundle as far as possible without its network.
 
     Args:
       message: a bundle.
-      schema: the policy schema that it must have, if that matters.
+      schema: required policy schema; None for any.
 
     Raises:
-      CongraspError: naming the array or the entry, and the rule that it breaks.
+      CongraspError: the bundle is invalid; the text names the array or the entry, and the violated rule.
     """
     validate(message, BUNDLE)
     if not any(name.startswith("actor/") for name in message.arrays):

@@ -1,8 +1,8 @@
-"""The arrays of a rollout: names, dtypes and shapes in symbols, spelled once for everyone who makes or takes them.
+"""Arrays of a rollout: names, dtypes and symbolic shapes, defined once for all producers and consumers.
 
-Actors can record `RECORDABLE`; the learner's algorithm names those that it learns from, and the learner tells them.
-From these specs and a run's sizes (`RolloutForm`) follow what is sent, what is admitted, what a batch looks like, and
-along which axis it is divided among ranks.
+Actors can record `RECORDABLE`; the learner's algorithm selects the arrays it learns from, and the learner sends that
+selection to the actors. These specs and a run's sizes (`RolloutForm`) determine what is sent, what is admitted, the
+layout of a batch, and the axis along which it is sharded over ranks.
 """
 
 import dataclasses
@@ -11,30 +11,30 @@ from collections.abc import Mapping
 import numpy as np
 
 WORLDS = "B"
-"""Symbol of the axis of a rollout's worlds, along which rollouts are laid side by side in a batch."""
+"""Symbol of the axis of a rollout's worlds, along which rollouts are concatenated in a batch."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ArraySpec:
-    """One array of a message."""
+    """Specification of one array of a message."""
 
     dtypes: tuple[str, ...]
-    """Names of the dtypes that it may have, the narrowest first."""
+    """Names of the allowed dtypes, the narrowest first."""
     shape: tuple[str | int, ...] | None
     """Sizes and symbols; None admits any shape."""
     optional: bool = False
-    """Whether the array may be absent."""
+    """True if the array may be absent."""
 
     @property
     def worlds_axis(self) -> int:
-        """The axis of the worlds."""
+        """Index of the axis of worlds."""
         assert self.shape is not None
         return self.shape.index(WORLDS)
 
 
 Schema = Mapping[str, ArraySpec]
-"""Arrays by name; their shapes are made of T control steps, B worlds, D observation and A action sizes, P of the
-critic's privileged inputs, and S of the observation of a policy that sees all."""
+"""Arrays by name; their shapes consist of T control steps, B worlds, D observation and A action sizes, P privileged
+inputs of the critic, and S, the size of the full observation."""
 
 F32 = ("float32",)
 _OBSERVATION = ("float16", "float32")
@@ -48,21 +48,21 @@ RECORDED: Schema = {
     "truncated": ArraySpec(("bool",), ("T", "B")),
     "last_observation": ArraySpec(_OBSERVATION, ("B", "D")),
 }
-"""What actors record of any rollout (`actors.rollout.Rollout`)."""
+"""Arrays that actors record in any rollout (`actors.rollout.Rollout`)."""
 PRIVILEGED: Schema = {
     "privileged": ArraySpec(_OBSERVATION, ("T", "B", "P")),
     "last_privileged": ArraySpec(_OBSERVATION, ("B", "P")),
 }
-"""What they record in addition for a critic with privileged inputs (`common.task.privileged`)."""
+"""Additional arrays for a critic with privileged inputs (`common.task.privileged`)."""
 TAUGHT: Schema = {"teacher_observation": ArraySpec(_OBSERVATION, ("T", "B", "S"))}
-"""What they record beside it where a teacher is to say what it would have done: what a policy sees that sees all."""
+"""Additional arrays for a teacher that labels the rollout: the full observation."""
 RECORDABLE: Schema = {**RECORDED, **PRIVILEGED, **TAUGHT}
-"""All of these."""
+"""All recordable arrays."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RolloutForm:
-    """What the rollouts of one run have in common, so that any of them make a batch without another compilation."""
+    """Common form of a run's rollouts, so that any of them form a batch without recompilation."""
 
     steps: int
     """T."""
@@ -73,17 +73,17 @@ class RolloutForm:
     action: int
     """A."""
     half: bool
-    """Observations are float16, or else float32."""
+    """Observations are float16 if true, otherwise float32."""
     teacher: int = 0
     """S."""
     privileged: int = 0
     """P."""
     arrays: Schema = dataclasses.field(default_factory=lambda: RECORDED)
-    """The arrays that the run's algorithm learns from."""
+    """Arrays from which the run's algorithm learns."""
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Values of the symbols."""
+        """Sizes of the symbols."""
         return {
             "T": self.steps,
             WORLDS: self.worlds,
@@ -95,14 +95,14 @@ class RolloutForm:
 
     @property
     def specs(self) -> dict[str, ArraySpec]:
-        """The arrays with the one dtype that each has in this run."""
+        """Specs of the arrays, each with its single dtype in this run."""
         return {
             name: dataclasses.replace(spec, dtypes=(spec.dtypes[0 if self.half else -1],))
             for name, spec in self.arrays.items()
         }
 
     def zeros(self, rollouts: int = 1) -> dict[str, np.ndarray]:
-        """The arrays of so many rollouts side by side, all zeros."""
+        """Returns zero arrays of `rollouts` concatenated rollouts."""
         sizes = {**self.sizes, WORLDS: self.worlds * rollouts}
 
         def zeros(spec: ArraySpec) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The learner's algorithms, by the names that a run's configuration chooses them by."""
+"""Registry of the learner's algorithms, by their names in a run's configuration."""
 
 from collections.abc import Callable
 
@@ -13,15 +13,15 @@ ALGORITHMS: dict[str, Callable[[PolicySpec, RunConfig], Algorithm]] = {
     "ppo": lambda spec, config: PPO(spec, config.ppo, config.updates),
     "distill": Distillation,
 }
-"""Factories by name: of the policy's spec and the run's configuration."""
+"""Factories by name; arguments are the policy's spec and the run's configuration."""
 
 
 def make_algorithm(spec: PolicySpec, config: RunConfig) -> Algorithm:
-    """The algorithm that the run's configuration names.
+    """Returns the algorithm named by the run's configuration.
 
     Raises:
-      CongraspError: there is none of that name.
+      CongraspError: there is no such algorithm.
     """
     if config.algorithm not in ALGORITHMS:
-        raise CongraspError(f"There is no algorithm '{config.algorithm}'.", f"Choose among {', '.join(ALGORITHMS)}.")
+        raise CongraspError(f"There is no algorithm '{config.algorithm}'.", f"Choose from: {', '.join(ALGORITHMS)}.")
     return ALGORITHMS[config.algorithm](spec, config)

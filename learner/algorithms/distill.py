@@ -1,6 +1,6 @@
-"""Distillation of a policy into one that sees other things, on the states that the student comes to.
+"""Distillation of a policy into one with other observations, on the states that the student visits.
 
-The student acts, and the teacher, which sees all of the simulation, says what it would have done in each state (DAgger:
+The student acts, and the teacher, which observes the full state, labels each state with its action (DAgger:
 Ross et al. 2011, arXiv 1011.0686, without its mixture of the two and without keeping old states). The student's mean is
 regressed on the teacher's, in units of the teacher's standard deviation: up to a constant the KL divergence from the
 student to the teacher, whose standard deviation the student keeps. The critic learns nothing.
@@ -26,23 +26,23 @@ from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import RECORDABLE, Schema
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
 from congrasp.learner.batch import partition_specs
 from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 _SCHEMA = {name: RECORDABLE[name] for name in ("observation", "teacher_observation")}
 _SPECS = partition_specs(_SCHEMA)
 _LAST_RATE = 0.02
-"""Share of the learning rate that is left at the run's end."""
+"""Share of the initial learning rate that remains at the end of the run."""
 _CHECKED = {"imitation_kl": "rollouts", "actor_grad_norm": "optimisation"}
-"""Metrics that must be finite, and what is to blame where they are not."""
+"""Metrics that must be finite, and their names in errors."""
 
 Learnt = tuple[Params, Any, Array]
 """The actor's parameters, the optimiser's state and the random key."""
 
 
 class _Given(NamedTuple):
-    """What an update learns with, beside state and batch."""
+    """Inputs of an update in addition to state and batch."""
 
     observations: Affine
     """Normalisation of the student's observations, frozen."""
@@ -72,8 +72,8 @@ class Distillation:
         self._layouts = (spec.layout, teacher.spec.layout)
         self._teacher = teacher.inference_parameters
 
-    def init(self, seed: int, initial: Policy | None = None) -> TrainState:
-        """The state before the first update; actions spread as the teacher's do."""
+    def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
+        """Returns the state before the first update, with the teacher's action noise."""
         initial = initial or random_policy(seed, self._spec)
         params = jax.tree.map(jnp.asarray, initial.params)
         params["actor"] = {**params["actor"], "log_std": self._teacher.params["actor"]["log_std"]}
@@ -89,14 +89,14 @@ class Distillation:
             privileged=initial.privileged,
         )
 
-    def policy(self, state: TrainState) -> Policy:
-        """Parameters and normalisers."""
-        return Policy(state.params, state.observation, state.value, state.privileged)
+    def policy(self, state: TrainState) -> LearnedPolicy:
+        """Returns parameters and normalisers."""
+        return LearnedPolicy(state.params, state.observation, state.value, state.privileged)
 
     def update(
         self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None
     ) -> tuple[TrainState, dict[str, float]]:
-        """Epochs of minibatches over a batch; see `Algorithm.update`.
+        """Runs epochs of minibatches over a batch; see `Algorithm.update`.
 
         The normaliser is frozen during the update and takes the batch in afterwards; only the first batch is also what
         the first update normalises by.
@@ -139,7 +139,7 @@ class Distillation:
 
 
 def read_teacher(named: str) -> PolicyBundle:
-    """The policy that a run names as its teacher.
+    """Returns the policy that a run names as its teacher.
 
     Raises:
       CongraspError: none is named, or there is no such policy.
@@ -207,7 +207,7 @@ def _program(
     layouts: tuple[Layout, Layout],
     config: DistillConfig,
 ) -> tuple[Learnt, dict[str, Array]]:
-    """What `_optimise` compiles, for one rank: shuffled minibatches, each sample at most once an epoch."""
+    """Body of `_optimise` for one rank: shuffled minibatches, each sample at most once an epoch."""
     actor, optimizer, key = learnt
     transform = _transform(config.max_grad_norm)
     labels = bundles.mean_action(layouts[1], given.teacher, batch["teacher_observation"])
@@ -236,7 +236,7 @@ def _program(
     keys = jax.random.split(collectives.own_key(epochs_key), config.epochs)
     (actor, optimizer), (found, norms) = jax.lax.scan(epoch, (actor, optimizer), keys)
     metrics = {
-        "imitation_kl": jnp.mean(found[0]),  # of the first pass: later ones have seen these states
+        "imitation_kl": jnp.mean(found[0]),  # of the first pass: later ones have trained on these states
         "actor_grad_norm": jnp.mean(norms),
         "action_std": jnp.mean(jnp.exp(actor["log_std"])),
     }

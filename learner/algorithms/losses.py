@@ -1,9 +1,10 @@
 """Decoupled proximal policy optimisation (Hilton et al. 2021, arXiv 2110.00641).
 
-Three policies take part: the behaviour policy acted, possibly some versions ago; the proximal policy is the learner's
-at the start of the update; the current one is being optimised. The trust region is around the proximal policy, so that
-old data do not use it up before learning begins; an importance weight corrects for who acted. With the proximal policy
-equal to the behaviour policy the weight is exactly one and the objective is that of plain PPO.
+Three policies are involved: the behaviour policy acted, possibly some versions ago; the proximal policy is the
+learner's at the start of the update; the current one is being optimised. The trust region is around the proximal
+policy, so that old data do not consume it before learning begins; an importance weight corrects for the behaviour
+policy. With the proximal policy equal to the behaviour policy the weight is exactly one and the objective is that of
+plain PPO.
 """
 
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from congrasp.common.task.types import Array
 
 
 class Sample(NamedTuple):
-    """Transitions of a minibatch with what stays fixed during an update; leading axis M."""
+    """Transitions of a minibatch, with quantities that stay fixed during an update; leading axis M."""
 
     observation: Array
     """(M, D) normalised."""
@@ -26,9 +27,9 @@ class Sample(NamedTuple):
     log_proximal: Array
     """(M,) log probability of the action under the proximal policy, computed as `objective` does."""
     mean_proximal: Array
-    """(M, A) the proximal policy's mean, computed likewise."""
+    """(M, A) mean of the proximal policy, computed as `objective` does."""
     weight: Array
-    """(M,) truncated importance weight of the proximal against the behaviour policy."""
+    """(M,) truncated importance weight of the proximal relative to the behaviour policy."""
     advantage: Array
     """(M,) normalised."""
     target: Array
@@ -46,7 +47,7 @@ class Coefficients(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """Scalars of one minibatch, for the guard and the metrics."""
+    """Scalars of one minibatch, for finiteness checks and metrics."""
 
     policy_loss: Array
     value_loss: Array
@@ -58,12 +59,12 @@ class Terms(NamedTuple):
 
 
 def importance_weight(log_proximal: Array, log_behaviour: Array, maximum: Array | float) -> Array:
-    """min(pi_proximal / pi_behaviour, maximum), formed in log space so that it cannot overflow; no gradient."""
+    """Returns min(pi_proximal / pi_behaviour, maximum), computed in log space to avoid overflow; no gradient."""
     return jnp.exp(jax.lax.stop_gradient(jnp.minimum(log_proximal - log_behaviour, jnp.log(maximum))))
 
 
 def surrogate(log_ratio: Array, advantage: Array, weight: Array, clip: Array | float) -> Array:
-    """Loss -w min(r A, clip(r, 1 - eps, 1 + eps) A) of each sample, r = pi / pi_proximal = exp(`log_ratio`)."""
+    """Loss -w min(r A, clip(r, 1 - eps, 1 + eps) A) of each sample, with r = pi / pi_proximal = exp(`log_ratio`)."""
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     return -weight * jnp.minimum(ratio * advantage, clipped * advantage)
@@ -72,7 +73,7 @@ def surrogate(log_ratio: Array, advantage: Array, weight: Array, clip: Array | f
 def objective(
     params: Params, layout: Layout, log_std_proximal: Array, sample: Sample, coefficients: Coefficients
 ) -> tuple[Array, Terms]:
-    """The scalar to minimise and its terms: surrogate + c_v (V - target)^2 - c_e entropy, means over the minibatch."""
+    """Scalar to minimise and its terms: surrogate + c_v (V - target)^2 - c_e entropy, means over the minibatch."""
     mean, log_std = network.policy(params, layout, sample.observation, exact=False)
     log_ratio = network.log_probability(mean, log_std, sample.action) - sample.log_proximal
     error = network.value(params, layout, sample.observation, sample.privileged) - sample.target

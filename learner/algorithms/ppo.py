@@ -1,14 +1,14 @@
-"""Decoupled PPO (`learner.algorithms.losses`) with generalised advantages and a learning rate that follows the KL.
+"""Decoupled PPO (`learner.algorithms.losses`) with generalised advantages and a KL-adaptive learning rate.
 
-The batch keeps its axis of worlds: arrays are (T, B, ...) with the worlds of all rollouts side by side, on whatever
-device they were made. Everything between the batch and the new weights is one compiled program; hyperparameters are
-traced, so that other settings need no other compilation. The optimiser's moments are donated to it, the weights are
-not: the bundle that was published with them may still be in use in this process. The host keeps the running statistics
-(`common.policy.normalizer`) and the counters, and sees scalars alone.
+The batch keeps its axis of worlds: arrays are (T, B, ...) with the worlds of all rollouts concatenated, on the device
+where they were created. Everything between the batch and the new weights is one compiled program; hyperparameters are
+traced, so that changing them needs no recompilation. The optimiser's moments are donated to it. The weights are not,
+since the bundle published with them may still be in use in this process. The host keeps the running statistics
+(`common.policy.normalizer`) and the counters, and receives only scalars.
 
-Several processes, each with a batch of its own, make one update over a mesh of their devices: gradients, advantages'
-statistics and metrics are averaged inside the program, once in each minibatch, and moments are gathered in rank order,
-so that all of them come to the same weights and statistics, bit for bit.
+Several processes, each with its batch, compute one update over a mesh of their devices. Gradients, statistics of
+advantages and metrics are averaged inside the program, once in each minibatch, and moments are gathered in rank order,
+so that weights and statistics are bitwise identical on all ranks.
 """
 
 import functools
@@ -29,7 +29,7 @@ from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
 from congrasp.learner.algorithms import gae, losses
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
 from congrasp.learner.batch import partition_specs
 from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
@@ -43,44 +43,44 @@ _CHECKED = (
     "KL divergence",
     "actor gradient",
     "critic gradient",
-    "policy (a KL divergence out of all reason)",
+    "policy (the KL divergence is too large)",
 )
 _NORMALISED = ("observation", "privileged")
 """Arrays of a batch with running statistics, which have the same names in a `TrainState`."""
 _FINE = -1  # no term was non-finite; otherwise an index into _CHECKED
-_UNREASONABLE_KL = 10.0  # nats between the policies before and after an update; a hundredth of one is aimed at
+_UNREASONABLE_KL = 10.0  # nats between the policies before and after an update; the target is about a hundredth of one
 _RATE_FACTOR = 1.5
-_TRUSTED_KL = 4.0  # targets; from a minibatch that sees the policy farther away the policy takes no step
+_TRUSTED_KL = 4.0  # KL targets; a minibatch with a larger divergence does not update the policy
 
 Learnt = tuple[Params, Any, Array]
-"""Parameters, the optimiser's state and the random key: the entries of a `TrainState` that live on the device."""
+"""Parameters, the optimiser's state and the random key: the device entries of a `TrainState`."""
 _ON_DEVICE = 3  # entries of a TrainState
 
 
 class _Given(NamedTuple):
-    """What an update learns from, beside the state."""
+    """Inputs of an update, in addition to the state."""
 
     batch: dict[str, Array]
     observations: Affine
     """Normalisation of observations, frozen."""
     privileged: Affine | None
-    """Normalisation of the critic's privileged inputs, frozen; None if it has none."""
+    """Normalisation of the critic's privileged inputs, frozen; None if there are none."""
     returns: Affine
     """Normalisation of returns, frozen."""
     hyper: dict[str, Any]
-    """The hyperparameters that are arguments of the compiled program; the others are part of it."""
+    """Hyperparameters that are arguments of the compiled program; the others are static."""
 
 
 class PPO:
     """Decoupled PPO, an `Algorithm`."""
 
     def __init__(self, spec: PolicySpec, config: PPOConfig, updates: int = 0):
-        """For a policy's networks, with these hyperparameters, in a run of so many updates (`PPOConfig.settling`)."""
+        """Creates the algorithm for a policy's networks, in a run of `updates` updates (`PPOConfig.settling`)."""
         self._spec, self._config, self._updates = spec, config, updates
         self.batch_schema: Schema = {**RECORDED, **PRIVILEGED} if spec.privileged else RECORDED
 
-    def init(self, seed: int, initial: Policy | None = None) -> TrainState:
-        """The state before the first update."""
+    def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
+        """Returns the state before the first update."""
         initial = initial or random_policy(seed, self._spec)
         params = jax.tree.map(jnp.asarray, initial.params)
         privileged = initial.privileged
@@ -97,31 +97,31 @@ class PPO:
             privileged=privileged,
         )
 
-    def policy(self, state: TrainState) -> Policy:
-        """Parameters and normalisers."""
-        return Policy(state.params, state.observation, state.value, state.privileged)
+    def policy(self, state: TrainState) -> LearnedPolicy:
+        """Returns parameters and normalisers."""
+        return LearnedPolicy(state.params, state.observation, state.value, state.privileged)
 
     def update(
         self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None
     ) -> tuple[TrainState, dict[str, float]]:
-        """Epochs of minibatches over a batch; see `Algorithm.update`.
+        """Runs epochs of minibatches over a batch; see `Algorithm.update`.
 
-        Where the policy is several KL targets from the proximal one already, the critic alone learns: a policy of small
-        standard deviations, such as one that a run began with, outlives a learning rate that is too large for it.
+        If the policy is already several KL targets from the proximal one, only the critic learns: a policy with small
+        standard deviations, such as an initial policy, thus survives a learning rate that is too large for it.
 
-        The normalisers are frozen during the update and take the batch in afterwards; only the first batch is also what
-        the first update normalises by. The critic's output layer is adapted to the moved value statistics so that its
-        estimates do not change with them (van Hasselt et al. 2016, arXiv 1602.07714). Rewards are not scaled yet.
+        The normalisers are frozen during the update and include the batch afterwards; the first update already
+        normalises by its batch. The critic's output layer is adapted to the new value statistics so that its estimates
+        do not change (van Hasselt et al. 2016, arXiv 1602.07714). Rewards are passed unscaled.
 
         Raises:
-          NonFiniteUpdate: naming the first term that was not finite, or the policy, if it left its trust region by far;
-            the state is that before the update.
-          CongraspError: if there are more minibatches than transitions.
+          NonFiniteUpdate: a term is not finite, or the policy left its trust region by far; the error names the first
+            term and holds the state before the update.
+          CongraspError: there are more minibatches than transitions.
         """
         layout, config = self._spec.layout, self._config
         if batch["reward"].size < config.minibatches:
             raise CongraspError(
-                f"A batch of {batch['reward'].size} transitions does not make {config.minibatches} minibatches.",
+                f"A batch of {batch['reward'].size} transitions cannot be split into {config.minibatches} minibatches.",
                 "Use fewer minibatches, more environments or longer rollouts.",
             )
         arrays = shard({name: batch[name] for name in self.batch_schema}, mesh, _specs(self.batch_schema))
@@ -165,29 +165,29 @@ class PPO:
 
 @optax.inject_hyperparams
 def _optimizer(learning_rate: Array | float, max_grad_norm: Array | float) -> optax.GradientTransformation:
-    """Adam on clipped gradients; the networks share no weight, so one's large gradient must not shrink the other's."""
+    """Adam on clipped gradients; each network separately, so that a large gradient does not shrink the other's."""
     clip = optax.clip_by_global_norm(max_grad_norm)
     clips = optax.partition({"actor": clip, "critic": clip}, {"actor": "actor", "critic": "critic"})
     return optax.chain(clips, optax.adam(learning_rate, eps=1e-5))
 
 
 def _with(optimizer: Any, **hyperparams: Array) -> Any:
-    """The optimiser's state with other hyperparameters."""
+    """Returns the optimiser's state with other hyperparameters."""
     return optimizer._replace(hyperparams={**optimizer.hyperparams, **hyperparams})
 
 
 def _ranks(gathered: Statistics) -> list[Statistics]:
-    """The statistics of each rank from those that `Collectives.gather` stacked."""
+    """Splits statistics stacked by `Collectives.gather` into those of each rank."""
     return [Statistics(*(entry[i] for entry in gathered)) for i in range(len(gathered.count))]
 
 
 def _specs(names: Iterable[str]) -> dict[str, PartitionSpec]:
-    """Partition of the arrays of a batch."""
+    """Partition specs of the arrays of a batch."""
     return {name: _SPECS[name] for name in names}
 
 
 def _first(statistics: Statistics, moments: Statistics, mesh: Mesh | None) -> Statistics:
-    """The statistics, or those of the batch where there are no samples yet."""
+    """Returns the statistics, or those of the batch while there are no samples yet."""
     return statistics if statistics.count else normalizer.merge(*_ranks(unreplicate(moments, mesh)))
 
 
@@ -213,7 +213,7 @@ def _optimise(
     minibatches: int,
     mesh: Mesh | None,
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
-    """Epochs over the batch; returns what was learnt, moments of the returns, the failed term, and metrics."""
+    """Runs epochs over the batch; returns the learnt state, moments of the returns, the failed term, and metrics."""
     program = functools.partial(
         _program, collectives=Collectives(mesh), layout=layout, epochs=epochs, minibatches=minibatches
     )
@@ -222,31 +222,31 @@ def _optimise(
 
 
 class _Evaluation(NamedTuple):
-    """A batch as the proximal policy and the critic see it; leading axes (T, B)."""
+    """A batch evaluated by the proximal policy and the critic; leading axes (T, B)."""
 
     samples: losses.Sample
-    """Inputs of the networks are not normalised yet: gathering a minibatch's rows in half precision is cheaper."""
+    """Inputs of the networks, not normalised yet: gathering a minibatch's rows in half precision is cheaper."""
     log_weight: Array
     """Log of proximal over behaviour probability."""
     weight: Array
-    """The same, truncated."""
+    """The same ratio, truncated; not a logarithm."""
     value: Array
-    """In the unit of the scaled rewards, as are the `returns`."""
+    """In units of the scaled rewards, like the `returns`."""
     returns: Array
     advantage_std: Array
-    """() over all ranks."""
+    """() mean over all ranks."""
     td_error: Array
     truncated_error: Array
     """TD error of a final step without bootstrap, r - V."""
 
 
 def _normalised(affine: Affine | None, privileged: Array | None) -> Array | None:
-    """Normalised privileged inputs of the critic, if it has any."""
+    """Normalised privileged inputs of the critic; None if there are none."""
     return None if affine is None or privileged is None else normalizer.apply(affine, privileged)
 
 
 def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: Layout) -> _Evaluation:
-    """Advantages, targets and importance weights, which stay fixed during the update."""
+    """Computes advantages, targets and importance weights, which stay fixed during the update."""
     batch, hyper = given.batch, given.hyper
     action, behaviour = batch["action"], batch["log_probability"]
     log_std = params["actor"]["log_std"]
@@ -293,7 +293,7 @@ def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: L
 def _program(
     learnt: Learnt, given: _Given, *, collectives: Collectives, layout: Layout, epochs: int, minibatches: int
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
-    """What `_optimise` compiles, for one rank."""
+    """Body of `_optimise` for one rank."""
     (params, optimizer, key), hyper = learnt, given.hyper
     evaluation = _evaluate(params, given, collectives, layout)
     inputs = [given.batch.get(name, jnp.zeros(())) for name in _CHECKED_INPUTS]
@@ -331,7 +331,7 @@ def _program(
 
 
 def _batch_metrics(given: _Given, evaluation: _Evaluation, collectives: Collectives) -> dict[str, Array]:
-    """Scalars about a batch and how old its policy is, over all ranks."""
+    """Scalars about a batch and the age of its policy, over all ranks."""
     variance = collectives.variance(evaluation.returns)
     residual = collectives.variance(evaluation.returns - evaluation.value)
     truncated = evaluation.log_weight > jnp.log(given.hyper["importance_max"])
@@ -378,7 +378,7 @@ def _epochs(
     layout: Layout,
     minibatches: int,
 ) -> tuple[Params, Any, Array, tuple[losses.Terms, dict[str, Array]]]:
-    """Shuffled minibatches, each sample at most once an epoch; the remainder of the division sits an epoch out.
+    """Runs shuffled minibatches, each sample at most once an epoch; the remainder of the division is skipped.
 
     The observations of `samples` are not normalised yet.
     """
@@ -386,7 +386,7 @@ def _epochs(
     size, hyper = count // minibatches, given.hyper
     coefficients = losses.Coefficients(hyper["clip"], hyper["entropy"], hyper["value_coefficient"])
     gradient = jax.value_and_grad(losses.objective, has_aux=True)
-    transform = _optimizer(0.0, 0.0)  # the hyperparameters are those of its state
+    transform = _optimizer(0.0, 0.0)  # hyperparameters are in its state
 
     def step(carry: tuple[Params, Any, Array], rows: Array):
         params, optimizer, failure = carry
@@ -421,14 +421,14 @@ def _epochs(
 
 
 def _first_failure(failure: Array, offset: int, *terms: Array) -> Array:
-    """`failure` if it names a term already, else `offset` plus the index of the first term that is not finite."""
+    """Returns `failure` if it names a term, else `offset` plus the index of the first term that is not finite."""
     bad = jnp.stack([~jnp.all(jnp.isfinite(term)) for term in terms])
     found = jnp.where(jnp.any(bad), offset + jnp.argmax(bad).astype(jnp.int32), _FINE)
     return jnp.where(failure == _FINE, found, failure)
 
 
 def _settle(params: Params, log_std_before: Array, hyper: dict[str, Any]) -> Params:
-    """The parameters with log std at most log f + k max(log std_0 - log f, 0).
+    """Caps log std of the parameters at log f + k max(log std_0 - log f, 0).
 
     f is `PPOConfig.final_std`, k `PPOConfig.noise_kept_at` and std_0 the deviation before the update.
     """
@@ -439,7 +439,7 @@ def _settle(params: Params, log_std_before: Array, hyper: dict[str, Any]) -> Par
 
 
 def _adapt_rate(rate: Array, kl: Array, hyper: dict[str, Array]) -> Array:
-    """The next update's learning rate from the mean KL to the proximal policy over the last epoch."""
+    """Returns the next learning rate from the mean KL to the proximal policy over the last epoch."""
     target = hyper["kl_target"]
     factor = jnp.where(kl > 2.0 * target, 1.0 / _RATE_FACTOR, jnp.where(kl < target / 2.0, _RATE_FACTOR, 1.0))
     return jnp.clip(rate * factor, *hyper["learning_rate_range"])
@@ -447,7 +447,7 @@ def _adapt_rate(rate: Array, kl: Array, hyper: dict[str, Array]) -> Array:
 
 @jax.jit
 def _preserve_values(params: Params, before: Affine, after: Affine) -> Params:
-    """The critic with its output layer changed such that its estimates stay the same under another normalisation."""
+    """Adapts the critic's output layer so that its estimates stay the same under another normalisation."""
     output = params["critic"]["output"]
     ratio = after.scale / before.scale
     moved = {

@@ -1,6 +1,6 @@
-"""What an algorithm is to the learner: four members, from which everything around it follows.
+"""Interface of an algorithm to the learner: four members on which everything else depends.
 
-The learner's process, its hub, checkpoints and ranks know algorithms by `Algorithm` alone, and find them by name
+The learner's process, its hub, checkpoints and ranks use algorithms only through `Algorithm`, and find them by name
 (`learner.algorithms.ALGORITHMS`).
 """
 
@@ -18,75 +18,75 @@ from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import Schema
 
 
-class Policy(NamedTuple):
-    """What is published: the entries of a `PolicyBundle` that learning changes."""
+class LearnedPolicy(NamedTuple):
+    """Published part of a policy: the entries of a `PolicyBundle` that learning changes."""
 
     params: Params
     """Actor and critic (`common.policy.network`)."""
     observation: Statistics
-    """Of observations (D,), on the host; inference normalises by them."""
+    """Statistics of observations (D,), on the host, used for normalisation in inference."""
     value: Statistics
-    """Of returns (), on the host."""
+    """Statistics of returns (), on the host."""
     privileged: Statistics | None = None
-    """Of the critic's privileged inputs (P,), on the host; None: it has none, or there are no samples."""
+    """Statistics of the critic's privileged inputs (P,), on the host; None without inputs or samples."""
 
 
-def random_policy(seed: int, spec: PolicySpec) -> Policy:
-    """Networks with random weights, and normalisers that have seen nothing."""
+def random_policy(seed: int, spec: PolicySpec) -> LearnedPolicy:
+    """Returns networks with random weights, and empty normalisers."""
     params = network.init(seed, spec.layout, spec.action_size, spec.network, spec.privileged_size)
-    return Policy(params, normalizer.empty((sum(size for _, size in spec.layout),)), normalizer.empty())
+    return LearnedPolicy(params, normalizer.empty((sum(size for _, size in spec.layout),)), normalizer.empty())
 
 
 class TrainState(NamedTuple):
-    """Everything that training needs to go on; a pytree whose first three entries live on the device."""
+    """Complete state of training; a pytree whose first three entries are on the device."""
 
     params: Params
     optimizer: Any
-    """Pytree of what the algorithm keeps beside the parameters; an update may consume its arrays."""
+    """Pytree of the algorithm's further state; an update may donate its arrays."""
     key: Array
     """(2,) uint32 random key."""
     observation: Statistics
-    """Of observations (D,), on the host."""
+    """Statistics of observations (D,), on the host."""
     value: Statistics
-    """Of returns (), on the host."""
+    """Statistics of returns (), on the host."""
     version: int
-    """Updates so far."""
+    """Number of updates so far."""
     transitions: int
-    """Environment steps consumed so far, by all ranks."""
+    """Number of environment steps consumed so far, by all ranks."""
     privileged: Statistics | None = None
-    """Of the critic's privileged inputs (P,), on the host; None if it has none."""
+    """Statistics of the critic's privileged inputs (P,), on the host; None without inputs."""
 
 
 class Algorithm(Protocol):
-    """How a policy is learnt from rollouts. All ranks of a run call the same methods in the same order."""
+    """Algorithm that learns a policy from rollouts. All ranks of a run call the same methods in the same order."""
 
     @property
     def batch_schema(self) -> Schema:
-        """The arrays of a rollout that it learns from, some of `common.wire.schema.RECORDABLE`.
+        """Arrays of a rollout used for learning, a subset of `common.wire.schema.RECORDABLE`.
 
-        From them follow what actors send, what the hub admits, warm-up batches, and how a batch is divided among ranks.
+        They determine what actors send, what the hub admits, warm-up batches, and how a batch is sharded over ranks.
         """
 
-    def init(self, seed: int, initial: Policy | None = None) -> TrainState:
-        """The state before the first update, which begins with the `initial` policy or with random weights."""
+    def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
+        """Returns the state before the first update, with the `initial` policy or random weights."""
 
     def update(
         self, state: TrainState, batch: Mapping[str, Array], mesh: Mesh | None = None
     ) -> tuple[TrainState, dict[str, float]]:
-        """Learns from a batch; returns the next state, one version on, and the update's metrics.
+        """Learns from a batch; returns the next state, one version later, and the update's metrics.
 
         Args:
           state: the training state; the arrays of its `optimizer` must not be used again.
-          batch: the arrays of `batch_schema`, with all the rollouts of this process along the axis B.
-          mesh: of the ranks' devices along `collectives.AXIS`, each of which calls this with the same state and a batch
-            of the same shape, and comes to the same state; None if this process is alone.
+          batch: the arrays of `batch_schema`, with the rollouts of this process along the axis B.
+          mesh: mesh of the ranks' devices along `collectives.AXIS`. Each rank calls this with the same state and a
+            batch of the same shape, and gets the same result. None for a single process.
 
         Raises:
-          NonFiniteUpdate: naming the first term that was not finite; the batch is dropped.
+          NonFiniteUpdate: a term is not finite; the error names the first one, and the batch is dropped.
         """
 
-    def policy(self, state: TrainState) -> Policy:
-        """What to publish; its arrays outlive further updates."""
+    def policy(self, state: TrainState) -> LearnedPolicy:
+        """Returns the policy to publish; its arrays remain valid after further updates."""
 
 
 class NonFiniteUpdate(PhysicsError):
@@ -97,5 +97,5 @@ class NonFiniteUpdate(PhysicsError):
     """
 
     def __init__(self, term: str, source: str, state: TrainState):
-        super().__init__(f"Not finite in the {source} of update {state.version + 1}: {term}.")
+        super().__init__(f"Diverged in the {source} of update {state.version + 1}: {term}.")
         self.state = state

@@ -1,7 +1,7 @@
 """Data parallelism: arrays over a mesh of the learner processes' devices, and reductions over them inside a program.
 
-Each process holds its own worlds and a replica of everything else. A process that is alone has no mesh (None), and the
-same code then costs it nothing.
+Each process holds different worlds and a replica of everything else. A single process has no mesh (None), and the same
+code then has no overhead.
 """
 
 from collections.abc import Callable
@@ -21,9 +21,9 @@ REPLICATED = PartitionSpec()
 
 
 def shard(tree: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
-    """Arrays over all of the mesh from this process's part of them; `specs` are those of `jax.shard_map`.
+    """Returns arrays over the whole mesh from this process's part; `specs` are those of `jax.shard_map`.
 
-    Without a mesh they are committed to this process's device: those that are not would have programs compiled anew.
+    Without a mesh they are committed to this process's device, since uncommitted ones would cause recompilation.
     """
     if mesh is None:
         return jax.device_put(tree, jax.local_devices()[0])
@@ -40,44 +40,44 @@ def shard(tree: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
 
 
 def shard_map(mesh: Mesh | None, program: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
-    """The program run by every process on its own part, for `jax.jit`; what it returns is the same for all of them."""
+    """Returns a program that every process runs on its part, for `jax.jit`; results are the same on all of them."""
     if mesh is None:
         return program
     return jax.shard_map(program, mesh=mesh, in_specs=in_specs, out_specs=REPLICATED, check_vma=False)
 
 
 def unreplicate(tree: Any, mesh: Mesh | None) -> Any:
-    """Replicated arrays on this process's first device alone."""
+    """Returns replicated arrays on this process's first device only."""
     return tree if mesh is None else jax.tree.map(lambda x: x.addressable_data(0), tree)
 
 
 class Collectives:
-    """Reductions over the mesh, for code inside `shard_map`; without a mesh they leave everything as it is."""
+    """Reductions over the mesh, for code inside `shard_map`; the identity without a mesh."""
 
     def __init__(self, mesh: Mesh | None):
-        """Over the mesh that the code runs on."""
+        """Creates the reductions over a mesh."""
         self._alone = mesh is None
 
     def mean(self, tree: Any) -> Any:
-        """The mean of every leaf, in one message for all of them: its latency is what it costs."""
+        """Mean of every leaf, in one message for all of them, since latency dominates its cost."""
         if self._alone:
             return tree
         flat, unravel = ravel_pytree(tree)
         return unravel(jax.lax.pmean(flat, AXIS))
 
     def max(self, x: Array) -> Array:
-        """The largest of every entry."""
+        """Maximum of every entry."""
         return x if self._alone else jax.lax.pmax(x, AXIS)
 
     def variance(self, x: Array) -> Array:
-        """Of all entries of all ranks."""
+        """Variance of all entries of all ranks."""
         centred = x - self.mean(jnp.mean(x))
         return self.mean(jnp.mean(centred * centred))
 
     def gather(self, tree: Any) -> Any:
-        """Every leaf with a leading axis over the processes."""
+        """Gathers every leaf along a new leading axis over the processes."""
         return jax.tree.map(lambda x: x[None] if self._alone else jax.lax.all_gather(x, AXIS), tree)
 
     def own_key(self, key: Array) -> Array:
-        """A random key for what every process does in a way of its own."""
+        """Returns a random key that differs between processes."""
         return key if self._alone else jax.random.fold_in(key, jax.lax.axis_index(AXIS))

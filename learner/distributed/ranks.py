@@ -1,9 +1,9 @@
-"""Several learner processes, the ranks of one run: who is there, what they agree on, and the devices they share.
+"""Ranks: the learner processes of one run, their agreement in rounds, and the mesh of their devices.
 
 Arrays are reduced by XLA (`collectives`) between one device of each rank. In addition the ranks talk over plain TCP
 with rank 0 in the middle: an update begins when all of them have a batch, they end together, they see each other's
-metrics, and a rank that dies or falls silent ends the others with one line, also those that sit in a collective.
-The two ports of the coordinator have no authentication, as JAX's own has none: keep them inside the cluster.
+metrics, and a rank that dies or falls silent ends the others with one line, also those that sit in a collective. The
+two ports of the coordinator have no authentication, as JAX's own has none: keep them inside the cluster.
 """
 
 import collections
@@ -28,9 +28,9 @@ from congrasp.learner.distributed.collectives import AXIS
 from congrasp.learner.distributed.relay import relay
 
 JOIN_SECONDS = 300.0
-"""Seconds within which all ranks must have come."""
+"""Deadline for all ranks to join, in seconds."""
 ROUND_SECONDS = 300.0
-"""Seconds that an update, or an exchange between ranks that are alive, may take."""
+"""Deadline of an update, or of an exchange between live ranks, in seconds."""
 _SILENCE_SECONDS = 20.0
 _HEARTBEAT_SECONDS = 2.0
 _RELAY_SECONDS = 2.0  # that rank 0 lives on, so that JAX does not abort the others before they have printed why
@@ -50,7 +50,7 @@ def end_process(text: str, code: int = TransportError.exit_code) -> NoReturn:
 
 
 class _Link:
-    """Messages over a TCP connection; silence for too long is an `OSError`, as its end is."""
+    """Messages over a TCP connection; a silence beyond the limit raises `OSError`, like its end."""
 
     def __init__(self, connection: socket.socket):
         connection.settimeout(_SILENCE_SECONDS)
@@ -84,10 +84,10 @@ class _Link:
 
 
 class Ranks:
-    """This process among the learner's ranks; by default it is alone.
+    """This process among the learner's ranks; by default the only one.
 
-    They agree in rounds. Each posts an entry, and all are given the list of entries, in rank order, once all are there,
-    or at once when somebody posts an urgent one (the entries that are missing are None then).
+    They agree in rounds. Each posts an entry, and all receive the list of entries, in rank order, once all are posted,
+    or at once after an urgent one (missing entries are then None).
 
     Attributes:
       rank: number of this process.
@@ -102,7 +102,7 @@ class Ranks:
         links: Mapping[int, _Link] | None = None,
         on_lost: Callable[[str], object] = end_process,
     ):
-        """Watches over the links: to every other rank on rank 0, to rank 0 elsewhere."""
+        """Monitors the links: rank 0 to every other rank, any other to rank 0."""
         self.rank, self.count = rank, count
         self.mesh: Mesh | None = None
         self._links = dict(links or {})
@@ -120,7 +120,7 @@ class Ranks:
 
     @classmethod
     def join(cls, rank: int, count: int, coordinator: str, on_lost: Callable[[str], object] = end_process) -> "Ranks":
-        """Meets the other ranks; to be called before anything else wakes JAX up.
+        """Joins the other ranks; must be called before anything else initialises JAX.
 
         Args:
           rank: number of this process.
@@ -165,16 +165,16 @@ class Ranks:
     def post(
         self, entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None, *, urgent: bool = False
     ) -> None:
-        """Puts this rank's entry (JSON) into the round; a second one replaces it, one that is late is ignored."""
+        """Posts this rank's entry (JSON) to the round; a second one replaces it, a late one is ignored."""
         frame = Message(arrays or {}, {"round": self._round, "urgent": urgent, "entry": entry})
         if self.rank == 0:
             self._collect(0, frame)
         else:
-            with contextlib.suppress(OSError):  # whoever listens to the link sees its end
+            with contextlib.suppress(OSError):  # the thread that listens to the link notices its end
                 self._links[0].send(frame)
 
     def poll(self, timeout: float) -> Message | None:
-        """The round's decision: `entries` in its meta data and the arrays of rank 0; None if there is none in time."""
+        """Returns the round's decision: `entries` in its metadata and the arrays of rank 0; None on a timeout."""
         with self._changed:
             if not self._changed.wait_for(lambda: self._decisions, timeout):
                 return None
@@ -182,7 +182,7 @@ class Ranks:
             return self._decisions.popleft()
 
     def exchange(self, entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None) -> Message:
-        """A whole round: every rank calls this, and all are given everyone's entries, and the arrays of rank 0."""
+        """Runs a whole round: every rank calls this, and all receive all entries and the arrays of rank 0."""
         self.post(entry, arrays)
         decision = self.poll(ROUND_SECONDS)
         if decision is None:
@@ -191,7 +191,7 @@ class Ranks:
 
     @contextlib.contextmanager
     def watchdog(self) -> Iterator[None]:
-        """A deadline around code with collectives, which would wait for ever for a rank that does not come."""
+        """Context with a deadline for code with collectives, which would otherwise wait forever for a missing rank."""
         if self.count == 1:
             yield
             return
@@ -205,7 +205,7 @@ class Ranks:
             timer.cancel()
 
     def close(self) -> None:
-        """Leaves the run cleanly: all ranks call this, and from then on the end of another rank is no failure."""
+        """Leaves the run cleanly: all ranks call this, after which the end of another rank is not a failure."""
         if self.count == 1 or self._leaving.is_set():
             return
         self.exchange({"bye": True})
@@ -213,7 +213,7 @@ class Ranks:
         jax.distributed.shutdown()
 
     def fail(self, error: BaseException) -> None:
-        """Tells the others why this rank ends, unless all leave cleanly or the cause is another rank's end."""
+        """Reports to the others why this rank ends, unless all leave cleanly or the cause is another rank's end."""
         if self.count == 1 or self._leaving.is_set():
             return
         if not isinstance(error, CongraspError) and self._lost.wait(_RELAY_SECONDS):
@@ -225,7 +225,7 @@ class Ranks:
                 link.send(Message(meta={"lost": f"Rank {self.rank} ended: {reason}"}))
 
     def _collect(self, rank: int, frame: Message) -> None:
-        """On rank 0: takes an entry in, and sends the decision around when it is made."""
+        """On rank 0: adds an entry, and broadcasts the decision when it is made."""
         with self._changed:
             if frame.meta["round"] != self._deciding:
                 return
@@ -250,7 +250,7 @@ class Ranks:
             self._changed.notify_all()
 
     def _listen(self, peer: int, link: _Link) -> None:
-        """Takes in what a peer sends, until the peer is gone."""
+        """Receives messages of a peer until it is gone."""
         try:
             while True:
                 message = link.receive()
@@ -275,7 +275,7 @@ class Ranks:
                 link.send(Message(meta={"lost": what}))
         if self.rank == 0:
             time.sleep(_RELAY_SECONDS)
-        self._on_lost(f"{what.rstrip('.')}. Rank {self.rank} cannot go on alone: start all ranks with --resume.")
+        self._on_lost(f"{what.rstrip('.')}. Rank {self.rank} cannot continue alone: start all ranks with --resume.")
 
     def _beat(self) -> None:
         while not self._leaving.wait(_HEARTBEAT_SECONDS):
@@ -285,7 +285,7 @@ class Ranks:
 
 
 def _gather(count: int, bind: str, port: int, deadline: float) -> dict[int, _Link]:
-    """On rank 0: the links to all others."""
+    """On rank 0: accepts the links of all others."""
     try:
         server = socket.create_server((bind, port))
     except OSError as error:
@@ -316,7 +316,7 @@ def _gather(count: int, bind: str, port: int, deadline: float) -> dict[int, _Lin
 
 
 def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Link:
-    """Elsewhere: the link to rank 0."""
+    """On other ranks: opens the link to rank 0."""
     while True:
         try:
             link = _Link(socket.create_connection((host, port), timeout=5.0))
@@ -331,5 +331,5 @@ def _reach(rank: int, count: int, host: str, port: int, deadline: float) -> _Lin
 
 
 def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> tuple[int, str] | None:
-    """The first rank whose entry ends training, and its reason."""
+    """Returns the first rank whose entry ends training, and its reason."""
     return next(((rank, entry["end"]) for rank, entry in enumerate(entries) if entry and entry.get("end")), None)

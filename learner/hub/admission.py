@@ -1,6 +1,6 @@
-"""What a rollout may say: every number is compared with what the task can produce, and names are a closed set.
+"""Validates the values of rollouts: every number is compared with the task's range, and names are a closed set.
 
-A peer that lies within these ranges is believed. One whose rollout is refused is put off, longer each time
+Values within these ranges are trusted. An actor whose rollout is refused must back off, longer each time
 (`learner.hub.rate_limit.PutOff`).
 """
 
@@ -15,10 +15,13 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.rate_limit import PutOff
 
-_DENSITY = (-100.0, 10.0)  # nats of a log probability for each action; 14 standard deviations, and one of 2e-5
-_ACTIONS = 256  # where a rollout has a log probability and no action
+_DENSITY = (
+    -100.0,
+    10.0,
+)  # log probability of each action in nats; reached at 14 standard deviations, or by one of 2e-5
+_ACTIONS = 256  # used if a rollout has a log probability but no action
 _ROWS = 128
-_NAMES = 1024  # of actors whose refused rollouts are counted
+_NAMES = 1024  # actors for which refused rollouts are counted
 _HALF_MAGNITUDE = 0x7FFF
 
 
@@ -28,11 +31,11 @@ class Ranges(NamedTuple):
     observation: np.ndarray
     """(D,)."""
     reward: float
-    """Of a control step."""
+    """Reward of a control step."""
     action: float
-    """In units of action: targets are clipped long before."""
+    """Action, in its units: targets are clipped far below."""
     episodes: dict[str, tuple[float, float]]
-    """Least and largest value of each metric of an episode, by its name on the wire: no others are known."""
+    """Least and largest value of each metric of an episode, by its name on the wire; other names are refused."""
     teacher_observation: np.ndarray = np.zeros(0)
     """(S,)."""
     privileged: np.ndarray = np.zeros(0)
@@ -40,22 +43,22 @@ class Ranges(NamedTuple):
 
 
 class Admission:
-    """Compares the values of rollouts with a task's ranges, and puts offenders off; for any number of threads."""
+    """Compares the values of rollouts with a task's ranges, and defers offenders; thread-safe."""
 
     def __init__(self, ranges: Callable[[], Ranges] | None = None):
-        """The function is called with the first rollout, whose answer waits for it; without one, values may be any."""
+        """Gets the ranges from a function at the first rollout, whose reply waits for it; None accepts any values."""
         self._ranges = ranges
         self._lock = threading.Lock()
         self._put_off = PutOff()
         self._refused: collections.Counter[str] = collections.Counter()
         self.turned_away = 0
-        """Requests of actors that are put off."""
+        """Number of requests of deferred actors."""
 
     def check(self, message: Message) -> None:
-        """Checks the values of a rollout of the right form; those on a device never left this process and are not.
+        """Checks the values of a rollout of valid form; device arrays, which never left this process, are not checked.
 
         Raises:
-          CongraspError: naming the array and the range that it leaves, or a name that the task does not know.
+          CongraspError: a value is out of range, or the task has no such metric; the message names it.
         """
         arrays = {name: array for name, array in message.arrays.items() if isinstance(array, np.ndarray)}
         if not arrays or self._ranges is None:
@@ -64,7 +67,7 @@ class Admission:
         for name, array in arrays.items():
             if name.startswith(("episode/", "term/")):
                 if name not in ranges.episodes:
-                    raise CongraspError(f"The rollout names {ascii(name)[:60]}, which is no metric of the task.")
+                    raise CongraspError(f"The rollout names {ascii(name)[:60]}, which is not a metric of the task.")
                 _within(name, array, *ranges.episodes[name])
             elif name in ("observation", "last_observation"):
                 _check_observations(name, array, ranges.observation)
@@ -81,38 +84,38 @@ class Admission:
                 _within(name, array, *(actions * bound for bound in _DENSITY))
 
     def accept(self, actor: str) -> None:
-        """Notes that a rollout of an actor was accepted."""
+        """Records an accepted rollout of an actor."""
         with self._lock:
             self._put_off.forgive(actor)
 
     def refuse(self, actor: str) -> None:
-        """Notes that one was refused, and puts the actor off."""
+        """Records a refused rollout, and defers the actor."""
         with self._lock:
             self._put_off.offend(actor)
             if actor in self._refused or len(self._refused) < _NAMES:
                 self._refused[actor] += 1
 
     def turn_away(self, actor: str) -> float:
-        """Seconds until the actor may come again, 0 for most; counts a request that comes before."""
+        """Seconds until the actor may send again, usually 0; counts earlier requests."""
         with self._lock:
             seconds = self._put_off.seconds(actor)
             self.turned_away += seconds > 0
             return seconds
 
     def counts(self, actor: str) -> dict[str, int]:
-        """Rollouts of an actor that were refused, for the status."""
+        """Numbers of refused rollouts of an actor, for the status."""
         with self._lock:
             return {"refused": self._refused[actor]}
 
 
 def _within(name: str, array: np.ndarray, least: float, most: float) -> None:
-    """Raises `CongraspError` for a number outside of a range."""
+    """Raises a `CongraspError` for a number out of range."""
     if array.size and not (least <= (low := array.min()) and (high := array.max()) <= most):
         raise _outside(name, low if low < least else high, least, most)
 
 
 def _check_observations(name: str, array: np.ndarray, most: np.ndarray) -> None:
-    """Raises `CongraspError` for an entry of observations (..., D) whose magnitude is beyond its bound (D,)."""
+    """Raises a `CongraspError` for an entry of observations (..., D) whose magnitude exceeds its bound (D,)."""
     for rows, bounds in _magnitudes(array, most):
         if (rows > bounds).any():
             entry = int((rows > bounds).any(0).argmax())
@@ -121,18 +124,18 @@ def _check_observations(name: str, array: np.ndarray, most: np.ndarray) -> None:
 
 
 def _magnitudes(array: np.ndarray, most: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Blocks of rows (n, D) and bounds (D,) that are ordered as magnitudes are; half precision by its bits."""
+    """Yields blocks of rows (n, D) and bounds (D,), ordered like magnitudes; half precision by its bits."""
     flat = array.reshape(-1, array.shape[-1])
     if array.dtype != np.float16:
         yield np.abs(flat), most.astype(array.dtype)
         return
     bits, bounds = flat.view(np.uint16), most.astype(np.float16).view(np.uint16)
-    for start in range(0, len(bits), _ROWS):  # blocks that stay in the processor's cache
+    for start in range(0, len(bits), _ROWS):  # blocks that fit into the processor's cache
         yield bits[start : start + _ROWS] & _HALF_MAGNITUDE, bounds
 
 
 def _outside(name: str, value: Any, least: float, most: float) -> CongraspError:
-    """The error of a number that the task cannot produce."""
+    """Error for a number that the task cannot produce."""
     return CongraspError(
         f"The rollout's array '{name}' holds {value:.4g}; the task's are within {least:.4g} and {most:.4g}."
     )

@@ -1,4 +1,4 @@
-"""Sequence deduplication: which rollouts of an actor's incarnation were decided on, so that none is taken twice."""
+"""Deduplication: records which rollouts of an actor's incarnation have been decided, so that none is accepted twice."""
 
 import collections
 import dataclasses
@@ -9,33 +9,33 @@ from congrasp.common.wire.messages import RolloutHeader
 from congrasp.learner.hub.rate_limit import certificate
 from congrasp.learner.hub.staleness import Owner
 
-_INCARNATIONS = 1024  # whose sequences are kept
+_INCARNATIONS = 1024  # incarnations whose sequences are kept
 _WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another
 _FAR = 1 << 10  # sequence numbers between the first that waits for an update and the next, of which a checkpoint tells
 
 
 @dataclasses.dataclass
 class Sequences:
-    """An incarnation's sequence numbers that were decided on: all below `next` but those skipped, and `ahead`."""
+    """Decided sequence numbers of an incarnation: all below `next` except the skipped ones, and `ahead`."""
 
     next: int = 0
     ahead: set[int] = dataclasses.field(default_factory=set)
     refused: set[int] = dataclasses.field(default_factory=set)
-    """Those among them that were refused, as far as they are recent; the others were accepted."""
+    """Refused ones among them, if recent; the others were accepted."""
     skipped: int = 0
     """Sequence numbers below `next` that never came, as far as they can have been made."""
     granted: int = 0
     """Tickets that it was given: it has made no more rollouts than these, and those of sessions before."""
     rollouts: int = 0
-    """Accepted ones."""
+    """Number of accepted rollouts."""
     version: int = -1
-    """Of the newest accepted one."""
+    """Version of the newest accepted one."""
 
     def __contains__(self, sequence: int) -> bool:
         return sequence < self.next or sequence in self.ahead
 
     def add(self, header: RolloutHeader, accepted: bool) -> None:
-        """Notes the decision on a rollout."""
+        """Records the decision on a rollout."""
         if accepted:
             self.rollouts += 1
             self.version = header.version
@@ -53,7 +53,7 @@ class Sequences:
 
     @property
     def missing(self) -> int:
-        """Sequence numbers below the highest that are not decided on."""
+        """Number of undecided sequence numbers below the highest."""
         ahead = max(self.ahead, default=self.next - 1) + 1 - self.next - len(self.ahead)
         return self.skipped + self._made(ahead)
 
@@ -63,34 +63,34 @@ class Sequences:
 
 
 class SequenceTable:
-    """The sequences of every incarnation that was seen, up to a number."""
+    """Sequences of the incarnations seen, up to a limit."""
 
     def __init__(self) -> None:
-        """Knows none."""
+        """Starts empty."""
         self._known: collections.OrderedDict[Owner, Sequences] = collections.OrderedDict()
         self._forgotten_missing = 0
 
     def of(self, owner: Owner) -> Sequences:
-        """An incarnation's sequences; others are forgotten for it where there are too many."""
+        """Returns an incarnation's sequences; older ones are dropped if there are too many."""
         sequences = self._known.setdefault(owner, Sequences())
         self._known.move_to_end(owner)
         if len(self._known) > _INCARNATIONS:
-            # Whoever has many incarnations displaces his own, so that nobody makes the learner forget another's.
+            # A certificate with many incarnations displaces only its own, so that it cannot displace those of others.
             mine = (of for of in self._known if of != owner and certificate(of[0]) == certificate(owner[0]))
             self._forgotten_missing += self._known.pop(next(mine, next(iter(self._known)))).missing
         return sequences
 
     def get(self, owner: Owner) -> Sequences | None:
-        """An incarnation's sequences, if it was seen."""
+        """Returns an incarnation's sequences; None if it has not been seen."""
         return self._known.get(owner)
 
     @property
     def missing(self) -> int:
-        """Sequence numbers below the highest of each incarnation that are not decided on."""
+        """Number of undecided sequence numbers below the highest of each incarnation."""
         return self._forgotten_missing + sum(each.missing for each in self._known.values())
 
     def durable(self, waiting: Collection[tuple[Owner, int]]) -> dict[str, Any]:
-        """What a checkpoint must keep, as JSON; rollouts that wait for an update count as not decided on."""
+        """Returns the part to be stored in a checkpoint, as JSON; rollouts queued for an update count as undecided."""
         rows = []
         for owner, known in self._known.items():
             queued = {sequence for of, sequence in waiting if of == owner}
@@ -100,7 +100,7 @@ class SequenceTable:
         return {"forgotten_missing": self._forgotten_missing, "sequences": rows}
 
     def restore(self, durable: Mapping[str, Any]) -> None:
-        """Goes on from what `durable` returned."""
+        """Restores the result of `durable`."""
         self._forgotten_missing = durable["forgotten_missing"]
         for actor, incarnation, start, ahead, refused, skipped in durable["sequences"]:
             self._known[actor, incarnation] = Sequences(start, set(ahead), set(refused), skipped, skipped)

@@ -1,12 +1,12 @@
-"""The learner's end of the link: it takes rollouts in, hands out tickets and weights, and reports the run's status.
+"""Learner side of the link: receives rollouts, grants tickets, serves weights, and reports the run's status.
 
-A rollout is identified by (actor, incarnation, sequence). It is acknowledged when it is in the queue and on disk, and
-an acknowledged one is never taken twice, however often its actor sends it.
+A rollout is identified by (actor, incarnation, sequence). It is acknowledged once it is queued and on disk, and an
+acknowledged one is never accepted twice, however often its actor sends it.
 
-What a checkpoint keeps of the hub (`durable`) fits the weights beside it: when training resumes from it, what was
-decided after it is undone with the updates that used it. What the write-ahead log has of that is taken in again before
-the first new rollout; the rest shows as gaps in actors' sequences, which the counters name `missing`; so do rollouts
-that later ones have overtaken, until they arrive. All others are counted once: as consumed, dropped, queued or stale.
+The hub's part of a checkpoint (`durable`) is consistent with its weights: resuming from it undoes later decisions
+together with the updates that used them. Their rollouts in the write-ahead log are accepted again before the first new
+rollout. The rest appears as gaps in actors' sequences, counted as `missing`; so do overtaken rollouts until they
+arrive. All others are counted once: as consumed, dropped, queued or stale.
 """
 
 import collections
@@ -38,12 +38,12 @@ from congrasp.learner.hub.write_ahead import Identity, Recovered, WriteAheadLog
 
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
-_EVENT_SECONDS = 1.0  # between two events of one kind
-_PIECES = 40.0  # a second of the weights, of four mebibytes at most, for the owners of one certificate
+_EVENT_SECONDS = 1.0  # seconds between two events of one kind
+_PIECES = 40.0  # limit of the weights for the owners of one certificate, at most four mebibytes, per second
 
 
 class LearnerHub:
-    """Serves a run's keys for the learner; its methods may be called from any thread."""
+    """Serves a run's keys for the learner; thread-safe."""
 
     def __init__(
         self,
@@ -63,26 +63,26 @@ class LearnerHub:
         log: WriteAheadLog | None = None,
         admission: Admission | None = None,
     ):
-        """Starts to answer; tickets are granted from the first `publish_weights` on.
+        """Starts to serve; tickets are granted from the first `publish_weights` on.
 
         Args:
-          transport: a transport that listens.
+          transport: a listening transport.
           run: name of the run.
-          config_json: the run's configuration, for actors that connect.
-          run_id: identifies this training; another one after a start from scratch, the same after a resume.
-          schema: policy schema that rollouts must have.
-          form: arrays and sizes that all rollouts must have: an actor with others is refused alone.
-          staleness: admission, at its start.
-          queue_limit: rollouts that wait for an update.
-          name: the learner's name, for logs.
-          durable: what `durable` returned when the checkpoint was written, to go on from it.
-          on_event: given level and text of every event, which it must not hold up.
-          audit: keeps the outcome of every rollout.
-          log: keeps accepted rollouts until a checkpoint holds their outcome.
-          admission: checks the values of rollouts; by default their form alone is checked.
+          config_json: configuration of the run, for actors that connect.
+          run_id: identifies this training; it changes on a start from scratch, not on a resume.
+          schema: required policy schema of rollouts.
+          form: required arrays and sizes of rollouts; only actors that differ are refused.
+          staleness: staleness manager in its initial state.
+          queue_limit: most rollouts queued for an update.
+          name: name of the learner, for logs.
+          durable: result of `durable` in the checkpoint, when resuming.
+          on_event: called with level and text of every event; must not block.
+          audit: journal of the outcome of every rollout.
+          log: stores accepted rollouts until a checkpoint holds their outcome.
+          admission: checks the values of rollouts; by default only their form is checked.
 
         Raises:
-          CongraspError: the durable state is of another run.
+          CongraspError: the durable state belongs to another run.
         """
         self.keys, self.run_id = Keys(run), run_id
         self.session_id = secrets.token_hex(4)
@@ -93,7 +93,7 @@ class LearnerHub:
         self._changed = threading.Condition()
         self._queue: collections.deque[tuple[RolloutHeader, Message]] = collections.deque()
         self._sequences = SequenceTable()
-        self._being_written: set[tuple[Owner, int]] = set()  # accepted, and not acknowledged yet
+        self._being_written: set[tuple[Owner, int]] = set()  # accepted, but not acknowledged yet
         self._bundle: SharedMessage | None = None
         self._members, self._admission = Members(), admission or Admission()
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
@@ -107,7 +107,7 @@ class LearnerHub:
         self._serve()
 
     def has_batch(self, count: int, timeout: float) -> bool:
-        """Whether `next_batch` would find a batch; waits for it for at most `timeout` seconds, and takes nothing."""
+        """Waits at most `timeout` seconds; returns True if `next_batch` would return a batch. Takes nothing."""
         deadline = time.monotonic() + timeout
         with self._changed:
             while True:
@@ -120,7 +120,7 @@ class LearnerHub:
                 self._changed.wait(rest)
 
     def next_batch(self, count: int, timeout: float) -> list[Message] | None:
-        """The `count` rollouts of the oldest policies that are fresh enough; None if `timeout` seconds bring fewer."""
+        """Returns the `count` fresh rollouts of the oldest policies; None if there are fewer after `timeout` s."""
         with self._changed:
             if not self.has_batch(count, timeout):
                 return None
@@ -134,18 +134,18 @@ class LearnerHub:
         return messages
 
     def lag(self, version: int) -> int:
-        """Updates between the policy of a version and the current one."""
+        """Number of updates between the policy of a version and the current one."""
         return self._staleness.lag(version)
 
     def publish_weights(self, bundle: Message, version: int) -> None:
-        """Makes a policy bundle the latest one, and announces it.
+        """Publishes a policy bundle as the latest, and announces it.
 
         Args:
           bundle: a policy bundle of this run and schema.
-          version: its version; one more than the last, except after a resume.
+          version: version of the bundle; one more than the last, except after a resume.
         """
         validate_bundle(bundle, schema=self._schema)
-        if (bundle.meta["version"], bundle.meta["epoch"]) != (version, self.run_id):
+        if (bundle.meta["version"], bundle.meta["run_id"]) != (version, self.run_id):
             raise CongraspError(f"The bundle is not version {version} of run id {self.run_id}.")
         with self._changed:
             self._bundle = SharedMessage(bundle.arrays, bundle.meta)
@@ -156,14 +156,14 @@ class LearnerHub:
         self._transport.publish(self.keys.announcement, Message(meta=self._state()))
 
     def finish(self) -> None:
-        """Tells actors that the run is over."""
+        """Notifies actors that the run is over."""
         self._finished = True
         self._transport.publish(self.keys.announcement, Message(meta=self._state()))
 
     def close(self) -> None:
-        """Stops accepting rollouts, though the transport still answers, and notes what waits unused.
+        """Stops accepting rollouts, while the transport still replies, and records the unused ones.
 
-        What is being written just then is among these, and acknowledged once it is written.
+        A rollout that is being written at that time is included, and acknowledged once it is written.
         """
         with self._changed:
             self._closed = True
@@ -171,7 +171,7 @@ class LearnerHub:
                 self._audit.end((*header.owner, header.sequence) for header, _ in self._queue)
 
     def status(self) -> dict[str, Any]:
-        """The run's status as JSON: roles, versions, rates and the counters."""
+        """Returns the run's status as JSON: roles, versions, rates and counters."""
         with self._changed:
             now = time.monotonic()
             self._forget_arrivals(now)
@@ -196,7 +196,7 @@ class LearnerHub:
                 "unlisted": self._members.unlisted,
                 "rates": _rates([steps for *_, steps in self._arrivals], span),
                 "queue": {"length": len(self._queue), "limit": self._limit},
-                "ledger": self._staleness.counters()
+                "counters": self._staleness.counters()
                 | {
                     "missing": self._sequences.missing,
                     "turned_away": self._rate_limit.turned_away + self._admission.turned_away,
@@ -204,7 +204,7 @@ class LearnerHub:
             }
 
     def durable(self) -> dict[str, Any]:
-        """What a checkpoint must keep of the hub, as JSON; call it between two updates, when no batch is in hand."""
+        """Returns the hub's part of a checkpoint, as JSON; call it between two updates, when no batch is in use."""
         with self._changed:
             if self._log is not None:
                 self._log.begin_checkpoint(self._staleness.version)
@@ -220,14 +220,14 @@ class LearnerHub:
             }
 
     def note_saved(self) -> None:
-        """Notes that there is a checkpoint with what `durable` returned last; what it covers is kept no longer."""
+        """Records that a checkpoint holds the last result of `durable`, and removes what it covers."""
         if self._log is not None:
             self._log.end_checkpoint()
         if self._audit is not None:
             self._audit.saved(self._staleness.version)
 
     def discard(self, batch: Sequence[Message]) -> None:
-        """Drops the rollouts of a batch that nothing can be learnt from, so that no resume takes them up."""
+        """Drops the rollouts of an unusable batch, so that no resume uses them."""
         identities = [(m.meta["actor"], m.meta["incarnation"], m.meta["sequence"]) for m in batch]
         if self._audit is not None:
             self._audit.dropped(identities)
@@ -235,7 +235,7 @@ class LearnerHub:
             self._log.discard(identities)
 
     def _serve(self) -> None:
-        """Answers at the run's keys from now on, and shows that the learner is there."""
+        """Serves the run's keys from now on, and declares the learner alive."""
         transport = self._transport
         transport.serve(self.keys.config, self._on_config)
         charging = self._rate_limit.charging
@@ -256,7 +256,7 @@ class LearnerHub:
         transport.declare_alive(self.keys.alive("learner", self._name, self.session_id))
 
     def _begin(self) -> Recovered:
-        """Reads what earlier sessions left on disk, and notes that this one begins."""
+        """Reads the data of earlier sessions from disk, and records the start of this one."""
         staleness, log = self._staleness, self._log
         version = staleness.version
         recovered = Recovered([], []) if log is None else log.recover(version, self.run_id, self._form, self._schema)
@@ -268,13 +268,13 @@ class LearnerHub:
 
     def _restore(self, durable: Mapping[str, Any]) -> None:
         if durable["run_id"] != self.run_id:
-            raise CongraspError(f"The checkpoint is of run id {durable['run_id']}, not {self.run_id}.")
+            raise CongraspError(f"The checkpoint has run id {durable['run_id']}, not {self.run_id}.")
         self._staleness.restore(durable["counters"], durable["version"])
         self._sequences.restore(durable)
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1
-        return {"version": version, "epoch": self.run_id, "life": self.session_id, "finished": self._finished}
+        return {"version": version, "run_id": self.run_id, "session_id": self.session_id, "finished": self._finished}
 
     def _on_config(self, key: str, request: Message) -> Message:
         arrays = list(self._form.arrays)
@@ -298,7 +298,7 @@ class LearnerHub:
 
     def _on_weights(self, key: str, request: Message) -> Message:
         bundle, state = self._bundle, self._state()
-        known = request.meta.get("newer_than"), request.meta.get("life", self.session_id)
+        known = request.meta.get("newer_than"), request.meta.get("session_id", self.session_id)
         if bundle is None or known == (bundle.meta["version"], self.session_id):
             return Message(meta=state)
         return bundle
@@ -317,7 +317,7 @@ class LearnerHub:
             return self._answer("refused", why=str(error))
         if header.run_id != self.run_id:
             self._staleness.refuse_stale(header.owner, ticket)
-            return self._answer("stale", why=f"It is of run id {header.run_id}, not {self.run_id}.")
+            return self._answer("stale", why=f"The rollout has run id {header.run_id}, not {self.run_id}.")
         with self._changed:
             answer = self._admit(header, ticket, message)
             if answer.meta["outcome"] != "accepted":
@@ -329,7 +329,7 @@ class LearnerHub:
         return answer if written or not self._closed else self._answer("retry", why="The learner is stopping.")
 
     def _write_ahead(self, header: RolloutHeader, message: Message) -> bool:
-        """Keeps an accepted rollout on disk if a resume could use it; one that the disk refuses is noted."""
+        """Writes an accepted rollout to disk if a resume could use it; records a failure of the disk."""
         if self._log is None or self._log.add(header, message):
             return True
         with self._changed:
@@ -338,7 +338,7 @@ class LearnerHub:
         return False
 
     def _take_up(self, recovered: Recovered) -> None:
-        """Takes in what earlier sessions had acknowledged since the checkpoint; the caller holds the lock."""
+        """Queues rollouts acknowledged by earlier sessions since the checkpoint; the caller holds the lock."""
         taken: list[Identity] = []
         stale: list[Identity] = []
         for header, message in recovered.rollouts:
@@ -353,9 +353,11 @@ class LearnerHub:
         if self._audit is not None:
             self._audit.recovered(taken, stale, recovered.damaged)
         if taken or stale:
-            self._event("info", f"Took up {len(taken)} accepted rollouts of before; {len(stale)} are too old.")
+            self._event(
+                "info", f"Recovered {len(taken)} accepted rollouts of earlier sessions; {len(stale)} are too old."
+            )
         if recovered.damaged:
-            self._event("error", f"{len(recovered.damaged)} accepted rollouts are damaged on disk, and left out.")
+            self._event("error", f"{len(recovered.damaged)} accepted rollouts are damaged on disk and were ignored.")
 
     def _admit(self, header: RolloutHeader, ticket: str, message: Message) -> Message:
         if self._bundle is None:
@@ -363,16 +365,16 @@ class LearnerHub:
         if self._closed:
             return self._answer("retry", why="The learner is stopping.")
         if (header.owner, header.sequence) in self._being_written:
-            return self._answer("retry", why="It is being written.")
+            return self._answer("retry", why="The rollout is being written.")
         sequences = self._sequences.of(header.owner)
         if header.sequence in sequences.refused:
             self._staleness.redeem(header.owner, ticket)
-            return self._answer("stale", why="It was refused before.")
+            return self._answer("stale", why="The rollout was refused before.")
         if header.sequence in sequences:
             self._staleness.refuse_duplicate(header.owner, ticket)
             return self._answer("duplicate")
         if len(self._queue) >= self._limit:
-            return self._answer("retry", why=f"{self._limit} rollouts wait already.")
+            return self._answer("retry", why=f"{self._limit} rollouts are already queued.")
         if self._finished:
             self._staleness.refuse_stale(header.owner, ticket)
             sequences.add(header, accepted=False)
@@ -382,7 +384,7 @@ class LearnerHub:
             return self._answer("retry", why="No more rollouts are needed at this version.")
         sequences.add(header, accepted=verdict == "accepted")
         if verdict == "stale":
-            why = f"It was made by version {header.version}, and the learner is at {self._staleness.version}."
+            why = f"The rollout has version {header.version}, but the learner is at {self._staleness.version}."
             self._event("info", f"A rollout of {header.actor} was refused. {why}", kind="stale")
             return self._answer("stale", why=why)
         self._admission.accept(header.actor)
@@ -415,18 +417,18 @@ class LearnerHub:
         self._event("warning", f"Dropped as too old at version {self._staleness.version}: {len(stale)} of {actors}.")
 
     def _turn_away(self, key: str) -> Message | None:
-        """The answer to an actor that is put off or over its rate limit, before its request is decoded; or None."""
+        """Returns the reply to a deferred or rate-limited actor, before its request is decoded; None for others."""
         if seconds := self._admission.turn_away(_sender(key)):
-            retry = self._answer("retry", why="A rollout of yours was refused: come again later.")
+            retry = self._answer("retry", why="A rollout of yours was refused: try again later.")
             return Message(meta={**retry.meta, "granted": False, "retry_after": seconds})
         if self._rate_limit.admits(key):
             return None
-        self._event("warning", f"Too many useless requests of {_sender(key)}: turned away.", kind="turned away")
-        retry = self._answer("retry", why="Too many of your requests were of no use.")
+        self._event("warning", f"Too many useless requests of {_sender(key)}: rejected.", kind="rejected")
+        retry = self._answer("retry", why="Too many of your requests were useless.")
         return Message(meta={**retry.meta, "granted": False})
 
     def _turn_away_puller(self, key: str) -> Message | None:
-        """The answer to a peer that pulls weights beyond its rate limit; None for all others, who pay for a piece."""
+        """Returns the reply to a peer beyond the rate limit of weights; None for others, which are charged."""
         if not self._pull_limit.admits(key):
             return Message(meta=self._state())
         self._pull_limit.charge(key, 0)
@@ -435,7 +437,11 @@ class LearnerHub:
     def _on_damage(self, key: str, error: CongraspError) -> None:
         self._rate_limit.charge(key, DAMAGED)
         self._staleness.refuse_damaged()
-        self._event("warning", f"A damaged message arrived at {key}: {error}", kind="damaged")
+        self._event(
+            "warning",
+            f"A damaged message arrived at {key}: {error}",
+            kind="damaged",
+        )
 
     def _on_alive(self, key: str, alive: bool) -> None:
         who = parse_alive(key)
@@ -446,7 +452,7 @@ class LearnerHub:
         if not counts:
             return
         if alive:
-            if who.role == "actor":  # it may have missed what was announced
+            if who.role == "actor":  # it may have missed announcements
                 self._transport.publish(self.keys.announcement, Message(meta=self._state()))
             return
         tickets = self._staleness.forget((who.id, who.incarnation)) if who.role == "actor" else 0
@@ -454,7 +460,7 @@ class LearnerHub:
         self._event("info", f"The {who.role} {who.id} left{returned}.")
 
     def _event(self, level: str, text: str, *, kind: str = "") -> None:
-        """Publishes an event; at most one of a kind each second, if strangers can cause it at will."""
+        """Publishes an event; at most one per second of a kind that untrusted peers can trigger."""
         now = time.monotonic()
         if kind and now - self._last_event.get(kind, -_EVENT_SECONDS) < _EVENT_SECONDS:
             return
@@ -465,12 +471,12 @@ class LearnerHub:
 
 
 def _rates(steps: list[int], seconds: float) -> dict[str, float]:
-    """Rates of rollouts of so many steps that arrived within some seconds."""
+    """Rates of rollouts with these numbers of steps, received within some seconds."""
     return {"rollouts_per_second": len(steps) / seconds, "steps_per_second": sum(steps) / seconds}
 
 
 def _sender(key: str) -> str:
-    """The actor that a key belongs to; access control may keep all others from using it."""
+    """Returns the actor of a key, which access control may reserve for it."""
     return key.rpartition("/")[2]
 
 

@@ -1,8 +1,8 @@
-"""What a task can produce: bounds of observations, rewards and an episode's metrics, found by evaluating the task.
+"""Ranges of a task's observations, rewards and episode metrics, computed by evaluating the task.
 
-Engines end whatever is faster than `MAX_SPEED` or farther away than `MAX_DISTANCE` (`common.ranges`). Observation and
-reward terms are evaluated in random states out to these limits, where every clipped term reaches its bound, so that the
-ranges of a constraint or a term that is added from outside follow as well.
+Engines end environments that exceed `MAX_SPEED` or `MAX_DISTANCE` (`common.ranges`). Observation and reward terms are
+evaluated in random states up to these limits, where every clipped term reaches its bound. The ranges of external
+constraints and terms therefore follow as well.
 """
 
 import dataclasses
@@ -31,18 +31,18 @@ from congrasp.learner.hub.admission import Ranges
 
 _STATES = 128
 _SLACK = 2.0
-_BEYOND = 1.0  # rad beyond its limits that a finger joint is pressed
+_BEYOND = 1.0  # rad by which a finger joint is pressed beyond its limits
 _TURN = 2 * np.pi  # rad of a wrist hinge
-_FORCE = 1e3  # N; terms and observations clip or squash forces far below
+_FORCE = 1e3  # N; terms and observations clip or squash forces far below this
 _FLAGS = ("success", "held", DIVERGED)
-_LARGEST = 1e6  # of an error or a force, in its unit
+_LARGEST = 1e6  # limit of an error or a force, in its unit
 _ACTION = 1e3
 _MASS = 1e3  # kg
 
 
 @functools.lru_cache(maxsize=8)
 def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
-    """The ranges of a task under every weight that its curriculum gives the rewards."""
+    """Returns the ranges of a task under all reward weights of its curriculum."""
     hand = get_hand(task.hand)
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         evaluate = jax.jit(functools.partial(_evaluate, hand, task))
@@ -63,7 +63,7 @@ def task_ranges(task: TaskConfig, curriculum: CurriculumConfig) -> Ranges:
         for name in episodes
         if name.startswith("episode/mask_") or name in {f"episode/{flag}" for flag in _FLAGS}
     }
-    # Some observations are zero in every state here, and nothing is refused for a rounding error.
+    # Some observations are zero in every state here, and rounding errors must not be refused.
     own, teacher, critic = (_SLACK * np.abs(found).max(0) + 1.0 for found in observed)
     return Ranges(own, reward, _ACTION, episodes, teacher, critic)
 
@@ -77,7 +77,7 @@ def _evaluate(
     readings: Readings,
     parameters: Parameters,
 ) -> tuple[Any, Any, Any, Any]:
-    """Observations (B, D), (B, S) of a policy that sees all and (B, P) of the critic, and unweighted reward terms."""
+    """Evaluates observations (B, D), (B, S) of the full state and (B, P) of the critic, and unweighted reward terms."""
     full = dataclasses.replace(task, observation="full")
     scene = scene_of(hand, full, state, surface, goal)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
@@ -87,9 +87,9 @@ def _evaluate(
 
 
 def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, Readings, Parameters]:
-    """Random states out to what engines let pass, with random surfaces and goals in which everything is active.
+    """Random states up to the engines' limits, with random surfaces and goals in which everything is active.
 
-    The readings before a state are those of other ones.
+    The readings before a state belong to other states.
     """
     rng = np.random.default_rng(0)
     fingers, contacts = len(hand.joints), (_STATES, len(hand.links), CONTACTS_PER_LINK)
@@ -99,7 +99,7 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
     def joints() -> np.ndarray:
         return rng.uniform(hand.lower - _BEYOND, hand.upper + _BEYOND, (_STATES, fingers)).astype(np.float32)
 
-    reach = rng.choice([0.1, MAX_DISTANCE], (_STATES, 1))  # hand and object touch, or have left each other
+    reach = rng.choice([0.1, MAX_DISTANCE], (_STATES, 1))  # hand and object touch, or are far apart
     start = within(3)
     u = within(6, most=np.concatenate([reach, reach, reach, np.full((_STATES, 3), _TURN)], 1))
     state = SceneState(
@@ -157,13 +157,13 @@ def _goal(hand: Hand, task: TaskConfig, rng: np.random.Generator) -> Goal:
 
 
 def _within(rng: np.random.Generator, *shape: int, most: Any = 1.0) -> np.ndarray:
-    """(B, *shape) numbers of at most a magnitude; some at the ends and some in the middle, where terms differ."""
+    """Numbers (B, *shape) up to a magnitude; some at the bounds and some in the middle, where terms differ."""
     drawn = rng.uniform(-1.0, 1.0, (_STATES, *shape))
     towards = rng.choice([0.1, 1.0, 8.0], (_STATES, *[1] * len(shape)))
     return np.asarray(most * np.sign(drawn) * np.abs(drawn) ** towards, np.float32)
 
 
 def _unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    """(B, *shape) unit vectors."""
+    """Unit vectors (B, *shape)."""
     drawn = rng.normal(size=(_STATES, *shape))
     return (drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)).astype(np.float32)

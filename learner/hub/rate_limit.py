@@ -1,8 +1,8 @@
-"""Rate limit of useless work, a token bucket for each actor's certificate; and how long an offender is put off.
+"""Rate limit of useless work by a token bucket for each actor's certificate, and exponential backoff of offenders.
 
-A request that helps training costs nothing: a ticket that is granted, a rollout that is accepted. All others (asked for
-in vain, refused, too old, sent twice) cost tokens by their size. Whoever has none left is told to come again later
-before anything is decoded, so a flood costs the learner little, and the other actors nothing.
+A request that helps training is free: a granted ticket, an accepted rollout. All others (denied, refused, stale,
+duplicate) cost tokens by size. An actor without tokens gets the reply to retry later before its request is decoded, so
+that a flood costs the learner little and other actors nothing.
 """
 
 import collections
@@ -14,13 +14,13 @@ from congrasp.common.transport.base import Handler
 from congrasp.common.wire.codec import Message
 
 DAMAGED = 1 << 20
-"""Bytes that a message is charged for which cannot be decoded."""
+"""Bytes charged for a message that cannot be decoded."""
 _NAMES = 1024
-_LONGEST = 600.0  # seconds that anybody is put off
+_LONGEST = 600.0  # longest backoff, s
 
 
 class RateLimit:
-    """Token buckets by certificate; safe to call from several threads."""
+    """Token buckets by certificate; thread-safe."""
 
     def __init__(
         self,
@@ -33,9 +33,9 @@ class RateLimit:
         """Starts with full buckets.
 
         Args:
-          per_second: tokens that return each second.
-          most: a bucket's size, tokens.
-          unit: bytes that cost as much as a request without any.
+          per_second: tokens added each second.
+          most: size of a bucket, tokens.
+          unit: bytes that cost as much as an empty request.
           clock: seconds, monotonic.
         """
         self._per_second = per_second
@@ -45,17 +45,17 @@ class RateLimit:
         self._lock = threading.Lock()
         self._levels: collections.OrderedDict[str, tuple[float, float]] = collections.OrderedDict()
         self.turned_away = 0
-        """Requests that found their bucket empty."""
+        """Number of requests with an empty bucket."""
 
     def admits(self, key: str) -> bool:
-        """Whether a request under an actor's key may be looked at; counts it if not."""
+        """True if a request under an actor's key may be processed; counts it otherwise."""
         with self._lock:
             fine = self._level(_account(key)) > 0
             self.turned_away += not fine
             return fine
 
     def charge(self, key: str, size: int) -> None:
-        """Notes a request of `size` bytes that helped nobody."""
+        """Charges a useless request of `size` bytes."""
         name = _account(key)
         with self._lock:
             self._levels[name] = self._level(name) - 1 - size / self._unit, self._clock()
@@ -64,7 +64,7 @@ class RateLimit:
                 self._levels.popitem(last=False)
 
     def charging(self, handler: Handler) -> Handler:
-        """A handler of tickets or rollouts that charges for what it does not grant or accept."""
+        """Wraps a handler of tickets or rollouts to charge for what it does not grant or accept."""
 
         def handle(key: str, request: Message) -> Message:
             helped = False
@@ -84,19 +84,18 @@ class RateLimit:
 
 
 class PutOff:
-    """Who offends is told to come again later: at once the first time, then after 1, 2, 4, … seconds.
+    """Backoff of offending certificates: none after the first offence, then 1, 2, 4, … seconds.
 
-    Offences are counted for each certificate, and one is forgiven for each useful rollout. Not safe for several
-    threads.
+    Offences are counted for each certificate, and each useful rollout cancels one. Not thread-safe.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
-        """Nobody has offended; `clock` counts seconds, monotonic."""
+        """Starts without offences; `clock` counts seconds, monotonic."""
         self._clock = clock
         self._known: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
 
     def offend(self, actor: str) -> None:
-        """Notes an offence of an actor."""
+        """Records an offence of an actor."""
         name = certificate(actor)
         count = self._known.get(name, (0, 0.0))[0] + 1
         seconds = 0.0 if count == 1 else min(_LONGEST, 2.0 ** min(count - 2, 20))
@@ -106,19 +105,19 @@ class PutOff:
             self._known.popitem(last=False)
 
     def forgive(self, actor: str) -> None:
-        """Notes something useful of an actor."""
+        """Records a useful rollout of an actor."""
         name = certificate(actor)
         count, until = self._known.pop(name, (0, 0.0))
         if count > 1:
             self._known[name] = count - 1, until
 
     def seconds(self, actor: str) -> float:
-        """Seconds until the actor may come again, 0 for most."""
+        """Seconds until the actor may send again, usually 0."""
         return max(0.0, self._known.get(certificate(actor), (0, 0.0))[1] - self._clock())
 
 
 def certificate(actor: str) -> str:
-    """What the names of all actors with one certificate have in common."""
+    """Common part of the names of all actors with one certificate."""
     return actor.partition(".")[0]
 
 

@@ -1,20 +1,20 @@
-"""Admission by staleness: how many rollouts may be under way, and which are too old to learn from.
+"""Admission by staleness: limits the rollouts in progress, and rejects those too old to learn from.
 
-An actor asks for a ticket before it makes a rollout. A ticket is granted while
+An actor requests a ticket before it produces a rollout. A ticket is granted while
 
     accepted + awaited < (max_staleness + version + 1) * batch
 
-(AReaL, arXiv 2505.24298, section on staleness control), where `version` counts the updates, `accepted` all rollouts
-that its updates have used or that wait for one, and `awaited` the tickets that are out and whose rollouts are waited
-for. So nothing is made that could only be thrown away, unless its actor is slow. A rollout that arrives more than
-`max_staleness` versions after the policy that made it is refused, and dropped if it grows that old while it waits.
+(AReaL, arXiv 2505.24298, section on staleness control), where `version` counts the updates, `accepted` the rollouts
+used by an update or queued for one, and `awaited` the outstanding tickets that hold a place. No rollout is therefore
+produced in vain, unless its actor is slow. A rollout that arrives more than `max_staleness` versions after its policy
+is refused, and dropped if it becomes that old in the queue.
 
-A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes. Who gets one, until when, and
-how long it is waited for also depends on what has come of earlier ones (`learner.hub.tickets`).
+A ticket ends when its rollout arrives, when its owner dies, and when its deadline passes. Its grant, its deadline and
+the time for which it holds a place also depend on the owner's earlier rollouts (`learner.hub.tickets`).
 
-The lag of a rollout is the number of updates between the policy that acted and the current one. A learner that resumes
-from a checkpoint gives its policy a new number; what acted under the versions before is measured from the checkpoint's:
-rollouts of that very policy are as fresh as ever, those of policies that died with the killed learner are not.
+The lag of a rollout is the number of updates between its policy and the current one. A learner that resumes from a
+checkpoint gives its policy a new version; earlier versions are measured from the checkpoint's:
+rollouts of that policy keep their lag, those of policies lost with the killed learner do not.
 """
 
 import collections
@@ -30,17 +30,17 @@ from congrasp.learner.hub.tickets import TicketBudget
 Owner = tuple[str, str]
 """Actor and incarnation."""
 Verdict = Literal["accepted", "stale", "full"]
-_EXPIRED = 256  # tickets that are remembered, to learn how long their rollouts take
+_EXPIRED = 256  # remembered tickets, to measure how long their rollouts take
 
 
 class Ticket(NamedTuple):
-    """Permission to make one rollout."""
+    """Permission to produce one rollout."""
 
     owner: Owner
     id: str
-    """Chosen by the owner, so that asking twice yields one ticket."""
+    """Chosen by the owner, so that a repeated request yields the same ticket."""
     version: int
-    """Policy version when it was granted."""
+    """Policy version at the time of the grant."""
     granted: float
     deadline: float
 
@@ -49,35 +49,35 @@ class Ticket(NamedTuple):
 class Counters:
     """Outcomes of tickets and rollouts.
 
-    Always `granted = running + redeemed + returned + expired` and `accepted = consumed + dropped + queued`.
+    Invariants: `granted = running + redeemed + returned + expired` and `accepted = consumed + dropped + queued`.
     """
 
     granted: int = 0
-    """Tickets given out."""
+    """Tickets granted."""
     redeemed: int = 0
     """Tickets whose rollout arrived, whatever its outcome."""
     returned: int = 0
-    """Tickets given back, by their owner or by its death."""
+    """Tickets returned by their owner, or because of its death."""
     expired: int = 0
     """Tickets whose deadline passed."""
     accepted: int = 0
-    """Rollouts taken in and acknowledged."""
+    """Rollouts accepted and acknowledged."""
     consumed: int = 0
-    """Accepted rollouts that were handed to an update."""
+    """Accepted rollouts passed to an update."""
     dropped: int = 0
-    """Accepted rollouts that were too old when their turn came."""
+    """Accepted rollouts that were too old when they were due."""
     stale: int = 0
     """Rollouts refused on arrival as too old."""
     duplicate: int = 0
-    """Arrivals of a rollout that had been accepted before."""
+    """Repeated arrivals of accepted rollouts."""
     damaged: int = 0
-    """Messages refused because they were damaged or broke the rules of a rollout."""
+    """Messages refused because they were damaged or not valid rollouts."""
     undone: int = 0
-    """Rollouts that were consumed by updates which died with a killed learner; not among the others."""
+    """Rollouts consumed by updates that were lost with a killed learner; not among the others."""
 
 
 class StalenessManager:
-    """Tickets and the counters; knows neither messages nor a transport. Safe to call from several threads."""
+    """Tickets and counters, independent of messages and transports; thread-safe."""
 
     def __init__(
         self,
@@ -88,13 +88,13 @@ class StalenessManager:
         tickets_per_owner: int = 4,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Starts at version 0 with nothing under way.
+        """Starts at version 0 without tickets.
 
         Args:
           max_staleness: eta, versions.
-          rollouts_per_update: the batch.
-          ticket_seconds: seconds until an unused ticket expires, at most.
-          tickets_per_owner: tickets that one owner can hold, so that nobody takes all there are.
+          rollouts_per_update: size of the batch.
+          ticket_seconds: longest time until an unused ticket expires, s.
+          tickets_per_owner: most tickets of one owner, so that no owner takes all of them.
           clock: seconds, monotonic.
         """
         self._max_staleness = max_staleness
@@ -108,47 +108,47 @@ class StalenessManager:
         self._expired: collections.OrderedDict[tuple[Owner, str], Ticket] = collections.OrderedDict()
         self._version = 0
         self._in_update = 0
-        # Where the last resume began: the version of the checkpoint, and the one that its policy got instead.
+        # Versions at the last resume: that of the checkpoint, and the new one of its policy.
         self._resumed: tuple[int, int | None] = 0, 0
         self._counters = Counters()
 
     @property
     def version(self) -> int:
-        """The current policy version."""
+        """Current policy version."""
         return self._version
 
     @property
     def max_staleness(self) -> int:
-        """Eta."""
+        """eta, the greatest lag in versions."""
         return self._max_staleness
 
     @property
     def rollouts_per_update(self) -> int:
-        """The batch."""
+        """Size of the batch."""
         return self._batch
 
     @property
     def running(self) -> int:
-        """Tickets that are out."""
+        """Number of outstanding tickets."""
         with self._lock:
             self._expire()
             return len(self._tickets)
 
     @property
     def queued(self) -> int:
-        """Accepted rollouts that wait for an update."""
+        """Number of accepted rollouts queued for an update."""
         return self._counters.accepted - self._counters.consumed - self._counters.dropped
 
     @property
     def capacity(self) -> int:
-        """Tickets that could be granted now."""
+        """Number of tickets that could be granted now."""
         with self._lock:
-            # Every version stands for one batch; so a resumed run, or an update of another size, leaves no debt.
+            # Every version counts for one batch, so that a resumed run, or an update of another size, leaves no debt.
             accepted = self._version * self._batch + self._in_update + self.queued
             return (self._max_staleness + self._version + 1) * self._batch - accepted - self._awaited()
 
     def grant(self, owner: Owner, ticket_id: str) -> Ticket | None:
-        """A ticket, or None if there is none now; asking again with the same id returns the same ticket."""
+        """Grants a ticket, or returns None if there is none now; repeating the id returns the same ticket."""
         with self._lock:
             self._expire()
             if held := self._tickets.get((owner, ticket_id)):
@@ -179,16 +179,16 @@ class StalenessManager:
             return len(mine)
 
     def arrive(self, owner: Owner, ticket_id: str, version: int, *, beyond_capacity: bool = False) -> Verdict:
-        """Decides about a valid rollout that arrived for the first time.
+        """Decides on a valid rollout that arrived for the first time.
 
-        Its ticket ends unless the verdict is `full`: neither it nor its owner has one (any more), and nothing more may
-        come in. It may come again later.
+        Its ticket ends unless the verdict is `full`: the rollout and its owner have no ticket (any more), and there is
+        no capacity. It may be sent again later.
 
         Args:
-          owner: who made it.
-          ticket_id: the ticket it was made under.
-          version: the policy version it was made with.
-          beyond_capacity: without a ticket it need not fit: it had been admitted before.
+          owner: actor and incarnation of the rollout.
+          ticket_id: ticket of the rollout.
+          version: policy version of the rollout.
+          beyond_capacity: admits it without a ticket or capacity, because it had been admitted before.
         """
         with self._lock:
             self._expire()
@@ -198,8 +198,8 @@ class StalenessManager:
                 self.refuse_stale(owner, ticket_id)
                 return "stale"
             if (owner, ticket_id) not in self._tickets and self.capacity <= 0 and not beyond_capacity:
-                # Perhaps its ticket is of a session before: one of its owner's present ones does as well. Otherwise an
-                # actor with one upload at a time would hold the place that its own rollout waits for.
+                # Its ticket may belong to an earlier session: any current one of its owner is used instead. Otherwise
+                # an actor with one upload at a time would hold the place for which its rollout waits.
                 ticket_id = next((other for of, other in self._tickets if of == owner), "")
                 if not ticket_id:
                     return "full"
@@ -210,43 +210,43 @@ class StalenessManager:
             return "accepted"
 
     def redeem(self, owner: Owner, ticket_id: str) -> None:
-        """Ends the ticket of a rollout that was answered; an unknown one is ignored."""
+        """Ends the ticket of a decided rollout; an unknown one is ignored."""
         with self._lock:
             if self._tickets.pop((owner, ticket_id), None):
                 self._counters.redeemed += 1
 
     def refuse_stale(self, owner: Owner, ticket_id: str) -> None:
-        """Notes a rollout that is too old, or that another training made."""
+        """Counts a rollout that is too old, or belongs to another training."""
         with self._lock:
             self.redeem(owner, ticket_id)
             self._counters.stale += 1
 
     def refuse_duplicate(self, owner: Owner, ticket_id: str) -> None:
-        """Notes that an accepted rollout came again."""
+        """Counts a repeated accepted rollout."""
         with self._lock:
             self.redeem(owner, ticket_id)
             self._counters.duplicate += 1
 
     def refuse_damaged(self, owner: Owner | None = None, ticket_id: str = "") -> None:
-        """Notes a message that is no valid rollout."""
+        """Counts a message that is not a valid rollout."""
         with self._lock:
             if owner is not None:
                 self.redeem(owner, ticket_id)
             self._counters.damaged += 1
 
     def lag(self, version: int) -> int:
-        """Updates between the policy of a version and the current one."""
+        """Number of updates between the policy of a version and the current one."""
         source, renamed = self._resumed
         if renamed is None or version >= renamed:
             return self._version - version
         return abs(version - source) + self._version - renamed
 
     def is_stale(self, version: int) -> bool:
-        """Whether a rollout of this policy version is too old to learn from."""
+        """True if a rollout of this policy version is too old to learn from."""
         return self.lag(version) > self._max_staleness
 
     def take(self, version: int) -> bool:
-        """Hands an accepted rollout to the coming update; False if it has grown too old, and is dropped."""
+        """Passes an accepted rollout to the coming update; returns False if it has become too old, and drops it."""
         with self._lock:
             if self.is_stale(version):
                 self._counters.dropped += 1
@@ -256,7 +256,7 @@ class StalenessManager:
             return True
 
     def publish(self, version: int) -> None:
-        """Moves on to a version, which ends the update that led to it."""
+        """Advances to a version, after the update that led to it."""
         with self._lock:
             if self._resumed[1] is None:
                 self._resumed = self._version, version
@@ -264,14 +264,14 @@ class StalenessManager:
             self._in_update = 0
 
     def counters(self) -> dict[str, int]:
-        """All counts, with the tickets that run, the rollouts that wait and the capacity now."""
+        """All counters, with outstanding tickets, queued rollouts and the current capacity."""
         with self._lock:
             self._expire()
             gauges = {"running": len(self._tickets), "queued": self.queued, "capacity": self.capacity}
             return dataclasses.asdict(self._counters) | gauges
 
     def durable(self) -> dict[str, int]:
-        """What a checkpoint keeps: the counts without what is under way, which dies with the process."""
+        """Counters for a checkpoint, without outstanding tickets, which do not survive the process."""
         with self._lock:
             self._expire()
             counts = dataclasses.asdict(self._counters)
@@ -281,7 +281,7 @@ class StalenessManager:
             }
 
     def restore(self, durable: Mapping[str, int], version: int) -> None:
-        """Goes on from a checkpoint: its counts and its version, with nothing under way; `publish` renames it."""
+        """Restores counters and version of a checkpoint, without tickets; `publish` assigns the new version."""
         with self._lock:
             self._counters = Counters(**durable)
             self._tickets.clear()
@@ -289,18 +289,18 @@ class StalenessManager:
             self._resumed = version, None
 
     def note_undone(self, count: int) -> None:
-        """Notes how many rollouts the run has lost with updates that died with a killed learner."""
+        """Records the number of rollouts lost with updates of a killed learner."""
         with self._lock:
             self._counters.undone = count
 
     def _awaited(self) -> int:
-        """Tickets whose rollouts are waited for."""
+        """Number of tickets that hold a place."""
         self._expire()
         now = self._clock()
         return sum(self._budget.holds_place(t.owner[0], now - t.granted) for t in self._tickets.values())
 
     def _known(self, owner: Owner, ticket_id: str) -> Ticket | None:
-        """A ticket that is out, or one that has expired, which is forgotten then."""
+        """Returns an outstanding ticket, or an expired one, which is then forgotten."""
         return self._tickets.get((owner, ticket_id)) or self._expired.pop((owner, ticket_id), None)
 
     def _expire(self) -> None:

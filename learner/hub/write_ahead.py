@@ -1,12 +1,12 @@
-"""Accepted rollouts on disk, so that an acknowledgement outlives the processes that gave and got it.
+"""Write-ahead log of accepted rollouts, so that an acknowledgement survives the death of both processes.
 
-A rollout is written before it is acknowledged: the message as it came over the wire, with its checksums, in a file of
-its own that takes its name once it is whole. It is removed when a checkpoint holds its outcome. Only rollouts that a
-resume could use are written: those whose policy is at most `max_staleness` versions from that of the newest checkpoint,
-or of the one that is being written. So the folder holds no more than admission lets in within `2 max_staleness + 1`
-versions, and what waits at a checkpoint.
+A rollout is written before it is acknowledged: the message as received, with its checksums, in a file that is renamed
+once it is complete. It is removed when a checkpoint holds its outcome. Only rollouts that a resume could use are
+written: those whose policy is at most `max_staleness` versions from that of the newest checkpoint, or of the one being
+written. The folder therefore holds at most the rollouts admitted within `2 max_staleness + 1` versions, and those
+queued at a checkpoint.
 
-Files survive the death of all processes. They are not flushed to the disk, so a power cut may cost them.
+Files survive the death of all processes. They are not flushed to disk, so a power failure may lose them.
 """
 
 import contextlib
@@ -32,16 +32,16 @@ _NAME = re.compile(r"(\d{12})~([^~]+)~([^~]+)~(\d+)\.safetensors")
 
 
 class Recovered(NamedTuple):
-    """What a session of the learner finds of those before it."""
+    """Rollouts of earlier sessions found by a session of the learner."""
 
     rollouts: list[tuple[RolloutHeader, Message]]
-    """In the order in which they were accepted."""
+    """Rollouts in the order of acceptance."""
     damaged: list[Identity]
-    """Rollouts whose files are not what was written; these are kept as `*.aside`."""
+    """Rollouts with damaged files, which are kept as `*.aside`."""
 
 
 class WriteAheadLog:
-    """The accepted rollouts of one learner that no checkpoint holds. Safe to call from several threads."""
+    """Accepted rollouts of one learner that no checkpoint covers; thread-safe."""
 
     def __init__(
         self,
@@ -51,13 +51,13 @@ class WriteAheadLog:
         write: bool = True,
         log_error: Callable[[str], None] = lambda text: None,
     ):
-        """Uses a folder, which is made when it is needed.
+        """Uses a folder, which is created when needed.
 
         Args:
-          folder: the learner's own.
+          folder: folder of the learner.
           max_staleness: eta, versions.
-          write: whether rollouts are written; what is there is recovered in any case.
-          log_error: given one line when the disk refuses rollouts, until it takes one again.
+          write: writes rollouts; existing ones are recovered in any case.
+          log_error: called with one line when the disk begins to refuse rollouts.
         """
         self.write = write
         self._folder, self._max_staleness, self._log_error = folder, max_staleness, log_error
@@ -69,14 +69,14 @@ class WriteAheadLog:
         self._full = False
 
     def recover(self, version: int, run_id: str, form: RolloutForm, schema: str) -> Recovered:
-        """Reads what earlier sessions left behind; to be called once, before all else.
+        """Reads the rollouts of earlier sessions; must be called once, before all other methods.
 
         Files of another training are removed.
 
         Args:
-          version: that of the checkpoint from which the learner resumes, 0 where there is none.
-          run_id: the training's.
-          form: see `validate_rollout`, as `schema`.
+          version: version of the checkpoint from which the learner resumes, 0 without one.
+          run_id: id of the run.
+          form: see `validate_rollout`.
 
         Raises:
           CongraspError: a damaged file cannot be renamed.
@@ -93,7 +93,7 @@ class WriteAheadLog:
                 message = decode(read_file(path, MAX_MESSAGE))
                 header = validate_rollout(message, form, schema=schema)
                 if (*header.owner, header.sequence) != identity:
-                    raise CongraspError("The file's name is that of another rollout.")
+                    raise CongraspError("The file's name belongs to another rollout.")
             except (CongraspError, OSError):
                 set_aside(path)
                 found.damaged.append(identity)
@@ -106,9 +106,9 @@ class WriteAheadLog:
         return found
 
     def add(self, header: RolloutHeader, message: Message) -> bool:
-        """Writes an accepted rollout if a resume could use it; false if it should be there and cannot be written."""
+        """Writes an accepted rollout if a resume could use it; returns False if that fails."""
         identity = *header.owner, header.sequence
-        with self._lock:  # also while it is written: another thread may be at the same rollout
+        with self._lock:  # also while it is being written: another thread may have the same rollout
             distance = min(abs(header.version - version) for version in (self._saved, self._next))
             if not self.write or identity in self._files or distance > self._max_staleness:
                 return True
@@ -128,35 +128,35 @@ class WriteAheadLog:
                 return True
         if is_new:
             self._log_error(
-                f"Accepted rollouts cannot be written to {self._folder} ({why}): until they can, they do not survive "
-                "the learner."
+                f"Accepted rollouts cannot be written to {self._folder} ({why}). Until they can, they do not "
+                "survive the learner."
             )
         return False
 
     def begin_checkpoint(self, version: int) -> None:
-        """Notes that a checkpoint of this version is about to be written; what a resume from it could use is kept."""
+        """Records that a checkpoint of this version is about to be written; rollouts for a resume from it are kept."""
         with self._lock:
             self._next = version
 
     def cover(self, waiting: Iterable[Identity]) -> None:
-        """Notes what the coming checkpoint holds the outcome of: all that is here but the rollouts that still wait."""
+        """Records which rollouts the coming checkpoint covers: all stored ones except those still queued."""
         with self._lock:
             self._decided = self._files.keys() - set(waiting)
 
     def end_checkpoint(self) -> None:
-        """Notes that the checkpoint is there: what it covers is removed."""
+        """Records that the checkpoint exists, and removes the rollouts it covers."""
         self._saved = self._next
         self.discard(self._decided)
 
     def discard(self, identities: Iterable[Identity]) -> None:
-        """Removes rollouts that no resume is to take up."""
+        """Removes rollouts that must not be recovered."""
         with self._lock:
             paths = [self._files.pop(identity) for identity in identities if identity in self._files]
         _remove(paths)
 
 
 def _remove(paths: Iterable[pathlib.Path]) -> None:
-    """Removes files; one that stays is passed over, or too old, when it is read again."""
+    """Removes files; one that remains is ignored, or too old, when it is read again."""
     for path in paths:
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)

@@ -1,1 +1,1 @@
-"""What people bring along: meshes, hand files, captured grasps; each becomes one of the project's own forms."""
+"""Importers of user files: meshes, hand files, captured grasps."""

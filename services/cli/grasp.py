@@ -45,6 +45,7 @@ def grasp(
     size: str = "1280x720",
     fps: float = 25.0,
     overlays: bool = False,
+    camera: str = "",
     pictures: bool = True,
     policy: pathlib.Path | None = None,
     hand: str = "human",
@@ -75,9 +76,11 @@ def grasp(
       size: Width and height of the video, pixels.
       fps: Frames a second of the video.
       overlays: Draw constraints and contacts into the video; grasp.png shows them in any case.
+      camera: Where pictures and video are seen from, in degrees around the table and above it: --camera "120 25"; by
+        default where fingers, contacts and object are seen best.
       pictures: Write pictures.
       policy: A policy file, or 'allegro-student'; by default the hand's that comes with the package.
-      hand: Hand whose pretrained policy is taken.
+      hand: Hand whose pretrained policy is taken; human:left takes its mirror image.
       attempts: How many are simulated side by side, 1024 at most.
       seed: Draws what is attempted.
       approach: Seconds in which the hand first comes from beside the table; longer where an arm needs it (1 m/s).
@@ -94,12 +97,14 @@ def grasp(
       congrasp grasp mug:7 --hand allegro --arm panda --base "-0.7 0 0 0"
     """
     from congrasp.common.hands import get_hand
+    from congrasp.common.hands.left import right_name
     from congrasp.common.policy import bundle as bundles
     from congrasp.common.policy.pretrained import policy_file
     from congrasp.services.cli.console import at_least, at_most, bars
     from congrasp.services.grasp.grasper import Grasper
     from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
     from congrasp.services.viz.render import Film
+    from congrasp.services.viz.views import view_of
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
@@ -111,19 +116,25 @@ def grasp(
     at_most(120.0, "frames a second", fps=fps)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
-    file = policy_file(policy, hand)
+    right, left = right_name(hand)
+    if left and arm.arm:
+        raise CongraspError("An arm carries right hands alone.", "Leave out --arm or :left.")
+    file = policy_file(policy, right)
     bundle = bundles.load(file)
     found, results = find_objects(objects, folder)
     film = Film(_pixels(size), fps, overlays) if video else None
     identity: tuple[Any, ...] = (bundles.content_hash(file.read_bytes()), attempts, seed, approach, lift)
+    if left:
+        identity = (*identity, "left")
     planner = None
     if arm.arm:
         from congrasp.services.arm.planner import ArmPlanner
 
         planner = ArmPlanner(arm, get_hand(bundle.spec.hand), seed)
         identity = (*identity, planner.identity)
-    settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, film, pictures, again, rest)
-    grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed, arm=planner)
+    drawn = film, view_of(camera)
+    settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, *drawn, pictures, again, rest)
+    grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed, arm=planner, left=left)
 
     for result in results:
         _show(result)

@@ -1,4 +1,4 @@
-"""Rows of an evaluation as tables for people: in a terminal, in reports, and in Markdown."""
+"""Rows of an evaluation as tables for display: in a terminal, in reports, and in Markdown."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.services.evaluate.scores import ERRORS, UNITS, Row
 
 RATES = ("constraint", "episodes", "objects", "success", "held 2 s", "of all objects", "error", "paper")
-"""Columns of the table that compares with the paper; `rate_cells` fills them. Of all objects: success and held, with
+"""Columns of the comparison with the paper; `rate_cells` fills them. "Of all objects": success and held, counting
 uncovered objects as failures."""
 PLAUSIBILITY = (
     "constraint",
@@ -24,15 +24,15 @@ PLAUSIBILITY = (
     "pushed by half the weight",
     "and by 1 N",
 )
-"""Columns of the table of plausibility (`plausibility_cells`): deepest penetration (mean, 95th percentile), in the
-object also that of the hand's own meshes where it has some; peak speed and acceleration of the wrist; rates. Each push
-is six pushes, one after the other (`actors.stress.Protocol`)."""
+"""Columns of the table of plausibility (`plausibility_cells`): deepest penetration (mean, 95th percentile), also of the
+hand's meshes into the object if it has some; peak speed and acceleration of the wrist; rates. Each push stands for six
+pushes in a row (`actors.stress.Protocol`)."""
 FORCES = ("constraint", "link, N", "sum, N", "torque, % of limit", "links in contact at table removal", "diverged")
 """Columns of the table of forces after the removal (mean, 95th percentile); `force_cells` fills them."""
 
 
 def rate_cells(row: Row) -> tuple[str, ...]:
-    """A row's cells under `RATES`."""
+    """Cells of a row under `RATES`."""
     return (
         row_title(row),
         str(row.episodes) if row.distinct == row.episodes else f"{row.episodes} ({row.distinct} different)",
@@ -46,12 +46,12 @@ def rate_cells(row: Row) -> tuple[str, ...]:
 
 
 def paper_cells(row: Row) -> tuple[str, str]:
-    """The paper's success and errors beside a row, empty where it has none."""
+    """Success and errors of the paper for a row; empty if it has none."""
     return (_percent(row.paper.success), _errors(row.paper.errors)) if row.paper else ("", "")
 
 
 def force_cells(row: Row) -> tuple[str, ...]:
-    """A row's cells under `FORCES`."""
+    """Cells of a row under `FORCES`."""
     return (
         row_title(row),
         _pair(row.forces["link_force_mean"], row.forces["link_force_p95"], 1.0),
@@ -63,7 +63,7 @@ def force_cells(row: Row) -> tuple[str, ...]:
 
 
 def plausibility_cells(row: Row) -> tuple[str, ...]:
-    """A row's cells under `PLAUSIBILITY`."""
+    """Cells of a row under `PLAUSIBILITY`."""
     found = row.plausibility
     *depths, mesh = (_pair(found.get(name), found.get(f"{name}_p95"), 1.0) for name in CLEAN_MM)
     if found.get("hand_mesh_mm") is not None:
@@ -79,12 +79,12 @@ def plausibility_cells(row: Row) -> tuple[str, ...]:
 
 
 def tables_of(rows: Sequence[Row], title: str, missing: Sequence[tuple[str, str, str]] = ()) -> list[Any]:
-    """Rows as rich tables: rates and errors beside the paper's, plausibility, then forces.
+    """Returns rows as rich tables: rates and errors with those of the paper, plausibility, then forces.
 
     Args:
-      rows: of one policy, or of several, which are then named and stand beside one another for each constraint.
-      title: of the first table.
-      missing: hands and methods that have no row, and why.
+      rows: rows of one policy, or of several, which are then named and grouped by constraint.
+      title: title of the first table.
+      missing: hands and methods without a row, and the reason.
     """
     from rich.table import Table
 
@@ -110,7 +110,7 @@ def tables_of(rows: Sequence[Row], title: str, missing: Sequence[tuple[str, str,
 
 
 def object_table(rows: Sequence[Row]) -> Any:
-    """Success and held rate of each object (a line) in each row (a column), as a rich table."""
+    """Returns the success and held rates of each object (a line) in each row (a column), as a rich table."""
     from rich.table import Table
 
     table = Table(title="By object: success, held 2 s", title_justify="left")
@@ -129,7 +129,7 @@ def object_table(rows: Sequence[Row]) -> Any:
 
 
 _FOR_PEOPLE = {"rad": ("°", 180 / np.pi), "m": ("mm", 1000.0), "": ("%", 100.0)}
-"""Unit and factor in which errors are shown, by the unit in which they are kept."""
+"""Unit and factor for the display of errors, by the stored unit."""
 
 
 def error_title(name: str) -> str:
@@ -139,7 +139,7 @@ def error_title(name: str) -> str:
 
 
 def scaled(name: str, error: float | None) -> str:
-    """An error under `error_title`; empty where there is none."""
+    """Formats an error under `error_title`; empty if there is none."""
     return "" if error is None else f"{_FOR_PEOPLE[UNITS[name]][1] * error:.1f}"
 
 
@@ -153,19 +153,19 @@ def _percent(rate: float) -> str:
 
 
 def _rate(rate: float | None, low: float | None, high: float | None) -> str:
-    """Such as "98.7 % (96.6-99.5)"."""
+    """Formats a rate with its interval, such as "98.7 % (96.6-99.5)"."""
     if rate is None or low is None or high is None:
         return "-"
     return f"{_percent(rate)} ({100 * low:.1f}-{100 * high:.1f})"
 
 
 def _pair(mean: float | None, percentile: float | None, factor: float) -> str:
-    """Such as "7.1, 19.3"."""
+    """Formats a mean and a percentile, such as "7.1, 19.3"."""
     return "-" if mean is None or percentile is None else f"{factor * mean:.1f}, {factor * percentile:.1f}"
 
 
 def _errors(errors: dict[str, float | None] | dict[str, float]) -> str:
-    """Such as "0.137 rad 0.020 m", constraint by constraint."""
+    """Formats errors by constraint, such as "0.137 rad 0.020 m"."""
     parts = []
     for names in ERRORS.values():
         found = [(errors.get(name), UNITS[name]) for name in names.values()]

@@ -1,4 +1,4 @@
-"""Episodes side by side under a policy's mean action: what evaluations and reference grasps are simulated with."""
+"""Parallel episodes under a policy's mean action, for evaluations and reference grasps."""
 
 import functools
 import math
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors import stress as protocols
-from congrasp.actors.env import EnvState, metric_names
+from congrasp.actors.env import EnvState, View, metric_names
 from congrasp.actors.episode import episode_message
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
@@ -32,11 +32,13 @@ from congrasp.services.evaluate.scores import Sample
 
 
 class Batch(NamedTuple):
-    """B episodes that were simulated together."""
+    """B episodes simulated together."""
 
     sample: Sample
+    final: View
+    """Hand and object at the end of the hold."""
     message: Callable[[int], Message]
-    """The recording of one of them, where traces are kept."""
+    """Recording of an episode, if traces are kept."""
 
 
 class Episodes:
@@ -55,19 +57,19 @@ class Episodes:
         field: DistanceField | None = None,
         traced: bool = False,
     ):
-        """Starts the engine.
+        """Creates the engine.
 
         Args:
           bundle: the policy.
           task: the task, under `services.evaluate.protocol.protocol`.
-          objects: what is grasped, in the hand's size.
+          objects: objects, scaled for the hand.
           hold: control steps without the table.
-          batch: B.
-          physics: engine; not `auto`.
+          batch: number B of episodes.
+          physics: engine, except `auto`.
           threads: threads of the `native` engine.
-          field: grids of the objects' surfaces, with which plausibility is measured at every step
-            (`common.task.plausibility`); without them it is not.
-          traced: whether every step of every episode is kept, for recordings.
+          field: grids of the objects' surfaces, used to measure plausibility at every step
+            (`common.task.plausibility`); None skips it.
+          traced: records every step of every episode.
         """
         self._bundle, self._task, self._hold, self._measured = bundle, task, hold, field is not None
         self._hand, self.batch = get_hand(bundle.spec.hand), batch
@@ -84,7 +86,7 @@ class Episodes:
             traced=slice(None) if traced else slice(0),
         )
         self.stressable = self._measured and hold == two_seconds(task)
-        """Whether episodes can go on after the hold: what they survive is asked after two seconds."""
+        """True if episodes can continue after the hold: the stress test begins after two seconds."""
         self._measure(objects, field)
 
     def __enter__(self) -> "Episodes":
@@ -94,18 +96,18 @@ class Episodes:
         self._worker.physics.close()
 
     def replace_objects(self, objects: Sequence[GraspObject], field: DistanceField | None) -> None:
-        """Other objects, as many as before, with grids if the first ones had some; nothing is compiled anew."""
+        """Replaces the objects by as many others, with grids if the first ones had some; nothing is recompiled."""
         self._worker.replace_objects(objects, None)
         self._measure(objects, field)
 
     def run(self, conditions: InitialConditions, *, stressed: bool = False) -> Batch:
         """Simulates B episodes.
 
-        They are collected in pieces, so that a large batch's observations need not be in memory for all steps.
+        They are collected in chunks, so that the observations of a large batch are not in memory for all steps.
 
         Args:
-          conditions: what they start from; their hold is that of these episodes.
-          stressed: whether what grasps survive after the hold is simulated too (`actors.stress`).
+          conditions: initial conditions, including the length of the hold.
+          stressed: also simulates the stress test after the hold (`actors.stress`).
         """
         task, worker = self._task, self._worker
         start, window, length = task.approach_steps, task.hold_steps, task.approach_steps + self._hold
@@ -121,6 +123,8 @@ class Episodes:
             if step < length:
                 traces.append(rollout.trace)
                 finished = finished_episodes(rollout, task)
+                assert worker.state is not None and worker.state.views is not None
+                final = worker.state.views.true
         samples = jax.tree.map(lambda *parts: np.concatenate(parts), *probed)
         values = {name: finished[f"episode/{name}"] for name in metric_names(task)}
         if self._measured:
@@ -128,41 +132,41 @@ class Episodes:
         force, torque = (x[start : start + window].swapaxes(0, 1) for x in (samples.link_force, samples.torque_share))
 
         def message(episode: int) -> Message:
-            """The recording of one episode."""
+            """Returns the recording of one episode."""
             trace = Trace(
                 *(np.concatenate([np.asarray(x[:, episode]) for x in field]) for field in zip(*traces, strict=True))
             )
             return self._message(begun, trace, {name: float(x[episode]) for name, x in values.items()}, episode)
 
-        return Batch(Sample({**values, **self._facts(conditions)}, force, torque), message)
+        return Batch(Sample({**values, **self._facts(conditions)}, force, torque), final, message)
 
     def take_grasps(self) -> Grasps:
-        """Grasps of the last batch's episodes that may become references."""
+        """Returns the grasps of the last batch that may become references."""
         return self._worker.take_grasps()
 
     def _facts(self, conditions: InitialConditions) -> dict[str, np.ndarray]:
-        """Columns (B,) of what episodes begin with: masses in kg, and their identities."""
+        """Columns (B,) of the initial conditions of episodes: masses in kg, and their identities."""
         start = jax.tree.map(np.asarray, conditions.reset_state)
         masses = np.array([obj.mass for obj in self._objects])[start.object_index]
         mass = (masses * start.mass_scale).astype(np.float32)
         return {"mass_kg": mass, "identity": identity(conditions), "reference": reference(conditions)}
 
     def _begin(self, conditions: InitialConditions, after: int) -> EnvState:
-        """Starts episodes with the full hold and `after` steps more, and returns how they begin."""
+        """Starts episodes with the full hold and `after` more steps; returns their initial state."""
         self._worker.begin(conditions._replace(hold=jnp.full_like(conditions.hold, self._hold)))
         assert self._worker.state is not None
         self._worker.state = self._worker.state._replace(after=jnp.full_like(conditions.hold, after))
         return self._worker.state
 
     def _measure(self, objects: Sequence[GraspObject], field: DistanceField | None) -> None:
-        """Measures against these objects; episodes that go on after their hold are under `protocols.stress`."""
+        """Prepares measurements for these objects; later phases are under `protocols.stress`."""
         self._objects = objects
         if self._measured:
             stress = protocols.stress(self._task, objects, self._hold) if self.stressable else None
             self._worker.adjust(protocol=stress, probe_data=field)
 
     def _message(self, begun: EnvState, trace: Trace, metrics: dict[str, float], episode: int) -> Message:
-        """One episode, from how all of them began and what was recorded of it."""
+        """Returns one episode, from the initial state of all of them and its recording."""
         return episode_message(
             self._hand,
             self._task,
@@ -180,18 +184,18 @@ class Episodes:
 
 
 def identity(conditions: InitialConditions) -> np.ndarray:
-    """(B,) uint32, equal for episodes that begin alike under the same active constraints, whatever sensors show.
+    """(B,) uint32, equal for episodes with the same initial conditions and active constraints, ignoring sensors.
 
-    Numbers are compared in steps of 1e-4.
+    Numbers are rounded to 1e-4.
     """
     start, goal = conditions.reset_state, conditions.goal
     return _hashes([*start, *(array for name in goal.values for array in _active(goal, name))])
 
 
 def reference(conditions: InitialConditions) -> np.ndarray:
-    """(B,) uint32, equal for episodes with the same object and the same reference.
+    """(B,) uint32, equal for episodes with the same object and reference.
 
-    Where poses and trajectories are drawn each for itself, that of the pose counts.
+    If poses and trajectories are drawn independently, the pose counts.
     """
     goal = conditions.goal
     drawn = [_active(goal, name) for name in goal.values if get_constraint(name).from_reference]
@@ -199,7 +203,7 @@ def reference(conditions: InitialConditions) -> np.ndarray:
 
 
 def _active(goal: Goal, name: str) -> list[np.ndarray]:
-    """Goal arrays (B, ...) of a constraint, zero where it is not active."""
+    """Goal arrays (B, ...) of a constraint, zero where it is inactive."""
     constraint, arrays = get_constraint(name), [np.asarray(array) for array in goal[name]]
     if not constraint.blocks:
         return arrays
@@ -208,14 +212,14 @@ def _active(goal: Goal, name: str) -> list[np.ndarray]:
 
 
 def _hashes(arrays: Sequence[Array]) -> np.ndarray:
-    """(B,) uint32 of the rows of arrays (B, ...), rounded to 1e-4."""
+    """Hashes (B,) uint32 of the rows of arrays (B, ...), rounded to 1e-4."""
     rows = [np.asarray(array, np.float64).reshape(len(arrays[0]), -1) for array in arrays]
     whole = np.round(np.concatenate(rows, 1) * 1e4).astype(np.int64)
     return np.array([zlib.crc32(row.tobytes()) for row in whole], np.uint32)
 
 
 class _Effort(NamedTuple):
-    """What is kept of a control step where plausibility is not measured."""
+    """Values recorded in a control step without plausibility."""
 
     link_force: Array
     """(B, L) N."""

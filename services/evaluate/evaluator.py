@@ -34,23 +34,23 @@ from congrasp.services.evaluate.references import References
 from congrasp.services.evaluate.scores import Row, Sample, joined, summarise
 
 STRESSED = 200
-"""Episodes of a row that go on after the hold, lifted and pushed."""
+"""Episodes of a row that continue after the hold with lift and pushes."""
 _KEPT = 8
-"""Episodes of a row that can be looked at afterwards: so many that hold the object to the end, and so many others."""
+"""Episodes of a row kept for inspection: at most this many that hold the object to the end, and as many others."""
 MEASURED = 512
-"""Objects beyond which their surfaces' distance fields are left out, and plausibility with them."""
+"""Number of objects above which distance fields, and thus plausibility, are skipped."""
 
 
 class _Level(NamedTuple):
-    """One of several changes of the same episodes."""
+    """One of several variants of the same episodes."""
 
     change: Callable[[InitialConditions], InitialConditions]
     objects: Sequence[GraspObject] = ()
-    """In place of the evaluator's, if there are any."""
+    """Objects that replace the evaluator's, if any."""
 
 
 class Evaluator:
-    """A policy on a pool of objects."""
+    """Evaluates a policy on a pool of objects."""
 
     def __init__(
         self,
@@ -71,18 +71,17 @@ class Evaluator:
 
         Args:
           bundle: the policy.
-          objects: what it grasps; they are brought to the size of its hand (`common.objects.pool.scale_objects`).
-          physics: engine; not `auto`.
-          batch: worlds that run side by side; 0 chooses by the engine.
+          objects: objects to grasp; they are scaled for its hand (`common.objects.pool.scale_objects`).
+          physics: engine, except `auto`.
+          batch: number of parallel worlds; 0 uses the engine's default.
           threads: threads of the `native` engine.
           seed: seed of constraints and episodes.
-          task: where it is not to be the bundle's; see `protocol` for what stays of it.
+          task: task, by default that of the bundle; see `protocol` for the settings that are kept.
           friction: sliding friction between hand and object.
-          hold_steps: control steps without the table; the task's, which count for success, if not given.
-          bank: constraints to draw from, of these objects in this order
-            (`common.task.sampling.write_sets.bank_of`); made from the seed if not given, with references of the
-            reference policy (`services.evaluate.references`).
-          paper: which of the paper's tables rows stand beside (`services.evaluate.paper`); empty for none.
+          hold_steps: control steps without the table; by default the task's, which count for success.
+          bank: constraint bank of these objects in this order (`common.task.sampling.write_sets.bank_of`); by default
+            generated from the seed, with references of the reference policy (`services.evaluate.references`).
+          paper: table of the paper for comparison (`services.evaluate.paper`); empty for none.
         """
         base = task or bundle.task
         hold = hold_steps or base.hold_steps
@@ -102,7 +101,7 @@ class Evaluator:
         self._kept: dict[str, dict[bool, list[Message]]] = {}
 
     def references(self, progress: Callable[[int, int], None] = lambda done, of: None) -> References | None:
-        """References of the reference policy, which rows draw the held-out ones of; None where all were given."""
+        """Returns references of the reference policy, of which rows draw the held-out ones; None if some were given."""
         if self._references is None and not self._given:
             policy, _ = references.reference_policy(self.bundle)
             self._references = self.references_of(policy, progress)
@@ -111,7 +110,7 @@ class Evaluator:
     def references_of(
         self, policy: PolicyBundle, progress: Callable[[int, int], None] = lambda done, of: None
     ) -> References:
-        """References of a policy on these objects; see `services.evaluate.references.make`."""
+        """Returns references of a policy on these objects; see `services.evaluate.references.make`."""
         return references.make(
             policy,
             self.task,
@@ -123,16 +122,16 @@ class Evaluator:
         )
 
     def bank_for(self, name: str) -> ConstraintBank:
-        """What a row's episodes are drawn from."""
+        """Returns the constraint bank of a row's episodes."""
         if from_references(name) and (made := self.references()):
             return references.held_out(made.bank)
         return self._bank
 
     def plan(self, name: str, episodes: int) -> RowPlan:
-        """The episodes of a row; see `services.evaluate.plan.plan_row`.
+        """Plans the episodes of a row; see `services.evaluate.plan.plan_row`.
 
         Raises:
-          CongraspError: no object allows the row's constraints, or the policy does not know them.
+          CongraspError: no object allows the row's constraints, or the policy does not support them.
         """
         return plan_row(self.task, self.bank_for(name), self.objects, name, episodes)
 
@@ -144,13 +143,13 @@ class Evaluator:
         *,
         keep: bool = False,
     ) -> dict[str, Sample]:
-        """Episodes of every row.
+        """Simulates the episodes of every row.
 
         Args:
-          names: of rows, see `services.evaluate.plan.plan_row`.
-          episodes: for each row, at least.
-          progress: is told how many episodes of all rows there are.
-          keep: keep some of them for `examples`, for which every step of all worlds has to be in memory.
+          names: names of rows, see `services.evaluate.plan.plan_row`.
+          episodes: least number for each row.
+          progress: called with the number of finished episodes of all rows.
+          keep: keeps some of them for `examples`; every step of all worlds is then in memory.
 
         Raises:
           CongraspError: no object of the pool allows a row's constraints.
@@ -165,7 +164,7 @@ class Evaluator:
         return found
 
     def allowed(self, names: Sequence[str]) -> tuple[list[str], list[CongraspError]]:
-        """The rows that some object allows, and why others are left out; captured objects may have no labelled parts.
+        """Returns the rows that some object allows, and errors for the others (captured objects may lack parts).
 
         Raises:
           CongraspError: no row is left.
@@ -182,11 +181,11 @@ class Evaluator:
         return allowed, errors
 
     def rows_under_noise(self, progress: Callable[[int], None], episodes: int) -> list[Row]:
-        """A row for each of `services.evaluate.noise.LEVELS`; see there. All of them add noise to the same references.
+        """Evaluates a row for each of `services.evaluate.noise.LEVELS`, all with noise on the same references.
 
         Args:
-          progress: is told how many episodes of all rows there are.
-          episodes: for each row, at least.
+          progress: called with the number of finished episodes of all rows.
+          episodes: least number for each row.
         """
         rows: list[Row] = []
         with self._episodes(episodes) as running:
@@ -199,7 +198,7 @@ class Evaluator:
         return rows
 
     def rows_under_sensing(self, progress: Callable[[int], None], episodes: int) -> list[Row]:
-        """A row for each of `services.evaluate.sensing.LEVELS`; see `_rows_at`."""
+        """Evaluates a row for each of `services.evaluate.sensing.LEVELS`; see `_rows_at`."""
         task = sensing.sensing_task(self.task)
         levels = {
             level.label: _Level(functools.partial(sensing.at_level, level=level, control_dt=task.control_dt))
@@ -208,7 +207,7 @@ class Evaluator:
         return self._rows_at(sensing.CONSTRAINT, levels, episodes, progress, task)
 
     def rows_under_loads(self, levels: Sequence[Load], progress: Callable[[int], None], episodes: int) -> list[Row]:
-        """A row for each load; see `_rows_at`."""
+        """Evaluates a row for each load; see `_rows_at`."""
         found = {
             load.label: _Level(functools.partial(loads.at_load, load=load), loads.loaded(self.objects, load))
             for load in levels
@@ -223,7 +222,7 @@ class Evaluator:
         progress: Callable[[int], None],
         task: TaskConfig,
     ) -> list[Row]:
-        """A row of a constraint for each level, by its label; all of them begin with the same episodes.
+        """Evaluates a row of a constraint for each level, by its label, all with the same initial conditions.
 
         `episodes` is the least number of each row, and `progress` receives the number of finished ones of all rows.
         """
@@ -240,11 +239,11 @@ class Evaluator:
         return rows
 
     def row_by_center(self, episodes: int, progress: Callable[[int], None]) -> tuple[Row, HeadingRules]:
-        """The heading row whose headings leave room for the hand's centre alone, and the effect of the rules.
+        """Evaluates headings that only keep the hand's centre above the table; returns the row and the rules' effect.
 
         Args:
-          episodes: of the row, at least.
-          progress: receives the number of finished episodes.
+          episodes: least number for the row.
+          progress: called with the number of finished episodes.
         """
         task = dataclasses.replace(self.task, headings="center")
         bank = build_bank(self._hand, task, self.objects, self._seed)
@@ -254,7 +253,7 @@ class Evaluator:
         return row, heading_rules(self._bank, self.objects, bank)
 
     def noisy_example(self, noise: Noise) -> Message | None:
-        """An episode under a noisy reference in which the object is held to the end, if there is one."""
+        """Returns an episode under a noisy reference in which the object is held to the end; None if there is none."""
         plan = self.plan(noise.constraint, self._batch)
         noisy = with_noise(self._hand, self.bank_for(noise.constraint), noise, self._seed)
         with self._episodes(self._batch, traced=True) as running:
@@ -270,12 +269,12 @@ class Evaluator:
         *,
         keep: bool = False,
     ) -> list[Row]:
-        """One row for each name; see `samples`."""
+        """Evaluates one row for each name; see `samples`."""
         samples = self.samples(names, episodes, progress, keep=keep)
         return [self.row(name, sample) for name, sample in samples.items()]
 
     def row(self, name: str, sample: Sample, group: str = "", objects: Sequence[str] = ()) -> Row:
-        """A row of episodes of this evaluator's protocol, on its own objects or on those of these names."""
+        """Returns a row of episodes of this evaluator's protocol, on its objects or on those of these names."""
         return summarise(
             name,
             self._hand.name,
@@ -289,15 +288,15 @@ class Evaluator:
         )
 
     def draws(self, name: str, episodes: int, count: int) -> list[Row]:
-        """`count` rows of `episodes` each from independent draws, to see how much chance there is in one."""
+        """Evaluates `count` rows of `episodes` each from independent draws, to estimate their variance."""
         sample = self.samples([name], episodes * count)[name]
         order = np.arange(len(sample.values["success"])) // episodes
         return [self.row(name, sample.where(order == i)) for i in range(count)]
 
     def examples(self, name: str, successes: int, failures: int, most: int = 300) -> list[Message]:
-        """Episodes of a row to look at, failures first; the object must be held to the end of the hold to succeed.
+        """Returns episodes of a row for inspection, failures first; success requires a hold to the end.
 
-        They are some of those that `samples` kept last, or of `most` that are evaluated now.
+        They come from those kept by the last `samples`, or from `most` that are evaluated now.
 
         Raises:
           CongraspError: the pool does not allow these constraints.
@@ -308,13 +307,13 @@ class Evaluator:
         return [*kept[False][:failures], *kept[True][:successes]]
 
     def episode(self, name: str, attempts: int = 1) -> Message:
-        """An episode under a set of constraints: the first of `attempts` that succeeds, or the last of them.
+        """Returns an episode under a set of constraints: the first of `attempts` that succeeds, or the last.
 
         Raises:
           CongraspError: the pool does not allow these constraints.
         """
         plan = self.plan(name, max(attempts, len(self.objects)))
-        first = zlib.crc32(name.encode()) % plan.total  # another object for another row
+        first = zlib.crc32(name.encode()) % plan.total  # a different object for each row
         plan = plan._replace(episodes=jax.tree.map(lambda x: np.roll(x, -first), plan.episodes))
         bank = self.bank_for(name)
         with self._episodes(attempts, traced=True) as running:
@@ -328,7 +327,7 @@ class Evaluator:
             return batch.message(int(succeeded[0]) if len(succeeded) else tried - 1)
 
     def _episodes(self, episodes: int, traced: bool = False, task: TaskConfig | None = None) -> Episodes:
-        """What simulates rows of so many episodes; its batch depends on nothing else, so that rows do not either."""
+        """Returns the simulator of rows with `episodes` episodes; its batch depends only on this number."""
         if self._field is None and len(self.objects) <= MEASURED:
             self._field = distance_field(self.objects)
         return Episodes(
@@ -352,7 +351,7 @@ class Evaluator:
         progress: Callable[[int], None] = lambda done: None,
         keep: bool = False,
     ) -> Sample:
-        """The episodes of a plan, of which some are kept under a name."""
+        """Simulates the episodes of a plan, of which some are kept under a name."""
         if keep:
             self._kept[name] = {False: [], True: []}
 
@@ -367,7 +366,7 @@ class Evaluator:
 
 
 def batch_of(episodes: int, most: int) -> int:
-    """Environments side by side for rows of so many episodes: a power of two, or `most`."""
+    """Number of parallel environments for rows of `episodes` episodes: a power of two, or `most`."""
     return min(most, 1 << (episodes - 1).bit_length())
 
 
@@ -379,15 +378,15 @@ def simulate(
     visit: Callable[[Batch, int], None] = lambda batch, count: None,
     stressed: int = STRESSED,
 ) -> Sample:
-    """The episodes of a row; the first ones go on after the hold, lifted and pushed.
+    """Simulates the episodes of a row; the first ones continue after the hold with lift and pushes.
 
     Args:
-      running: what simulates them.
+      running: simulator.
       conditions: see `services.evaluate.plan.batches`.
       total: number of episodes.
-      progress: is told how many there are.
-      visit: is given each batch, and how many of its episodes count.
-      stressed: how many go on, at least; batches go on as a whole.
+      progress: called with the number of finished episodes.
+      visit: called with each batch, and the number of its episodes that count.
+      stressed: least number of episodes that continue; batches continue as a whole.
     """
     found: list[Sample] = []
     done, most = 0, min(total, stressed) if running.stressable else 0

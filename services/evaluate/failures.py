@@ -1,4 +1,4 @@
-"""Failures and successes of a row as a contact sheet, each failure with its cause."""
+"""Contact sheets of a row's failures and successes, with the cause of each failure."""
 
 from collections.abc import Iterator, Sequence
 
@@ -12,11 +12,11 @@ from congrasp.services.viz.sheets import contact_sheet
 
 _FRAMES = 5
 _SIZE = (300, 225)
-_PUSHED = 0.05  # m that an object may move before the table is removed
+_PUSHED = 0.05  # tolerated displacement of an object before the table is removed, m
 
 
 def cause(episode: Message, drop_height: float) -> str:
-    """Why an episode ended with the object `drop_height` (m) or more below where it was, or `held`."""
+    """Cause of an episode's end with the object `drop_height` (m) or more below its initial height, or `held`."""
     metrics = episode.meta["metrics"]
     if metrics["bad"]:
         return "the physics diverged"
@@ -32,7 +32,7 @@ def cause(episode: Message, drop_height: float) -> str:
 
 
 def fall_step(episode: Message, drop_height: float) -> int:
-    """The step at which the object is `drop_height` (m) below where it was at the table's removal, or the last one."""
+    """Step at which the object is `drop_height` (m) below its height at the table's removal, or the last one."""
     removal = int(np.argmin(episode.arrays["table"]))
     height = np.asarray(episode.arrays["object_position"])[:, 2]
     below = np.flatnonzero(height[removal:] < height[removal] - drop_height)
@@ -45,14 +45,14 @@ def failure_sheets(
     """Draws episodes of rows up to the step at which the object has fallen, or to the end, failures first.
 
     Args:
-      evaluator: of the policy; where it kept episodes, none are evaluated anew.
-      policy: for the titles.
+      evaluator: evaluator of the policy; episodes it kept are not evaluated again.
+      policy: policy, for the titles.
       constraints: names of the rows.
-      successes: how many of each to show.
-      failures: how many of each to show, if there are so many.
+      successes: number of successes to show for each row.
+      failures: most failures to show for each row.
 
     Yields:
-      For each row that has an episode to show: its name, the sheet (H, W, 3) uint8, and the outcome of each episode.
+      For each row with an episode: its name, the sheet (H, W, 3) uint8, and the outcome of each episode.
     """
     for constraint in constraints:
         episodes = evaluator.examples(constraint, successes, failures)

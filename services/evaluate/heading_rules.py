@@ -7,11 +7,11 @@ import numpy as np
 
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.sampling.bank import ConstraintBank
-from congrasp.common.task.sampling.headings import Headings, feasible
+from congrasp.common.task.sampling.headings import Headings, feasible, opposed_at
 from congrasp.services.evaluate.plan import repeated_rests
 
 _LIFT = np.array([0, 0, 10, 0, 0, 0, 0])
-"""Of a resting pose, m: higher than any hand reaches down."""
+"""z coordinate of the resting pose, m: higher than any hand reaches down."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +19,7 @@ class HeadingRules:
     """Shares of all pairs of a sampled heading and a resting pose."""
 
     kept: float
-    """Pairs that episodes draw from."""
+    """Pairs used by episodes."""
     from_below: float
     """Pairs dropped because the hand would come from below."""
     no_room: float
@@ -27,13 +27,17 @@ class HeadingRules:
     moved: float
     """Share of the kept pairs whose position moves back from the table."""
     kept_by_center: float | None = None
-    """Pairs kept where the hand's centre alone must be above the table."""
+    """Pairs kept if only the hand's centre must be above the table."""
+    opposed: float | None = None
+    """Share of the headings by the paper's rules alone that have surfaces to press on from both sides."""
 
     def sentence(self, hand: str) -> str:
-        """Such as "Headings of the human hand: 24 % of those sampled are kept …"."""
+        """Summary, such as "Headings of the human hand: 24 % of those sampled are kept …"."""
         kept, below, room, moved = (f"{100 * x:.0f} %" for x in (self.kept, self.from_below, self.no_room, self.moved))
-        center = "" if self.kept_by_center is None else (
-            f" With the hand's centre alone above the table, {100 * self.kept_by_center:.0f} % are kept."
+        center = "" if self.kept_by_center is None or self.opposed is None else (
+            f" By the paper's rules, with the hand's centre above the table, {100 * self.kept_by_center:.0f} % are "
+            f"kept; {100 * (1 - self.opposed):.0f} % of these rules' headings have no surfaces to press on from both "
+            "sides, which the full rules do not sample."
         )  # fmt: skip
         return (
             f"Headings of the {hand} hand: {kept} of the sampled ones are kept, {below} dropped because they come from "
@@ -48,14 +52,13 @@ def heading_rules(
     """Effect of the rules on the headings of the whole surface, over all resting poses.
 
     Args:
-      bank: of the objects (`common.task.sampling.build.build_bank`).
-      objects: N objects, in the hand's size.
-      by_center: the same with the task's `headings` set to `center`.
+      bank: bank of the objects (`common.task.sampling.build.build_bank`).
+      objects: N objects, scaled for the hand.
+      by_center: the same with the task's `headings` set to `center`, which also takes the paper's rules alone.
     """
     total, below = 0, 0
     for n, obj in enumerate(objects):
-        axes = (getattr(bank, f"heading_{name}")[n, 0] for name in Headings._fields)
-        headings = Headings(*(np.asarray(axis, np.float64) for axis in axes))
+        headings = _sampled(bank, n)
         for rest in obj.rest_poses:
             total += len(headings.direction)
             below += int((~feasible(headings, rest + _LIFT)).sum())
@@ -66,7 +69,20 @@ def heading_rules(
         no_room=1 - (kept + below) / total,
         moved=moved / kept,
         kept_by_center=None if by_center is None else _kept(by_center)[0] / total,
+        opposed=None if by_center is None else _opposed(by_center, objects),
     )
+
+
+def _sampled(bank: ConstraintBank, n: int) -> Headings:
+    """Sampled headings of the whole surface of an object, before they are moved."""
+    axes = (getattr(bank, f"heading_{name}")[n, 0] for name in Headings._fields)
+    return Headings(*(np.asarray(axis, np.float64) for axis in axes))
+
+
+def _opposed(bank: ConstraintBank, objects: Sequence[GraspObject]) -> float:
+    """Share of a bank's headings that have surfaces to press on from both sides."""
+    found = [opposed_at(_sampled(bank, n), obj, np.zeros(len(obj.points), bool)) for n, obj in enumerate(objects)]
+    return float(np.mean(found))
 
 
 def _kept(bank: ConstraintBank) -> tuple[int, int]:

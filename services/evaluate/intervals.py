@@ -1,4 +1,4 @@
-"""Intervals of rates whose episodes come in clusters, and standard errors of means."""
+"""Intervals of rates of clustered episodes, and standard errors of means."""
 
 import math
 
@@ -13,7 +13,7 @@ def wilson(rate: float, count: float) -> tuple[float, float]:
 
     Args:
       rate: share of successes.
-      count: number of independent episodes, which need not be whole.
+      count: number of independent episodes, not necessarily an integer.
     """
     if count <= 0:
         return 0.0, 1.0
@@ -28,8 +28,8 @@ def independent_episodes(outcomes: np.ndarray, clusters: np.ndarray) -> float:
 
     It is the number of episodes over the design effect (Kish, Survey Sampling, 1965): the cluster-robust variance of
     the rate, G / (G - 1) sum_g (sum_{i in g} (y_i - p))^2 / n^2, over p (1 - p) / n. The design effect is at least 1.
-    Where all episodes end alike it cannot be estimated, and each cluster counts once. Episodes of a single cluster
-    count as independent, and the rate is that of the cluster alone.
+    If all episodes have the same outcome it cannot be estimated, and each cluster counts once. Episodes of a single
+    cluster count as independent, and the rate is that of the cluster.
 
     Args:
       outcomes: (E,) bool.
@@ -48,7 +48,7 @@ def independent_episodes(outcomes: np.ndarray, clusters: np.ndarray) -> float:
 
 
 def clustered(outcomes: np.ndarray, clusters: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the rate of outcomes (E,) in clusters (E,): Wilson's, of `independent_episodes`."""
+    """95 % interval of the rate of outcomes (E,) in clusters (E,): Wilson's, with `independent_episodes`."""
     rate = float(np.mean(outcomes)) if len(outcomes) else 0.0
     return wilson(rate, independent_episodes(outcomes, clusters))
 

@@ -1,4 +1,4 @@
-"""Which policies the tables of an evaluation compare: those given, pretrained ones, and methods without a policy."""
+"""Selects the policies compared in an evaluation: given ones, pretrained ones, and methods without a policy."""
 
 import dataclasses
 import hashlib
@@ -21,7 +21,7 @@ _POLICY = "policy.safetensors"
 
 
 class Entrant(NamedTuple):
-    """A policy as a method; its task is that of the method."""
+    """A policy with its method; its task is that of the method."""
 
     policy: PolicyBundle
     file: pathlib.Path
@@ -33,12 +33,12 @@ class Entrant(NamedTuple):
 
     @property
     def method(self) -> str:
-        """`common.task.methods`."""
+        """Method of `common.task.methods`."""
         return self.policy.task.method
 
 
 class Missing(NamedTuple):
-    """A method of a table that has no policy."""
+    """A method of a table without a policy."""
 
     hand: str
     method: str
@@ -46,17 +46,17 @@ class Missing(NamedTuple):
 
 
 class Lineup(NamedTuple):
-    """Who is evaluated, on which tables of rows."""
+    """Policies to evaluate, and the tables of each."""
 
     entrants: list[tuple[Entrant, tuple[Table, ...]]]
     missing: list[Missing]
 
 
 def read_entrant(file: pathlib.Path, method: str | None = None) -> Entrant:
-    """A policy file, under its own method or as a given one.
+    """Reads a policy file, with its method or as a given one.
 
     Raises:
-      CongraspError: it cannot be read, or the policy is of another method that learns.
+      CongraspError: it cannot be read, or the policy has another method that learns.
     """
     policy = bundles.load(file)
     if method is not None:
@@ -65,14 +65,15 @@ def read_entrant(file: pathlib.Path, method: str | None = None) -> Entrant:
 
 
 def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entrant]:
-    """Policies that a user names: FILE, METHOD=FILE, a name in the package, or a folder of runs, each with a policy.
+    """Reads policies named by a user: FILE, METHOD=FILE, a name in the package, or a folder of runs with policies.
 
     Args:
-      texts: what the user wrote.
-      method: of policies that are named without one; by default the policy says.
+      texts: arguments of the user.
+      method: method of policies given without one; by default that of the policy.
 
     Raises:
-      CongraspError: one cannot be read or is of another method, a folder holds none, or two are alike.
+      CongraspError: a policy cannot be read or has another method, a folder holds none, or two have the same hand and
+        method.
     """
     found: list[Entrant] = []
     for text in texts:
@@ -84,29 +85,29 @@ def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entra
         if path.is_dir():
             files = sorted({*path.glob(_POLICY), *path.glob(f"*/{_POLICY}")})
             if not files:
-                raise CongraspError(f"The folder {path} holds no {_POLICY}.", "Name a run's folder, or a policy file.")
+                raise CongraspError(f"The folder {path} holds no {_POLICY}.", "Pass a run's folder, or a policy file.")
         found += [read_entrant(file, own) for file in files]
     for i, one in enumerate(found):
         if any((one.hand, one.method) == (other.hand, other.method) for other in found[:i]):
             raise CongraspError(
-                f"Two policies are of the hand '{one.hand}' and the method '{one.method}'.", "Evaluate one at a time."
+                f"Two policies have the hand '{one.hand}' and the method '{one.method}'.", "Evaluate one at a time."
             )
     return found
 
 
 def line_up(tables: Sequence[Table], given: Sequence[Entrant], hand: str, method: str | None = None) -> Lineup:
-    """Who is evaluated for some tables.
+    """Selects the policies for some tables.
 
-    `hands` compares full systems: those given, or else the pretrained ones. `ablation` compares the methods of
-    `ABLATION` for the hand of the first policy; where none is given for the full system the pretrained one stands in.
-    `sensing` has beside a student the full system, likewise. Every other table is of each policy given, or else of the
+    `hands` compares full systems: the given ones, or else the pretrained ones. `ablation` compares the methods of
+    `ABLATION` for the hand of the first policy; the full system defaults to the pretrained one. `sensing` compares a
+    student with the full system, with the same default. Every other table covers each given policy, or else the
     pretrained one of a hand.
 
     Args:
-      tables: what is wanted.
-      given: policies that the user named.
-      hand: whose pretrained policy stands in for none.
-      method: as which method.
+      tables: requested tables.
+      given: policies given by the user.
+      hand: hand whose pretrained policy is the default.
+      method: method to evaluate.
 
     Raises:
       CongraspError: there is no policy for the hand.
@@ -138,7 +139,7 @@ def line_up(tables: Sequence[Table], given: Sequence[Entrant], hand: str, method
 
 
 def facts(one: Entrant) -> dict[str, Any]:
-    """What JSON files say about a policy."""
+    """Description of a policy in JSON files."""
     return {
         "hand": one.hand,
         "method": one.method,

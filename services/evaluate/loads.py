@@ -1,8 +1,7 @@
-"""Levels of load: masses and frictions, such as those of other projects, at which the same episodes are evaluated.
+"""Levels of load: masses and frictions, including those of other projects, applied to the same episodes.
 
-All levels have the heading constraint. The inertia is scaled with the mass. Objects are replaced instead of scaling the
-mass of an episode: engines derive the softness of contacts from the mass that a scene is compiled with, and diverge far
-from it.
+All levels use the heading constraint. The inertia is scaled with the mass. Objects are replaced instead of scaling the
+mass of an episode: engines derive the softness of contacts from the mass at compilation, and diverge far from it.
 """
 
 import dataclasses
@@ -16,7 +15,7 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.services.evaluate.episodes import identity
 
 CONSTRAINT = "heading"
-"""The row that is evaluated at every level."""
+"""Row evaluated at every level."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Load:
     friction: tuple[float, float] | None = None
     """Sliding friction between hand and object."""
     factor: float = 1.0
-    """Factor of the object's mass, where no mass is named."""
+    """Factor on the object's mass, if no mass is given."""
 
 
 PEERS = (
@@ -38,15 +37,15 @@ PEERS = (
 )
 """Conditions of RobustDexGrasp (arXiv:2504.05287) and of Isaac Lab's dexsuite."""
 MASSES = (0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0)
-"""kg, of the table `payload`."""
+"""Masses of the table `payload`, kg."""
 
 
 def payload(scale: float, *, constant_mass: bool) -> tuple[Load, ...]:
-    """The masses of the table `payload`, the objects' own, and those scaled with the objects' lengths where these are.
+    """Loads of the table `payload`: fixed masses, the objects' masses, and masses scaled with lengths if different.
 
     Args:
       scale: factor on the lengths of the hand's objects.
-      constant_mass: the task's: whether the objects that are evaluated keep their mass when they are scaled.
+      constant_mass: setting of the task; True if the evaluated objects keep their mass when scaled.
     """
     masses = tuple(Load(f"{mass:g} kg", mass=(mass, mass)) for mass in MASSES)
     own = 1.0 if constant_mass else scale**-3
@@ -56,7 +55,7 @@ def payload(scale: float, *, constant_mass: bool) -> tuple[Load, ...]:
 
 
 def loaded(objects: Sequence[GraspObject], load: Load) -> list[GraspObject]:
-    """The objects with their masses at a load; the place of a mass in its range follows from the object's name."""
+    """Returns the objects with masses of a load; an object's name determines its position in the range."""
     found = []
     for obj in objects:
         mass = load.factor * obj.mass
@@ -67,7 +66,7 @@ def loaded(objects: Sequence[GraspObject], load: Load) -> list[GraspObject]:
 
 
 def at_load(conditions: InitialConditions, load: Load) -> InitialConditions:
-    """Episodes with their frictions at a load; the place of a friction in its range follows from the episode alone."""
+    """Returns episodes with frictions of a load; the episode determines the position in the range."""
     if not load.friction:
         return conditions
     low, high = load.friction

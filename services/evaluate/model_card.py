@@ -1,4 +1,4 @@
-"""What a policy is for, what it learnt from, where it is bad, and how it may be used and cited."""
+"""Model card of a policy: purpose, training data, limits, licence and citation."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,9 +10,9 @@ from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.services.evaluate.scores import Row
 
 _LEAST = 0.8
-"""Rates below this are named as limits."""
+"""Rates below this are listed as limits."""
 _WORST = 6
-"""Objects that are named at most."""
+"""Most objects listed."""
 _OVERLAPS = {
     "hand_hand_mm": "Its fingers pass through one another",
     "hand_table_mm": "It passes through the table",
@@ -20,10 +20,10 @@ _OVERLAPS = {
 }
 _FAST = 1.0  # m/s of a wrist, above which an arm hardly follows
 _SIMULATED = (
-    "It was made and measured in simulation, never on a physical hand: success here says nothing about the safety of a "
-    "robot."
+    "It was trained and measured in simulation, never on a physical hand: success here implies nothing about the "
+    "safety of a robot."
 )
-_MET = "It met rigid objects that fit the hand: no soft or jointed ones, no clutter and no obstacles."
+_MET = "Its objects were rigid and fit the hand: no soft or articulated ones, no clutter and no obstacles."
 _HEADINGS = {
     "all": "all headings",
     "above": "headings within 30° of straight down",
@@ -37,15 +37,15 @@ _CITATION = """@article{congraspxl,
 
 
 def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
-    """The sections of a policy's model card.
+    """Returns the sections of a policy's model card.
 
     Args:
-      policy: what it is about.
-      rows: its evaluation.
+      policy: policy of the card.
+      rows: rows of its evaluation.
 
     Returns:
-      `uses`: sentences; `commands`: that use it; `data`: sentences; `limits`: sentences, what the rows show first;
-      `licence`; `citation`: BibTeX of the method.
+      `uses`: sentences; `commands`: examples of use; `data`: sentences; `limits`: sentences, those from the rows first;
+        `licence`; `citation`: BibTeX of the method.
     """
     hand = policy.spec.hand_name
     return {
@@ -60,19 +60,19 @@ def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
             "congrasp export policy --policy FILE --to onnx",
         ),
         "data": (
-            "It learnt by reinforcement in simulation. Objects are procedural, or those of the run's own folder; "
-            "constraints are sampled, or those of the run's constraint sets.",
+            "It was trained by reinforcement learning in simulation. Objects are procedural, or those of the "
+            "run's folder; constraints are sampled, or those of the run's constraint sets.",
             _trained(policy.task),
         ),
         "limits": (*limits(rows), _SIMULATED, _observed(policy.task), _MET),
-        "licence": "The software and the policies that come with it: Apache-2.0. A policy of your own is yours, within "
-        "the licences of the meshes, hands and captured grasps that it learnt from.",
+        "licence": "The software and its policies: Apache-2.0. A policy that you train is yours, within "
+        "the licences of the meshes, hands and captured grasps of its training.",
         "citation": _CITATION,
     }
 
 
 def limits(rows: Sequence[Row]) -> list[str]:
-    """What is bad by the figures: rows below the paper's or below 80 %, lost objects, implausible motions."""
+    """Limits shown by the figures: rows below the paper's or below 80 %, lost objects, implausible motions."""
     found = []
     for row in rows:
         name = f"{row.constraint} ({row.group})" if row.group else row.constraint
@@ -86,11 +86,11 @@ def limits(rows: Sequence[Row]) -> list[str]:
     if not found:
         found.append("No row is below the paper's success, or below 80 %.")
     if worst := _worst(rows):
-        found.append(f"Objects that it loses most: {', '.join(worst)}.")
+        found.append(f"Objects with the most losses: {', '.join(worst)}.")
     for measure, words in _OVERLAPS.items():
         deepest = max((row.plausibility.get(measure) or 0.0 for row in rows), default=0.0)
         if deepest > CLEAN_MM[measure]:
-            found.append(f"{words}: {deepest:.1f} mm at the deepest, in the mean of the worst row.")
+            found.append(f"{words}: {deepest:.1f} mm at the deepest, mean of the worst row.")
     fastest = max((row.plausibility.get("wrist_speed") or 0.0 for row in rows), default=0.0)
     if fastest > _FAST:
         found.append(f"Its wrist peaks at {fastest:.1f} m/s, in the mean of the fastest row.")
@@ -110,7 +110,7 @@ def _worst(rows: Sequence[Row]) -> list[str]:
 
 
 def _trained(task: TaskConfig) -> str:
-    """The distribution of the episodes in training."""
+    """Describes the distribution of the episodes in training."""
     parts = [f"{part.title} in {100 * getattr(task, f'p_{part.name}'):.0f} %" for part in optional(task)]
     ranges = [f"mass x {_range(task.mass_range)}", f"sliding friction {_range(task.friction_range)}"]
     if task.gain_range != (1.0, 1.0):
@@ -120,7 +120,7 @@ def _trained(task: TaskConfig) -> str:
 
 
 def _tracker(sensing: SensingConfig) -> list[str]:
-    """What the tracker in training drew, each range in its unit; nothing of what was always zero."""
+    """Describes the tracker's ranges in training, with units, omitting those that were always zero."""
     ranges = {name: (getattr(sensing, name), unit) for name, unit in _TRACKER_UNITS.items()}
     return [
         f"tracker's {name.replace('_', ' ')} {_range(limits)} {unit}".rstrip()
@@ -130,13 +130,13 @@ def _tracker(sensing: SensingConfig) -> list[str]:
 
 
 def _range(limits: tuple[float, float]) -> str:
-    """Such as "0.8 to 1.2"; one number where the two are equal."""
+    """Formats a range such as "0.8 to 1.2"; one number if both are equal."""
     low, high = limits
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def _observed(task: TaskConfig) -> str:
-    """What the policy sees of the world."""
+    """Describes the observation of the policy."""
     if task.observation == "tracked":
         return (
             f"It observes the last {task.history} control steps of joint angles, the wrist, their targets and the "

@@ -1,7 +1,7 @@
-"""Noisy references: how a policy follows captured poses and trajectories with errors (paper, noisy constraints).
+"""Noisy references: accuracy of a policy on captured poses and trajectories with errors (paper, noisy constraints).
 
 Each kind of noise is added to the reference poses or trajectories of a constraint bank, and the same episodes are
-evaluated as those without noise; errors are measured against what was requested, noise included.
+evaluated as without noise; errors are relative to the request, including noise.
 """
 
 import dataclasses
@@ -20,15 +20,15 @@ class Noise:
     """One kind of noise at one level."""
 
     constraint: str
-    """The row whose references get it: pose or trajectory."""
+    """Row whose references get the noise: pose or trajectory."""
     kind: str
-    """joints, depth or jitter; empty for none."""
+    """joints, depth or jitter; empty for no noise."""
     level: float
-    """rad of joints, m otherwise."""
+    """rad for joints, m otherwise."""
 
     @property
     def label(self) -> str:
-        """Such as "joints 0.2 rad"; empty without noise."""
+        """Label such as "joints 0.2 rad"; empty without noise."""
         amount = f"{self.level:g} rad" if self.kind == "joints" else f"{100 * self.level:g} cm"
         return f"{self.kind} {amount}" if self.kind else ""
 
@@ -44,10 +44,10 @@ LEVELS = (
 
 
 def with_noise(hand: Hand, bank: ConstraintBank, noise: Noise, seed: int) -> ConstraintBank:
-    """The constraint bank with noisy references.
+    """Returns the constraint bank with noisy references.
 
-    * joints: an independent normal error of standard deviation `level` on every finger joint, kept within its limits.
-    * depth: the wrist is moved along the hand's heading axis, into the object, by a uniform share of `level`.
+    * joints: an independent normal error of standard deviation `level` on every finger joint, clipped to its limits.
+    * depth: a displacement of the wrist along the hand's heading axis, into the object, uniform up to `level`.
     * jitter: an independent normal error of standard deviation `level` on every coordinate of every waypoint.
     """
     rng = np.random.default_rng(seed)

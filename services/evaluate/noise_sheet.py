@@ -29,13 +29,13 @@ def draw_noise(evaluator: Evaluator, rows: Sequence[Row], folder: pathlib.Path, 
     """Writes `noise.png`, the curves, and `noise_examples.png`, a grasp under the worst level of each kind.
 
     Args:
-      evaluator: of the policy.
-      rows: of `LEVELS`, in that order.
-      folder: for the files.
-      title: of the curves.
+      evaluator: evaluator of the policy.
+      rows: rows of `LEVELS`, in that order.
+      folder: folder for the files.
+      title: title of the curves.
 
     Raises:
-      CongraspError: matplotlib is absent, or a file cannot be written.
+      CongraspError: matplotlib is not installed, or a file cannot be written.
     """
     draw_curves(rows, folder / "noise.png", title)
     images: list[np.ndarray] = []
@@ -56,15 +56,15 @@ def draw_noise(evaluator: Evaluator, rows: Sequence[Row], folder: pathlib.Path, 
 
 
 def draw_curves(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
-    """Success and errors against the noise, a panel for each kind, as PNG.
+    """Draws success and errors against the noise, a panel for each kind, as PNG.
 
     Args:
-      rows: of `LEVELS`, in that order.
+      rows: rows of `LEVELS`, in that order.
       path: the file to write.
-      title: of the figure.
+      title: title of the figure.
 
     Raises:
-      CongraspError: matplotlib is absent, or the file cannot be written.
+      CongraspError: matplotlib is not installed, or the file cannot be written.
     """
     try:
         from matplotlib.figure import Figure

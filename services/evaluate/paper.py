@@ -1,4 +1,4 @@
-"""The paper's tables, each for rows that are made as it is: of the same hand, method and source of constraints."""
+"""Tables of the paper, with figures to compare with rows of the same hand, method and source of constraints."""
 
 import dataclasses
 from typing import NamedTuple
@@ -80,28 +80,28 @@ _OBJECTS = {
     "no-dynamic-center": {"": 0.880, "small": 0.871, "medium": 0.893, "large": 0.877},
 }
 CENTER_GROUP = "hand's centre alone above the table"
-"""Group of the row whose headings leave room for the hand's centre instead of the whole hand: the paper states no rule
-for the hand."""
+"""Group of the row whose headings only keep the hand's centre above the table; the paper has no rule for the hand."""
 SOURCES = {
     "hands": "procedural references for each hand (hand morphology)",
     "captured": "captured constraints of GRAB and OakInk (single and composed constraints, ablation)",
     "cross": "captured constraints of DexYCB (cross-dataset)",
     "objects": "large-scale objects of Objaverse",
 }
-"""The paper's tables, by what their episodes are drawn from."""
+"""Tables of the paper, by the source of their episodes."""
 CAPTURED_SETS = {"grab": "captured", "oakink": "captured", "dexycb": "cross"}
-"""Which of them belongs to a captured data set; others have none."""
+"""Table of each captured data set; others have none."""
 
 
 def paper_row(source: str, hand: str, method: str, constraint: str, group: str = "") -> PaperRow | None:
-    """The paper's row for these episodes; None where it has none.
+    """Returns the paper's row for these episodes; None if it has none.
 
     Args:
       source: one of `SOURCES`, or empty for none.
-      hand: the human hand's tables of captured constraints and of large-scale objects are MANO's.
-      method: `common.task.methods`.
-      constraint: constraints with `+` between them.
-      group: which objects or pairs; its first word counts.
+      hand: name of the hand; in the tables of captured constraints and of large-scale objects, the human hand is
+        MANO's.
+      method: method of `common.task.methods`.
+      constraint: constraints joined by `+`.
+      group: group of objects or pairs; only its first word is compared.
     """
     word = group.split(" ")[0]
     if source == "hands" and method == "ours" and group in ("", CENTER_GROUP):
@@ -123,9 +123,9 @@ class PaperLine(NamedTuple):
     table: str
     """One of `TABLES`."""
     source: str
-    """What its episodes are drawn from, one of `SOURCES`."""
+    """Source of its episodes, one of `SOURCES`."""
     constraint: str
-    """Constraints with `+` between them."""
+    """Constraints joined by `+`."""
     hand: str
     method: str
     group: str
@@ -146,7 +146,7 @@ _ABLATION = ("ours", "no-dynamic-center", "no-feedforward")
 
 
 def paper_lines() -> list[PaperLine]:
-    """Every line of the paper's tables, in its order."""
+    """Returns every line of the paper's tables, in its order."""
     constraints = tuple(_HANDS["human"])
     lines = []
     for method in ("graspxl", "dgrasp", "pd", "ours"):

@@ -1,8 +1,8 @@
-"""Rows of an evaluation: which episodes they consist of, decided before any is simulated.
+"""Plans the episodes of a row, before any is simulated.
 
-A row has the same number of episodes for every object that allows its constraints, and as nearly as that goes the same
-number for each resting pose of an object. What is drawn for an episode depends on the seed, the row's constraints, the
-object and the episode's number: never on the rows, objects or policies that are evaluated beside it.
+A row has the same number of episodes for every object that allows its constraints, and nearly the same number for each
+resting pose of an object. The draws of an episode depend on the seed, the row's constraints, the object and the
+episode's number, never on other rows, objects or policies of the evaluation.
 """
 
 import dataclasses
@@ -23,18 +23,18 @@ from congrasp.common.task.constraints import get_constraint, optional, require_k
 from congrasp.common.task.sampling.bank import ConstraintBank
 
 ALIGNED = ":aligned"
-"""Ends the name of a row whose pose and trajectory belong together; elsewhere each is drawn for itself."""
+"""Suffix of rows with matching pose and trajectory; elsewhere they are drawn independently."""
 
 
 class RowPlan(NamedTuple):
     """The episodes of a row."""
 
     constraint: str
-    """Constraints with `+` between them."""
+    """Constraints joined by `+`."""
     aligned: bool
-    """Whether reference pose and trajectory belong together."""
+    """True if reference pose and trajectory match."""
     episodes: PlannedEpisodes
-    """One object after another, then all of them again."""
+    """Objects in turn, repeated."""
     covered: np.ndarray
     """(N,) bool: objects that allow the constraints in some resting pose."""
 
@@ -47,27 +47,27 @@ class RowPlan(NamedTuple):
 def plan_row(
     task: TaskConfig, bank: ConstraintBank, objects: Sequence[GraspObject], name: str, episodes: int
 ) -> RowPlan:
-    """The episodes of a row.
+    """Plans the episodes of a row.
 
     Args:
-      task: the task; which constraints there are.
-      bank: constraints of the objects.
+      task: the task, for its constraints.
+      bank: constraint bank of the objects.
       objects: N objects.
-      name: constraints with `+` between them, and `ALIGNED` if pose and trajectory are to belong together.
+      name: constraints joined by `+`, with `ALIGNED` for matching pose and trajectory.
       episodes: least number; rounded up to a multiple of the objects that allow the constraints.
 
     Raises:
-      CongraspError: no object allows them, or the policy does not know them.
+      CongraspError: no object allows them, or the policy does not support them.
     """
     constraint, aligned = name.removesuffix(ALIGNED), name.endswith(ALIGNED)
     require_known(constraint.split("+"), task)
     allowed = initial.allowing(dataclasses.replace(task, aligned_references=aligned), bank, constraint.split("+"))
-    allowed = allowed & ~repeated_rests(np.asarray(bank.rest))
+    allowed = allowed & ~repeated_rests(np.asarray(bank.rest)) & (np.asarray(bank.weight) > 0)[:, None]
     covered = np.asarray(allowed.any(1))
     if not covered.any():
         raise CongraspError(
             f"None of the {len(objects)} objects allows the constraint '{constraint}'.",
-            "An affordance needs labelled parts, poses and trajectories need room above the table.",
+            "An affordance needs labelled parts; poses and trajectories need room above the table.",
         )
     which = np.flatnonzero(covered)
     each = -(-episodes // len(which))
@@ -88,22 +88,22 @@ def plan_row(
 
 
 def from_references(name: str) -> bool:
-    """Whether a row's constraints are drawn from references."""
+    """True if a row's constraints are drawn from references."""
     return any(get_constraint(part).from_reference for part in name.removesuffix(ALIGNED).split("+"))
 
 
 def batches(
     hand: Hand, task: TaskConfig, bank: ConstraintBank, plan: RowPlan, seed: int, size: int
 ) -> Iterator[tuple[InitialConditions, int]]:
-    """The row's episodes in batches of `size`, and how many of each batch count: the last one is filled up.
+    """Yields the row's episodes in batches of `size`, and the number that count: the last batch is padded.
 
     Args:
       hand: the hand.
       task: ranges.
-      bank: what is drawn from.
-      plan: the row.
-      seed: of the evaluation; the row's constraints are part of what draws depend on.
-      size: of a batch.
+      bank: constraint bank.
+      plan: plan of the row.
+      seed: seed of the evaluation; draws also depend on the row's constraints.
+      size: size of a batch.
     """
     asked = tuple(c.name for c in optional(task) if c.name in plan.constraint.split("+"))
     task = dataclasses.replace(task, aligned_references=plan.aligned)
@@ -118,7 +118,7 @@ _planned = jax.jit(initial.planned, static_argnums=(0, 1, 5))
 
 
 def repeated_rests(rest: np.ndarray) -> np.ndarray:
-    """(N, R) bool: resting poses (N, R, 7) that only fill the row of an object with fewer of them."""
+    """(N, R) bool: resting poses (N, R, 7) that only pad the row of an object with fewer of them."""
     same = (rest[:, :, None] == rest[:, None]).all(-1)
     repeated: np.ndarray = np.tril(same, -1).any(-1)
     return repeated

@@ -1,4 +1,4 @@
-"""Figures of an evaluation from its JSON: the table beside the paper's, rates with intervals, and how errors spread."""
+"""Figures of an evaluation from its JSON: comparison with the paper, rates with intervals, distributions of errors."""
 
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -19,22 +19,22 @@ _TITLES = {
 }
 """Title and unit of each error, by its name in the rows."""
 _COLUMNS = 4
-_LARGEST = 64 << 20  # bytes of a JSON file
+_LARGEST = 64 << 20  # limit of a JSON file in bytes
 
 
 def plot_evaluation(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str]) -> list[pathlib.Path]:
-    """Draws the result of `congrasp evaluate --json`.
+    """Plots the result of `congrasp evaluate --json`.
 
     Args:
       path: the file.
       out: folder for the figures.
-      formats: of the files: png, pdf.
+      formats: formats of the files: png, pdf.
 
     Returns:
-      The files written: table, success, and errors where the file has their quantiles.
+      The files written: table, success, and errors if the file has their quantiles.
 
     Raises:
-      CongraspError: it is no such file.
+      CongraspError: it is not such a file.
     """
     try:
         rows = read_json(path, _LARGEST)["rows"]
@@ -46,13 +46,13 @@ def plot_evaluation(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str
     except (CongraspError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise CongraspError(
             f"{path} is not the result of an evaluation ({type(error).__name__}: {error}).",
-            "Name a file that 'congrasp evaluate --json FILE' wrote, or a run's folder.",
+            "Pass a file that 'congrasp evaluate --json FILE' wrote, or a run's folder.",
         ) from None
     return [file for name, figure in figures.items() for file in save(figure, out / name, formats)]
 
 
 def cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """The table's text, its header first; a pair is ours and the paper's."""
+    """Text of the table, its header first; a pair is ours and the paper's."""
     shown = [name for name in _TITLES if any(row.get(name) is not None for row in rows)]
     head = ["constraint", "episodes", "success, %", "paper", "held 2 s, %"]
     table = [[*head, *(word for name in shown for word in (f"{_TITLES[name][0]}, {_TITLES[name][1]}", "paper"))]]
@@ -66,31 +66,31 @@ def cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def _labels(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Constraint and group of each row; its hand and method, where there are several."""
+    """Labels of the rows: constraint and group, with hand and method if there are several."""
     several = len({(row["hand"], row["method"]) for row in rows}) > 1
     keys = ("constraint", "group", "hand", "method") if several else ("constraint", "group")
     return [", ".join(row[key] for key in keys if row[key]) for row in rows]
 
 
 def _percent(rate: float | None) -> str:
-    """Empty where there is no rate."""
+    """Formats a rate in per cent; empty if there is none."""
     return "" if rate is None else f"{100 * rate:.1f}"
 
 
 def _figure(value: float | None) -> str:
-    """Three digits; empty where there is no value."""
+    """Formats a value with three digits; empty if there is none."""
     return "" if value is None else f"{value:.3f}"
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Any:
-    """The figure of `cells`."""
+    """Draws the figure of `cells`."""
     text = cells(rows)
     widths = [
         max(max(len(word) for word in cell.split("\n")) for cell in column)
         for column in zip(*_wrapped(text), strict=True)
     ]
     total = sum(widths) + 2 * len(widths)
-    figure = new_figure(0.085 * total + 0.3, 0.32 * len(text) + 1.0, "Evaluation beside the paper")
+    figure = new_figure(0.085 * total + 0.3, 0.32 * len(text) + 1.0, "Evaluation and paper")
     axes = figure.subplots()
     axes.set_axis_off()
     edges = np.cumsum([0, *(width + 2 for width in widths)]) / total
@@ -108,12 +108,12 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Any:
 
 
 def _wrapped(text: Sequence[Sequence[str]]) -> list[list[str]]:
-    """The header's words one below the other after their comma."""
+    """Breaks the header's words after their comma."""
     return [[word.replace(", ", ",\n", 1) for word in text[0]], *map(list, text[1:])]
 
 
 def _success(rows: Sequence[Mapping[str, Any]]) -> Any:
-    """Success of each row with its interval, beside the paper's."""
+    """Draws the success of each row with its interval, and that of the paper."""
     figure = new_figure(7.2, 0.9 + 0.36 * len(rows), "Success, with 95 % intervals")
     axes = figure.subplots()
     y = np.arange(len(rows))[::-1]
@@ -131,7 +131,7 @@ def _success(rows: Sequence[Mapping[str, Any]]) -> Any:
 
 
 def _errors(rows: Sequence[Mapping[str, Any]]) -> Any:
-    """Cumulative distributions of the errors, a panel each."""
+    """Draws cumulative distributions of the errors, one panel each."""
     shown = [name for name in _TITLES if any(name in row.get("quantiles", {}) for row in rows)]
     columns = min(_COLUMNS, len(shown))
     lines = -(-len(shown) // columns)

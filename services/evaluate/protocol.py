@@ -1,4 +1,4 @@
-"""The task of an evaluation: which of a policy's settings count in it, and what its objects are called."""
+"""Task of an evaluation: the settings of a policy that apply, and the label of its objects."""
 
 import dataclasses
 import pathlib
@@ -10,9 +10,9 @@ from congrasp.common.objects.pool import object_scale
 from congrasp.common.policy.bundle import PolicyBundle
 
 HOLD_SECONDS = 2.0
-"""How long a grasp should last without the table, beyond the paper's quarter of a second."""
+"""Required hold of a grasp without the table, beyond the paper's quarter of a second."""
 NOMINAL_FRICTION = CONTACT.friction[0]
-"""Sliding friction between hand and object, of evaluations that name no other."""
+"""Default sliding friction between hand and object in evaluations."""
 
 
 def two_seconds(task: TaskConfig) -> int:
@@ -21,10 +21,10 @@ def two_seconds(task: TaskConfig) -> int:
 
 
 def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) -> TaskConfig:
-    """The task with `hold` control steps without the table, objects of their own mass and of one sliding friction,
-    nominal gains, and a perfect tracker.
+    """Returns the task with `hold` steps without the table, unscaled masses, one friction and no disturbances.
 
-    So rates compare between policies, whatever ranges they were trained with.
+    Servo gains are nominal, and the tracker is perfect. Rates are therefore comparable between policies trained with
+    different ranges.
     """
     return dataclasses.replace(
         task,

@@ -1,7 +1,7 @@
-"""Reference poses and trajectories that no policy under test has made (paper, section Hand Morphology).
+"""Reference poses and trajectories independent of the policy under test (paper, section Hand Morphology).
 
-A policy that never had poses or trajectories grasps every object under headings, on the whole surface and on the
-graspable region; final states of its successful episodes are the references, and approach paths to them the
+A policy trained without poses and trajectories grasps every object under headings, on the whole surface and on the
+graspable region. Final states of its successful episodes are the references, and approach paths to them the
 trajectories. The last fifth of each object's references is held out.
 """
 
@@ -36,35 +36,35 @@ from congrasp.services.evaluate.plan import RowPlan, batches
 from congrasp.services.evaluate.protocol import protocol
 
 HELD_OUT = POSES // 5
-"""References of an object and region that tables are made with; the others are for training."""
+"""References of an object and region used in tables; the others are for training."""
 _ATTEMPTS = 3 * POSES
-"""Episodes of an object and region after which the grasps that there are must do."""
+"""Most episodes of an object and region; the grasps found by then are used."""
 _SPARE = 1.25
-"""Episodes for each reference that is still missing."""
+"""Episodes for each missing reference."""
 _SEED = 0
 _MOST_FILES = 256
-"""Sets of references that are kept; that of 64 objects has some 3 MB."""
+"""Most sets of references in the cache; that of 64 objects takes about 3 MB."""
 
 
 class References(NamedTuple):
-    """A constraint bank with references, and where they come from."""
+    """A constraint bank with references, and their source."""
 
     bank: ConstraintBank
     grasps: np.ndarray
-    """(N, V) int: references of each object and region that are the reference policy's grasps; where there is none,
-    they are poses that close the hand around the object."""
+    """(N, V) int: references of each object and region that are grasps of the reference policy; if there are none,
+    poses that close the hand around the object are used."""
 
 
 def reference_policy(bundle: PolicyBundle) -> tuple[PolicyBundle, str]:
-    """The reference policy of a policy's hand, and what to call it.
+    """Returns the reference policy of a policy's hand, and its description.
 
-    It comes with the package for the hands of its pretrained policies; for any other hand it is the policy itself,
-    which is asked for headings and affordances alone.
+    The package has one for the hands of its pretrained policies; for any other hand it is the policy itself, under
+    headings and affordances only.
     """
     hand = get_hand(bundle.spec.hand)
     if hand.reference == hand.name and (file := reference_file(hand.name)):
         return bundles.load(file), f"the reference policy of the {hand.name} hand"
-    return bundle, "the policy itself, asked for headings and affordances"
+    return bundle, "the policy itself, under headings and affordances"
 
 
 def make(
@@ -77,16 +77,16 @@ def make(
     threads: int,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> References:
-    """The bank with references of a reference policy; kept on disk, and found there by whoever asks again.
+    """Returns the bank with references of a reference policy, cached on disk.
 
     Args:
       policy: the reference policy.
-      task: geometry of the approach, and which waypoints trajectories have.
-      objects: N objects, in the hand's size.
-      bank: of these objects (`build_bank`); its own references stand in where the policy makes none.
-      physics: engine; not `auto`.
+      task: the task, for the geometry of the approach and the waypoints of trajectories.
+      objects: N objects, scaled for the hand.
+      bank: bank of these objects (`build_bank`), with references for where the policy finds none.
+      physics: engine, except `auto`.
       threads: threads of the `native` engine.
-      progress: is told how many references there are, and how many at most.
+      progress: called with the number of references found, and their greatest number.
     """
     kept = cache_folder("references") / f"{_key(policy, task, objects, physics)}.safetensors"
     if found := _read(kept, bank):
@@ -99,7 +99,7 @@ def make(
 
 
 def held_out(bank: ConstraintBank) -> ConstraintBank:
-    """The bank with the references of tables alone."""
+    """Returns the bank with only the references of tables."""
     table = np.arange(bank.pose_valid.shape[-1]) >= bank.pose_valid.shape[-1] - HELD_OUT
     return bank._replace(pose_valid=jnp.asarray(bank.pose_valid) & table)
 
@@ -116,7 +116,7 @@ def _grasp(
     threads: int,
     progress: Callable[[int, int], None],
 ) -> list[list[list[Poses]]]:
-    """At most `POSES` grasps of each object (N) and region (V)."""
+    """Returns at most `POSES` grasps of each object (N) and region (V)."""
     own = protocol(policy.task, policy.task.hold_steps)
     hand = get_hand(policy.spec.hand)
     found: list[list[list[Poses]]] = [[[] for _ in range(2)] for _ in objects]
@@ -153,10 +153,10 @@ def _grasp(
 def _filled(
     policy: PolicyBundle, task: TaskConfig, bank: ConstraintBank, grasps: list[list[list[Poses]]]
 ) -> References:
-    """The bank with these grasps and trajectories to them, arranged so that tables and training share none.
+    """Returns the bank with these grasps and trajectories to them, without overlap between tables and training.
 
-    A grasp counts if the table leaves room for it in some resting pose. Where there are fewer than there are places, a
-    fifth of them (at least one) is repeated in the places of tables, and the others are in those for training.
+    A grasp counts if it clears the table in some resting pose. If there are too few, a fifth of them (at least one) is
+    repeated for tables, and the others for training.
     """
     hand = get_hand(policy.spec.hand)
     arrays = {name: np.array(getattr(bank, name)) for name in _ARRAYS}
@@ -187,7 +187,7 @@ def _filled(
 
 
 def _arranged(count: int) -> np.ndarray:
-    """(POSES,) which of `count` references is where; those of tables are the last ones."""
+    """Indices (POSES,) into `count` references; those of tables come last."""
     tables = max(1, round(count * HELD_OUT / POSES))
     training = np.arange(max(count - tables, 1))
     return np.concatenate(
@@ -196,7 +196,7 @@ def _arranged(count: int) -> np.ndarray:
 
 
 def _key(policy: PolicyBundle, task: TaskConfig, objects: Sequence[GraspObject], physics: str) -> str:
-    """What references depend on, as a file's name."""
+    """File name from everything that references depend on."""
     made_by = bundles.content_hash(encode(policy.to_message()))
     digests = [store.digest(obj) for obj in objects]
     geometry = [task.trajectory_points, task.surface_points, task.back_off, task.headings]
@@ -205,7 +205,7 @@ def _key(policy: PolicyBundle, task: TaskConfig, objects: Sequence[GraspObject],
 
 
 def _read(path: pathlib.Path, bank: ConstraintBank) -> References | None:
-    """Kept references of the bank's objects, if they are there and whole."""
+    """Reads cached references of the bank's objects; returns None if they are missing or damaged."""
     if not (message := read_kept(path)):
         return None
     arrays = message.arrays

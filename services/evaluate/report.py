@@ -1,4 +1,4 @@
-"""A policy's report and model card: one HTML file with tables, pictures, curves and how each was made."""
+"""Report and model card of a policy: one HTML file with tables, pictures, curves and the commands that made them."""
 
 import base64
 import collections
@@ -20,7 +20,7 @@ from congrasp.services.viz.plots import draw, encoded, figures
 
 _REPORT = pathlib.Path(__file__).with_suffix(".html")
 _FEW = 100
-"""Episodes of a row below which its figures are a first look."""
+"""Number of episodes of a row below which its figures are preliminary."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class Commands:
-    """Command lines that make the parts of a report again."""
+    """Command lines that reproduce the parts of a report."""
 
     table: str
     pictures: str
@@ -43,10 +43,10 @@ class Commands:
 
 @dataclasses.dataclass(frozen=True)
 class HandCheck:
-    """What a report says of the self-check of its policy's hand."""
+    """Self-check of the policy's hand in a report."""
 
     findings: Sequence[tuple[str, str, str, str]]
-    """Check, verdict, what was measured, and the remedy of each line."""
+    """Check, verdict, measurement and remedy of each line."""
     sheet: bytes
     """PNG of the grips and joints."""
 
@@ -63,22 +63,22 @@ def write_report(
     check: HandCheck | None = None,
     motion: Mapping[str, Any] | None = None,
 ) -> None:
-    """Writes the report, whole or not at all.
+    """Writes the report atomically.
 
     Args:
-      out: the HTML file; it needs nothing beside it.
-      policy: what it is about.
-      name: of the policy's file.
-      rows: the evaluation.
+      out: self-contained HTML file.
+      policy: policy of the report.
+      name: name of the policy's file.
+      rows: rows of the evaluation.
       conditions: a sentence on objects, engine and seed of the evaluation.
-      sheets: episodes of each row.
-      curves: of the training, where it was recorded.
-      commands: that make its parts again.
-      check: the self-check of the hand, where it was made.
-      motion: a grasp to turn around (`services.evaluate.turntable`).
+      sheets: pictures of episodes of each row.
+      curves: curves of the training, if it was recorded.
+      commands: commands that reproduce its parts.
+      check: self-check of the hand, if it was run.
+      motion: an interactive grasp (`services.evaluate.turntable`).
 
     Raises:
-      CongraspError: jinja2 is absent, or the file cannot be written.
+      CongraspError: jinja2 is not installed, or the file cannot be written.
     """
     errors = [name for names in ERRORS.values() for name in names.values() if _measured(name, rows)]
     text = template().render(
@@ -104,7 +104,7 @@ def write_report(
 
 @functools.cache
 def template(path: pathlib.Path = _REPORT) -> Any:
-    """A page that reports fill, which may extend `base.html`; a CongraspError if jinja2 is absent."""
+    """Returns a page template, which may extend `base.html`; raises a CongraspError if jinja2 is not installed."""
     try:
         import jinja2
     except ImportError:
@@ -115,7 +115,7 @@ def template(path: pathlib.Path = _REPORT) -> Any:
 
 
 def curves_of(run_dir: pathlib.Path) -> Iterator[Picture]:
-    """Figures of a run's recordings, if it has any."""
+    """Yields the figures of a run's recordings, if it has any."""
     if any(run_dir.rglob("*.mcap")):
         runs = {run_dir.name: read_metrics(run_dir)}
         for title, panels in figures(runs).values():
@@ -123,41 +123,41 @@ def curves_of(run_dir: pathlib.Path) -> Iterator[Picture]:
 
 
 def count_causes(causes: Sequence[str]) -> str:
-    """Such as "2 held, 1 slipped 0.82 s after the table was removed"."""
+    """Counts causes, such as "2 held, 1 slipped 0.82 s after the table was removed"."""
     return ", ".join(f"{count} {cause}" for cause, count in collections.Counter(causes).items())
 
 
 def _measured(error: str, rows: Sequence[Row]) -> bool:
-    """Whether one of the rows has this error."""
+    """True if one of the rows has this error."""
     return any(row.errors.get(error) is not None for row in rows)
 
 
 def _warning(rows: Sequence[Row]) -> str:
-    """That rows have too few episodes to be quoted; empty where they have enough."""
+    """Warning that rows have too few episodes to be quoted; empty if they have enough."""
     fewest = min((row.episodes for row in rows), default=_FEW)
     if fewest >= _FEW:
         return ""
     width = max(row.success_high - row.success_low for row in rows)
     return (
-        f"First look: rows of {fewest} episodes, fewer than {_FEW}, with intervals of {100 * width:.0f} points. "
-        "Do not quote these figures or compare policies by them; --episodes 200 makes better ones."
+        f"Preliminary: rows of {fewest} episodes, fewer than {_FEW}, with intervals of {100 * width:.0f} points. "
+        "Do not quote these figures or compare policies by them. Pass --episodes 200 for better ones."
     )
 
 
 def _summary(rows: Sequence[Row]) -> str:
-    """How many rows are better and worse than the paper's."""
+    """Numbers of rows that are better and worse than the paper's."""
     compared = [row for row in rows if row.paper]
     above = sum(row.success >= row.paper.success for row in compared if row.paper)
     clear = collections.Counter(_verdict(row) for row in compared)
     return (
-        f"{sum(row.episodes for row in rows)} episodes in simulation. Success is at or above the paper's in {above} of "
-        f"the {len(compared)} rows that it has; the 95 % interval is above it in {clear['better']} and below it in "
+        f"{sum(row.episodes for row in rows)} episodes in simulation. Success is at or above the paper's in "
+        f"{above} of its {len(compared)} rows; the 95 % interval is above it in {clear['better']} and below it in "
         f"{clear['worse']}."
     )
 
 
 def _compared(row: Row, errors: Sequence[str]) -> Mapping[str, Any]:
-    """A row for the template: its rates, the paper's success, and pairs of errors, its own and the paper's."""
+    """Row for the template: its rates, the paper's success, and pairs of our and the paper's errors."""
     name, episodes, objects, success, held, *_ = rate_cells(row)
     paper = row.paper.errors if row.paper else {}
     pairs = [(scaled(error, row.errors.get(error)), scaled(error, paper.get(error))) for error in errors]
@@ -166,14 +166,14 @@ def _compared(row: Row, errors: Sequence[str]) -> Mapping[str, Any]:
 
 
 def _verdict(row: Row) -> str:
-    """better or worse where the whole interval is, else empty."""
+    """ "better" or "worse" if the whole interval is, else empty."""
     if row.paper is None or row.success_low <= row.paper.success <= row.success_high:
         return ""
     return "better" if row.success_low > row.paper.success else "worse"
 
 
 def embedded(picture: Picture) -> Mapping[str, Any]:
-    """A picture for the template."""
+    """Picture for the template."""
     return {"title": picture.title, "caption": picture.caption, "image": base64.b64encode(picture.png).decode()}
 
 

@@ -1,4 +1,4 @@
-"""Evaluates a policy and writes its report: what `congrasp report` and `congrasp hands train` end with."""
+"""Evaluates a policy and writes its report, for `congrasp report` and `congrasp hands train`."""
 
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
@@ -31,11 +31,11 @@ _PICTURED = 4
 
 
 class Reported(NamedTuple):
-    """What a report says."""
+    """Content of a report."""
 
     rows: list[Row]
     left_out: list[CongraspError]
-    """Why rows are missing."""
+    """Reasons for missing rows."""
 
 
 def report_on(
@@ -55,16 +55,16 @@ def report_on(
     """Evaluates a policy by the paper's protocol and writes one HTML file about it.
 
     Args:
-      file: the policy's file.
+      file: file of the policy.
       out: the HTML file.
-      subject: options of `congrasp evaluate` that name the policy.
-      episodes: in each row.
+      subject: options of `congrasp evaluate` that select the policy.
+      episodes: episodes of each row.
       pool: number of procedural objects.
       physics: engine.
-      seed: of constraints and episodes.
-      objects: objects to grasp, as `congrasp evaluate` takes them; held-out procedural ones by default.
-      run_dir: the run whose curves are shown.
-      check: the self-check of its hand.
+      seed: seed of constraints and episodes.
+      objects: objects to grasp, as for `congrasp evaluate`; held-out procedural ones by default.
+      run_dir: run whose curves are shown.
+      check: self-check of its hand.
       track: shows progress.
 
     Raises:
@@ -74,7 +74,7 @@ def report_on(
     policy, engine = bundles.load(file), resolve_physics(physics)
     curves = list(curves_of(run_dir)) if run_dir else []
     given = objects_of(objects, track=track) if objects else exam_pool("figures", pool)
-    track("Making constraints", None)
+    track("Generating constraints", None)
     evaluator = Evaluator(
         policy, given, physics=engine, threads=cores(), seed=seed, hold_steps=two_seconds(policy.task)
     )
@@ -102,7 +102,7 @@ def report_on(
 
 
 def _motion(evaluator: Evaluator, names: Sequence[str]) -> Mapping[str, Any] | None:
-    """A success of the first row that has one, to turn around; a failure if none has."""
+    """Returns the interactive view of a success of the first row that has one, or else of a failure."""
     for successes, failures in ((1, 0), (0, 1)):
         for name in names:
             for episode in evaluator.examples(name, successes, failures):

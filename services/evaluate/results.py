@@ -1,4 +1,4 @@
-"""Figures of record: the files of `docs/results`, and the tables that pages show of them.
+"""Published figures: the files of `docs/results`, and the tables of them in pages.
 
 `congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m congrasp.services.evaluate.results` writes
 each table between `<!-- results NAME KIND -->` and `<!-- end of results -->` in the README and in `docs`. KIND is one
@@ -39,16 +39,16 @@ class Results:
 
     rows: Sequence[Row]
     about: Mapping[str, Any]
-    """What else `congrasp evaluate --json` wrote."""
+    """Further content of the file from `congrasp evaluate --json`."""
 
     @property
     def policies(self) -> dict[str, str]:
-        """SHA-256 of each policy by its file's name."""
+        """SHA-256 of each policy by file name."""
         return {policy["file"]: policy["sha256"] for policy in self.about["policies"]}
 
 
 def provenance() -> dict[str, Any]:
-    """Version of the package, the command line and the machine of an evaluation that runs now."""
+    """Version of the package, command line and machine of the current evaluation."""
     device = jax.local_devices()[0]
     accelerator = [] if device.platform == "cpu" else [device.device_kind]
     return {
@@ -59,12 +59,12 @@ def provenance() -> dict[str, Any]:
 
 
 def read_results(file: pathlib.Path) -> Results:
-    """The rows of a file and how they were made.
+    """Reads the rows of a file and their provenance.
 
     Raises:
       CongraspError: the file cannot be read, or another version of the project wrote it.
     """
-    remedy = "Run the command again that wrote it."
+    remedy = "Run the command that wrote it again."
     try:
         about = read_json(file, _LARGEST)
         rows = [Row.from_json(row) for row in about.pop("rows")]
@@ -78,12 +78,12 @@ def read_results(file: pathlib.Path) -> Results:
 
 
 def recorded(root: pathlib.Path = ROOT) -> dict[str, Results]:
-    """All files of results by name."""
+    """Reads all files of results, by name."""
     return {file.stem: read_results(file) for file in sorted((root / FOLDER).glob("*.json"))}
 
 
 def summary(results: Results) -> list[str]:
-    """Success, held and clean beside the paper's success."""
+    """Success, held and clean, with the paper's success."""
     head = ("constraint", "success", "held for 2 s", "held, and clean", "success, held of all objects", "paper")
     return _table(
         head,
@@ -102,7 +102,7 @@ def summary(results: Results) -> list[str]:
 
 
 def rates(results: Results) -> list[str]:
-    """Rates with intervals and errors, and the paper's."""
+    """Rates with intervals and errors, and those of the paper."""
     head = ("constraint", "episodes (independent)", "objects", "success (95 %)", "held 2 s (95 %)", "of all objects")
     rows = []
     for row in results.rows:
@@ -112,7 +112,7 @@ def rates(results: Results) -> list[str]:
 
 
 def plausibility(results: Results) -> list[str]:
-    """Penetrations (mean, 95th percentile), peaks of the wrist, and what grasps survive."""
+    """Penetrations (mean, 95th percentile), peaks of the wrist, and survival of grasps."""
     head = ("constraint", "in itself, mm", "in the table", "in the object", "wrist, m/s", "m/s²", "clean", "lifted")
     return _table((*head, "pushed by half the weight", "and by 1 N"), map(plausibility_cells, results.rows))
 
@@ -143,21 +143,21 @@ def headings(results: Results) -> list[str]:
 KINDS: dict[str, Callable[[Results], list[str]]] = {
     function.__name__: function for function in (summary, rates, plausibility, conditions, headings)
 }
-"""What a page may show of a file of results, as lines of Markdown."""
+"""Tables of a file of results available to pages, as lines of Markdown."""
 
 
 def filled(page: str, results: Mapping[str, Results], name: str = "page") -> str:
-    """A page with its tables written anew from results.
+    """Returns a page with its tables regenerated from results.
 
     Raises:
-      CongraspError: it shows a file or a kind of table that does not exist.
+      CongraspError: it names a file or a kind of table that does not exist.
     """
 
     def block(found: re.Match[str]) -> str:
-        """One table between its markers."""
+        """Returns one table between its markers."""
         if found[2] not in results or found[3] not in KINDS:
             raise CongraspError(
-                f"{name} shows '{found[2]} {found[3]}', which does not exist.",
+                f"{name} names '{found[2]} {found[3]}', which does not exist.",
                 f"Files: {', '.join(results)}; tables: {', '.join(KINDS)}.",
             )
         lines = "\n".join(KINDS[found[3]](results[found[2]]))
@@ -167,7 +167,7 @@ def filled(page: str, results: Mapping[str, Results], name: str = "page") -> str
 
 
 def pages(root: pathlib.Path = ROOT) -> Iterator[tuple[pathlib.Path, str]]:
-    """Every page whose tables differ from the results, and its text as it should be."""
+    """Yields every page whose tables differ from the results, and its corrected text."""
     results = recorded(root)
     for path in (root / "README.md", *sorted((root / "docs").rglob("*.md"))):
         text = path.read_text()
@@ -176,7 +176,7 @@ def pages(root: pathlib.Path = ROOT) -> Iterator[tuple[pathlib.Path, str]]:
 
 
 def _table(head: Sequence[str], rows: Iterator[tuple[str, ...]] | Sequence[tuple[str, ...]]) -> list[str]:
-    """A Markdown table."""
+    """Returns a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines]
 

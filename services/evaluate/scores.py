@@ -1,4 +1,4 @@
-"""Rows of an evaluation: rates with intervals, errors, forces, and the paper's figures to compare with."""
+"""Rows of an evaluation: rates with intervals, errors, forces, and the paper's figures for comparison."""
 
 import dataclasses
 import json
@@ -22,13 +22,13 @@ TABLES = {
     "composed": ("pose+trajectory", f"pose+trajectory{ALIGNED}", "trajectory+affordance"),
     "cross": ("heading", "pose", "trajectory", "pose+trajectory"),
 }
-"""Rows of the paper's tables, by the constraints that are active; the aligned pairs are none of the paper's."""
+"""Rows of the paper's tables, by active constraints; the aligned pairs are not in the paper."""
 ERRORS = {c.name: {spec.name: spec.column or spec.name for spec in c.errors} for c in CONSTRAINTS}
-"""Of each constraint: names of its errors among the metrics of episodes and in the rows."""
+"""Names of the errors of each constraint, in the metrics of episodes and in rows."""
 UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
 """Units of the errors, by their names in rows."""
 PROBED_EPISODES = 2000
-"""Forces are read from this many episodes of a row at most."""
+"""Most episodes of a row from which forces are read."""
 _FORCES = ("link_force", "force_sum", "torque_share")
 _PRESSED = ("force_peak_n", "force_mean_n")
 _HUNDREDTHS = np.linspace(0, 1, 101)
@@ -37,30 +37,30 @@ _SIZES = ("small", "medium", "large")
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """Episodes that count for one row."""
+    """Episodes of one row."""
 
     values: dict[str, np.ndarray]
-    """Metrics (E,), by the names in `actors.env.metric_names`; `mass_kg`; and `identity` and `reference`, equal for
-    equal episodes and for those of one object and reference (`services.evaluate.episodes`)."""
+    """Metrics (E,), by the names in `actors.env.metric_names`; `mass_kg`; `identity`, equal for equal episodes; and
+    `reference`, equal for the same object and reference (`services.evaluate.episodes`)."""
     link_force: np.ndarray
-    """(E', W, L) net contact force of each link in the paper's window, N; of the first E' of the episodes."""
+    """(E', W, L) net contact force of each link in the paper's window, N, for the first E' episodes."""
     torque: np.ndarray
     """(E', W, F) finger torques in that window, as shares of their limits."""
 
     def where(self, chosen: np.ndarray) -> "Sample":
-        """The episodes that `chosen` (E,) selects."""
+        """Selects episodes by `chosen` (E,)."""
         kept = chosen[: len(self.link_force)]
         values = {name: column[chosen] for name, column in self.values.items()}
         return Sample(values, self.link_force[kept], self.torque[kept])
 
     def first(self, count: int) -> "Sample":
-        """The first `count` episodes."""
+        """Returns the first `count` episodes."""
         values = {name: column[:count] for name, column in self.values.items()}
         return Sample(values, self.link_force[:count], self.torque[:count])
 
 
 def joined(samples: Sequence[Sample]) -> Sample:
-    """All episodes of several samples, with forces of the first `PROBED_EPISODES` at most."""
+    """Joins the episodes of several samples, with forces of at most the first `PROBED_EPISODES`."""
     probed: list[Sample] = []
     for sample in samples:
         probed.append(sample)
@@ -75,67 +75,70 @@ def joined(samples: Sequence[Sample]) -> Sample:
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One row: rates with 95 % intervals (`services.evaluate.intervals.clustered`: objects are clusters, or
-    captured sequences), errors and forces averaged over successful episodes."""
+    """One row of a table.
+
+    Rates have 95 % intervals (`services.evaluate.intervals.clustered`; clusters are objects or captured sequences).
+    Errors and forces are averaged over successful episodes.
+    """
 
     constraint: str
     hand: str
     method: str
     group: str
-    """Which objects or pairs: empty for all of them."""
+    """Group of objects or pairs; empty for all of them."""
     episodes: int
     covered: int
-    """Objects that allow the row's constraints."""
+    """Number of objects that allow the row's constraints."""
     pool: int
-    """Requested objects."""
+    """Number of requested objects."""
     distinct: int
-    """Different episodes: those that begin alike under the same goal are one."""
+    """Number of different episodes: those with the same initial conditions and goal count once."""
     independent: float
-    """Independent episodes that the interval of the success rate is of."""
+    """Number of independent episodes behind the interval of the success rate."""
     mass_kg: float
-    """Mean mass of the episodes' objects."""
+    """Mean mass of the episodes' objects, kg."""
     success: float
     success_low: float
     success_high: float
     success_all: float
-    """Success rate over all requested objects, where every uncovered object fails."""
+    """Success rate over all requested objects, counting every uncovered object as a failure."""
     held_2s: float | None
-    """Rate of success that lasts for two seconds without the table; None where episodes ended before."""
+    """Rate of success that lasts for two seconds without the table; None if episodes ended earlier."""
     held_2s_low: float | None
     held_2s_high: float | None
     held_all: float | None
-    """The same as `success_all`, for two seconds."""
+    """Like `success_all`, for two seconds."""
     errors: dict[str, float | None]
     forces: dict[str, float | None]
     episode_return: float
     links_at_removal: float
     diverged: float
-    """Rate of episodes in which the physics failed."""
+    """Rate of episodes with diverged physics."""
     paper: PaperRow | None
     plausibility: dict[str, float | None] = dataclasses.field(default_factory=dict)
-    """Over all episodes: means of the measures, `_p95` of the deepest penetrations, and rates (`actors.stress`)."""
+    """Means of the measures over all episodes, `_p95` of the deepest penetrations, and rates (`actors.stress`)."""
     margins: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Of each error with two successful episodes: half of the 95 % interval of its mean, 1.96 standard errors."""
+    """Half of the 95 % interval of each error's mean (two successful episodes at least): 1.96 standard errors."""
     quantiles: dict[str, list[float]] = dataclasses.field(default_factory=dict)
-    """Of each error in successful episodes: least, every further hundredth, and greatest; 101 numbers."""
+    """Quantiles of each error in successful episodes: minimum, every hundredth, and maximum; 101 numbers."""
     objects: list[dict[str, Any]] = dataclasses.field(default_factory=list)
-    """Of each object with episodes: its name, their number, and its rates."""
+    """Name, number of episodes and rates of each object with episodes."""
 
     def to_json(self) -> dict[str, Any]:
-        """The row as it is written to `--json`."""
+        """Returns the row as written to `--json`."""
         row = dataclasses.asdict(self)
         errors, forces, total = row.pop("errors"), row.pop("forces"), row.pop("episode_return")
         return {**row, **errors, **forces, **row.pop("plausibility"), "return": total}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> "Row":
-        """The row that `to_json` made this of.
+        """Returns the row from the result of `to_json`.
 
         Raises:
-          LookupError, TypeError: it did not.
+          LookupError, TypeError: `row` has another format.
         """
         own = {field.name: row[field.name] for field in dataclasses.fields(cls) if field.name in row}
-        # Constraints that a file's project did not have are absent from it.
+        # Older files lack constraints that were added later.
         errors = {name: row.get(name) for names in ERRORS.values() for name in names.values()}
         forces = {f"{name}_{of}": row[f"{name}_{of}"] for name in _FORCES for of in ("mean", "p95")}
         forces |= {name: row[name] for name in _PRESSED}
@@ -146,7 +149,7 @@ class Row:
 
 
 def known_rows(tables: Iterable[str], task: TaskConfig) -> list[str]:
-    """Rows of some of `TABLES` whose constraints the task's policy knows."""
+    """Names of the rows of some of `TABLES` whose constraints the task's policy supports."""
     rows = dict.fromkeys(row for table in tables for row in TABLES[table])
     return [row for row in rows if set(row.removesuffix(ALIGNED).split("+")) <= set(task.constraints)]
 
@@ -164,19 +167,19 @@ def summarise(
     method: str = "ours",
     paper: str = "",
 ) -> Row:
-    """A row from its episodes.
+    """Computes a row from its episodes.
 
     Args:
-      name: of the row, see `services.evaluate.plan.plan_row`.
+      name: name of the row, see `services.evaluate.plan.plan_row`.
       hand: name of the hand.
-      sample: its episodes.
-      held_2s: whether the episodes lasted for two seconds without the table.
-      objects: names of the pool's objects, those without an episode too.
-      pool: number of the requested objects, where the row is of some of these; otherwise all of them.
-      by_reference: whether references, such as captured sequences, are the clusters of the intervals, not objects.
-      group: which objects these are, such as "small (below 8 cm)".
-      method: `common.task.methods`.
-      paper: which of the paper's tables it stands beside, see `services.evaluate.paper`.
+      sample: episodes of the row.
+      held_2s: True if the episodes lasted for two seconds without the table.
+      objects: names of the pool's objects, including those without an episode.
+      pool: number of requested objects, if the row covers only some of them; all by default.
+      by_reference: uses references, such as captured sequences, as clusters of the intervals instead of objects.
+      group: group of objects, such as "small (below 8 cm)".
+      method: method of `common.task.methods`.
+      paper: table of the paper for comparison, see `services.evaluate.paper`.
     """
     constraint = name.removesuffix(ALIGNED)
     group = group or ("aligned pairs" if name.endswith(ALIGNED) else "")
@@ -216,12 +219,12 @@ def summarise(
 def _rates(
     names: tuple[str, str], outcomes: np.ndarray, clusters: np.ndarray, objects: np.ndarray, pool: int
 ) -> dict[str, Any]:
-    """Columns of a rate: its mean over episodes with the interval, and over `pool` objects, of which some have none.
+    """Columns of a rate: its mean over episodes with the interval, and over `pool` objects, some without episodes.
 
     Args:
-      names: of the two means.
+      names: names of the two means.
       outcomes: (E,) bool.
-      clusters: (E,) see `services.evaluate.intervals`.
+      clusters: (E,) labels of clusters, see `services.evaluate.intervals`.
       objects: (E,) index of each episode's object.
       pool: number of objects; those without episodes have a rate of 0.
     """
@@ -233,7 +236,7 @@ def _rates(
 
 
 def _by_object(values: dict[str, np.ndarray], objects: Sequence[str], held_2s: bool) -> list[dict[str, Any]]:
-    """Rates of each object that has episodes, in the pool's order."""
+    """Rates of each object with episodes, in the pool's order."""
     index = values["object_index"].astype(int)
     counts = np.bincount(index, minlength=len(objects))
     columns = {"success": values["success"] > 0}
@@ -250,7 +253,7 @@ def _by_object(values: dict[str, np.ndarray], objects: Sequence[str], held_2s: b
 
 
 def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, float | None]:
-    """Measures of a row's episodes; None where none was measured, and without the two seconds that rates speak of."""
+    """Means of the plausibility measures; None if not measured, or if they need the missing two-second hold."""
     row: dict[str, float | None] = {}
     for name in ASSESSED:
         column = values.get(name, np.zeros(0))
@@ -263,7 +266,7 @@ def _plausibility(values: dict[str, np.ndarray], held_2s: bool) -> dict[str, flo
 
 
 def _forces(sample: Sample) -> dict[str, float | None]:
-    """Mean and 95th percentile: force of a touching link, sum over the links, and finger torque over its limit.
+    """Mean and 95th percentile of: force of a touching link, sum over the links, and finger torque over its limit.
 
     `force_peak_n` is the greatest force of a link in an episode, `force_mean_n` that of the strongest link in a step.
     Both are means over the episodes.
@@ -281,10 +284,10 @@ def _forces(sample: Sample) -> dict[str, float | None]:
 
 
 def terciles(values: np.ndarray, names: Sequence[str], unit: str, factor: float) -> tuple[np.ndarray, list[str]]:
-    """Objects in three groups of equal number, by a property (N,).
+    """Divides objects into three groups of equal size by a property (N,).
 
     Returns:
-      (N,) group of each object, 0 to 2, and the groups' labels with their bounds.
+      Groups (N,) of the objects, 0 to 2, and labels of the groups with their bounds.
     """
     low, high = (float(x) for x in np.quantile(values, [1 / 3, 2 / 3]))
     labels = [
@@ -296,10 +299,10 @@ def terciles(values: np.ndarray, names: Sequence[str], unit: str, factor: float)
 
 
 def object_groups(sizes: np.ndarray, masses: np.ndarray, families: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Label and members (N,) bool of the groups of objects that the test on unseen geometry reports.
+    """Labels and members (N,) bool of the groups of objects in the test on unseen geometry.
 
-    The paper stratifies by size without giving bounds: here they are terciles of the largest side (m), then terciles
-    of the mass (kg), then families.
+    The paper stratifies by size without giving bounds. The groups are terciles of the largest side (m), terciles of the
+    mass (kg), and families.
     """
     groups = []
     for values, names, unit, factor in ((sizes, _SIZES, "cm", 100.0), (masses, ("light", "mid", "heavy"), "g", 1000.0)):
@@ -309,7 +312,7 @@ def object_groups(sizes: np.ndarray, masses: np.ndarray, families: np.ndarray) -
 
 
 def write_json(rows: Sequence[Row], path: pathlib.Path, about: dict[str, Any]) -> None:
-    """Writes `{"rows": [...]}`, a line for each row, together with what is known about the evaluation."""
+    """Writes `{"rows": [...]}`, one line per row, with the metadata of the evaluation."""
     head = json.dumps({**about, "rows": []}, indent=1).removesuffix("]\n}")
     lines = ",\n".join(json.dumps(row.to_json()) for row in rows)
     write_atomically(path, f"{head}\n{lines}\n ]\n}}\n".encode())

@@ -1,7 +1,7 @@
-"""Levels of what a robot's sensors and servos do to a policy: one thing at a time beside a tracker as they are sold.
+"""Levels of sensor and servo errors: one change at a time relative to a typical commercial tracker.
 
-The same episodes are evaluated at every level, under the heading constraint. A policy that sees all of the simulation
-gets the tracker's pose in the place of the true one, and keeps its contact forces and velocities.
+The same episodes are evaluated at every level, under the heading constraint. A policy of the full state gets the
+tracker's pose instead of the true one, and keeps its contact forces and velocities.
 """
 
 import dataclasses
@@ -13,29 +13,29 @@ from congrasp.actors.initial import InitialConditions
 from congrasp.common.config import SensingConfig, TaskConfig
 
 CONSTRAINT = "heading"
-"""The row that is evaluated at every level."""
+"""Row evaluated at every level."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Level:
-    """A tracker, a friction and an error of the gains; by default a tracker of 30 Hz with 5 mm, 3 degrees and 60 ms."""
+    """A tracker, a friction and an error of the gains; by default a tracker with 30 Hz, 5 mm, 3 degrees and 60 ms."""
 
     label: str
-    """What is another than that."""
+    """Difference from the default."""
     position_noise: float = 0.005
-    """m, standard deviation of each coordinate."""
+    """Standard deviation of each coordinate, m."""
     rotation_noise: float = math.radians(3.0)
-    """rad, about each axis."""
+    """Standard deviation about each axis, rad."""
     delay: float = 0.06
     """s."""
     rate: float = 30.0
     """Hz."""
     dropout: float = 0.0
-    """Share of the samples that never arrive."""
+    """Share of lost samples."""
     friction: float | None = None
-    """Sliding friction between hand and object; None: the evaluation's."""
+    """Sliding friction between hand and object; None: that of the evaluation."""
     gains: float = 1.0
-    """Factor of the finger servos' gains."""
+    """Factor on the finger servos' gains."""
 
 
 LEVELS = (
@@ -52,16 +52,16 @@ LEVELS = (
     Level("gains -20 %", gains=0.8),
     Level("gains +20 %", gains=1.2),
 )
-"""Rows of the table; every one but the first is the second with one thing changed."""
+"""Rows of the table; each but the first differs from the second in one setting."""
 
 
 def sensing_task(task: TaskConfig) -> TaskConfig:
-    """The task in which a policy sees what trackers show, with room for the longest delay."""
+    """Returns the task in which a policy observes trackers, with room for the longest delay."""
     return dataclasses.replace(task, sensing=SensingConfig(delay=(0.0, max(level.delay for level in LEVELS))))
 
 
 def at_level(conditions: InitialConditions, level: Level, control_dt: float) -> InitialConditions:
-    """The episodes at a level; errors and losses are drawn alike at all of them.
+    """Returns the episodes at a level; errors and losses use the same random numbers at all levels.
 
     Args:
       conditions: episodes of `sensing_task`.

@@ -1,4 +1,4 @@
-"""One picture of what a policy can do: a grasp under each constraint that it knows."""
+"""Showcase picture of a policy: a grasp under each constraint that it supports."""
 
 import pathlib
 from collections.abc import Callable
@@ -23,12 +23,12 @@ def showcase(
     """Draws a grasp of a held-out object under each constraint, the first success of a few attempts.
 
     Args:
-      policy: of any hand.
+      policy: policy of any hand.
       path: the PNG file to write.
-      progress: called with what is being done.
+      progress: called with the current step.
 
     Returns:
-      Whether the grasp succeeded, by the name of the constraint.
+      Success of the grasp by constraint.
     """
     objects = load_pool(ObjectsConfig(count=_OBJECTS, seed=HELD_OUT_SEED))
     evaluator = Evaluator(policy, objects, threads=cores())

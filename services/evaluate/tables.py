@@ -1,4 +1,4 @@
-"""The rows of an evaluation's tables, for one policy."""
+"""Rows of an evaluation's tables, for one policy."""
 
 import dataclasses
 import pathlib
@@ -25,61 +25,62 @@ from congrasp.services.evaluate.heading_rules import HeadingRules
 from congrasp.services.evaluate.noise import LEVELS
 from congrasp.services.evaluate.paper import CAPTURED_SETS
 from congrasp.services.evaluate.plan import from_references
+from congrasp.services.evaluate.pools import folder_pools, procedural_pools
 from congrasp.services.evaluate.protocol import NOMINAL_FRICTION, two_seconds
 from congrasp.services.evaluate.references import reference_policy
 from congrasp.services.evaluate.scores import TABLES, Row, known_rows
-from congrasp.services.evaluate.unseen import evaluate_objects, folder_pools, procedural_pools
+from congrasp.services.evaluate.unseen import evaluate_objects
 
 MANY = 50_000
-"""Most procedural objects of the table `objects`, where their number is not given."""
-_OTHERS = {"noise", "sensing", "objects", "payload", "peers"}  # tables whose rows are no constraints
+"""Most procedural objects of the table `objects` by default."""
+_OTHERS = {"noise", "sensing", "objects", "payload", "peers"}  # tables whose rows are not constraints
 Track = Callable[[str, int | None], Callable[[int], None]]
-"""(what is done, its total if known) -> what to call with the amount done."""
+"""(label, total if known) -> function to call with the number done."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """How policies are evaluated, and on what."""
+    """Settings of an evaluation."""
 
     episodes: int
-    """Of each row; of the table `objects` in all."""
+    """Episodes of each row; of the table `objects` in total."""
     physics: PhysicsName
-    """Not `auto`."""
+    """Engine, except `auto`."""
     exam: Exam = "figures"
-    """Which procedural objects."""
+    """Set of procedural objects."""
     pool: int = 0
-    """Procedural objects; 0 takes `exam.POOL`, for the table `objects` one an episode, at most `MANY`."""
+    """Number of procedural objects; 0 uses `exam.POOL`, and for the table `objects` one per episode, at most `MANY`."""
     batch: int = 0
-    """Worlds side by side; 0 chooses by the engine."""
+    """Number of parallel worlds; 0 uses the engine's default."""
     seed: int = 0
     friction: float = NOMINAL_FRICTION
     given: Sequence[GraspObject] = ()
-    """Objects of rows by constraint; procedural ones if there are none."""
+    """Objects of rows by constraint; procedural ones if empty."""
     bank: ConstraintBank | None = None
-    """Their constraints, where those are given too."""
+    """Constraints of the objects, if given."""
     paper: str = "hands"
-    """Which of the paper's tables rows stand beside (`services.evaluate.paper`)."""
+    """Table of the paper for comparison (`services.evaluate.paper`)."""
     folder: pathlib.Path | None = None
-    """Objects of the table `objects`; procedural ones if there is none."""
+    """Objects of the table `objects`; procedural ones if None."""
     keep: pathlib.Path | None = None
-    """Where results of its pools are kept, to resume from."""
+    """Folder for results of its pools, to resume from."""
 
 
 class Found(NamedTuple):
-    """Results for one policy."""
+    """Results of one policy."""
 
     evaluator: Evaluator | None
-    """Of the rows by constraint; None if there are none."""
+    """Evaluator of the rows by constraint; None if there are none."""
     names: list[str]
-    """Rows by constraint that were evaluated."""
+    """Names of the evaluated rows by constraint."""
     left_out: list[CongraspError]
-    """Why others were not."""
+    """Reasons for skipped rows."""
     noisy: list[Row]
     """Rows under noise of references."""
     rows: list[Row]
     """All rows."""
     references: str
-    """Where reference poses and trajectories come from; empty if no row has any."""
+    """Source of reference poses and trajectories; empty if no row has any."""
     heading_rules: HeadingRules | None = None
     """Effect of the rules for headings; None without the table `single` of sampled headings."""
 
@@ -87,14 +88,14 @@ class Found(NamedTuple):
 def evaluate_tables(
     policy: PolicyBundle, tables: Sequence[str], setup: Setup, track: Track, *, keep: bool = False
 ) -> Found:
-    """The rows of some tables.
+    """Evaluates the rows of some tables.
 
     Args:
-      policy: as the method that its task names.
+      policy: policy, evaluated as the method of its task.
       tables: keys of `TABLES`, `objects`, `noise`, `sensing`, `payload`, `peers`, or `all` for all of these.
       setup: objects, engine and numbers.
       track: shows progress.
-      keep: keep episodes for `Evaluator.examples`.
+      keep: keeps episodes for `Evaluator.examples`.
 
     Raises:
       CongraspError: the policy's method has no row in these tables, or no object allows one.
@@ -104,7 +105,7 @@ def evaluate_tables(
     if not takes(method, "heading"):
         wanted -= _OTHERS - {"noise"}
     if not names and not wanted & _OTHERS:
-        raise CongraspError(f"The method '{method}' has no row in these tables.", "Name another --table.")
+        raise CongraspError(f"The method '{method}' has no row in these tables.", "Pass another --table.")
     rows: list[Row] = []
     noisy: list[Row] = []
     left_out: list[CongraspError] = []
@@ -134,7 +135,7 @@ def evaluate_tables(
 def _rows_at_levels(
     evaluator: Evaluator, policy: PolicyBundle, wanted: Set[str], episodes: int, track: Track
 ) -> list[Row]:
-    """Rows of the tables `sensing`, `payload` and `peers`, if they are wanted."""
+    """Evaluates rows of the tables `sensing`, `payload` and `peers`, if requested."""
     rows: list[Row] = []
     if "sensing" in wanted:
         advance = track("Episodes with a robot's sensors", len(sensing.LEVELS) * episodes)
@@ -148,8 +149,8 @@ def _rows_at_levels(
 
 
 def _evaluator(policy: PolicyBundle, setup: Setup, track: Track) -> Evaluator:
-    """An evaluator of given objects, or of an exam's procedural ones."""
-    track("Making constraints", None)
+    """Returns an evaluator of given objects, or of procedural ones of an evaluation set."""
+    track("Generating constraints", None)
     return Evaluator(
         policy,
         setup.given or exam_pool(setup.exam, setup.pool),
@@ -165,20 +166,22 @@ def _evaluator(policy: PolicyBundle, setup: Setup, track: Track) -> Evaluator:
 
 
 def _references(evaluator: Evaluator, track: Track) -> str:
-    """Makes the references, where none were given, and says where they come from."""
+    """Generates references if none were given, and describes their source."""
     advance = track("Reference grasps", None)
     made = evaluator.references(lambda done, of: advance(done))
     if made is None:
-        return "References are those of the constraint sets."
+        return "References come from the constraint sets."
     _, who = reference_policy(evaluator.bundle)
     whole = made.grasps[:, 0]
     closed = [obj.name for obj, count in zip(evaluator.objects, whole, strict=True) if not count]
-    text = f"References: grasps of {who}, {np.median(whole):.0f} an object (median), the last fifth held out."
-    return text + (f" The hand closed around the object where it holds none: {', '.join(closed)}." if closed else "")
+    text = f"References: grasps of {who}, {np.median(whole):.0f} per object (median), the last fifth held out."
+    return text + (
+        f" Without a grasp, the hand closed around the object is used: {', '.join(closed)}." if closed else ""
+    )
 
 
 def _object_rows(policy: PolicyBundle, setup: Setup, track: Track) -> list[Row]:
-    """Rows of the heading on many objects."""
+    """Evaluates rows of the heading on many objects."""
     if setup.folder:
         pools = folder_pools(setup.folder, setup.physics)
     else:
@@ -198,27 +201,27 @@ def _object_rows(policy: PolicyBundle, setup: Setup, track: Track) -> list[Row]:
 
 
 class Captured(NamedTuple):
-    """Objects and the constraint sets that are evaluated on them."""
+    """Objects with their constraint sets."""
 
     objects: list[GraspObject]
     bank: ConstraintBank
     hand: str
-    """For which the sets were made."""
+    """Hand of the sets."""
     paper: str
-    """The paper's table of their data set (`services.evaluate.paper`); empty for none."""
+    """Table of the paper for their data set (`services.evaluate.paper`); empty for none."""
 
 
 def captured(folder: pathlib.Path, split: Split, objects: Sequence[GraspObject]) -> Captured:
-    """The objects that have a constraint set with a heading of the split in a folder, and the sets.
+    """Returns the objects that have a constraint set with a heading of the split in a folder, and the sets.
 
     Raises:
-      CongraspError: none has one, or a set is not for its object.
+      CongraspError: none has one, or a set belongs to another object.
     """
     chosen, sets = load_for(folder, objects, split)
     if not sets:
         raise CongraspError(
             f"{folder} holds no constraint set ({split}) of these objects.",
-            "Name folders that belong together, or take another --split.",
+            "Pass folders that belong together, or another --split.",
         )
     sources = {made.meta.get("source", "") for made in sets}
     paper = CAPTURED_SETS.get(sources.pop(), "") if len(sources) == 1 else ""

@@ -1,7 +1,7 @@
-"""A grasp to turn around in a page: skin, object and table as one skinned mesh, as the script of motion.html reads it.
+"""Interactive grasp for a page: skin, object and table as one skinned mesh, in the format of motion.html.
 
-Hand, object and table move with bones: the hand's links, then the object, then the world. A bone's matrix of a frame
-takes points from where they rest to the world.
+Hand, object and table move with bones: the hand's links, then the object, then the world. The matrix of a bone maps
+resting points to the world frame.
 """
 
 import base64
@@ -24,14 +24,14 @@ FRAME_SECONDS = 0.04
 
 
 def turntable(episode: Message) -> Mapping[str, Any]:
-    """What motion.html needs of an episode.
+    """Returns the data of an episode for motion.html.
 
     Returns:
       `data`, JSON whose arrays are base64 of little-endian numbers: for V points `position` and `normal` (V, 3)
       float32, `colour` (V, 3) uint8 sRGB, `bones` (V, 4) and `weights` (V, 4) uint8 of 255; `faces` (F, 3) uint32; and
       `frames` (T, B, 12) float32, the upper three rows of each bone's matrix. Then `seconds` between two frames, the
-      frame of the table's `removal`, the `table`'s first and last corner in `faces`, and the `centre` (3,)
-      and `radius`, m, of the grasp.
+      frame of the table's `removal`, the `table`'s first and last corner in `faces`, and the `centre` (3,) and
+      `radius`, m, of the grasp.
     """
     arrays, hand = episode.arrays, known_hand(episode.meta["hand"])
     every = max(1, round(FRAME_SECONDS / float(episode.meta["control_dt"])))
@@ -72,7 +72,7 @@ def turntable(episode: Message) -> Mapping[str, Any]:
 
 
 def _frames(episode: Message, steps: np.ndarray) -> np.ndarray:
-    """(T, B, 3, 4) matrices of all bones at some steps."""
+    """Matrices (T, B, 3, 4) of all bones at some steps."""
     arrays, skin = episode.arrays, skin_of(known_hand(episode.meta["hand"]))
     places = np.concatenate([arrays["link_position"][steps], arrays["object_position"][steps][:, None]], 1)
     turns = np.concatenate([arrays["link_quaternion"][steps], arrays["object_quaternion"][steps][:, None]], 1)
@@ -84,5 +84,5 @@ def _frames(episode: Message, steps: np.ndarray) -> np.ndarray:
 
 
 def _encoded(array: np.ndarray, kind: str) -> str:
-    """Base64 of an array's numbers."""
+    """Encodes an array's numbers as base64."""
     return base64.b64encode(np.ascontiguousarray(array, np.dtype(kind)).tobytes()).decode()

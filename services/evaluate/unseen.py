@@ -1,105 +1,36 @@
-"""The test on unseen geometry: the heading constraint over as many different objects as there is time for.
+"""Test on unseen geometry: the heading constraint over many different objects.
 
-Objects come in pools of equal size. While the episodes of one are simulated the next is made or imported, with its
-constraints; no program is compiled for it, and only these two are in memory. What stays of a pool is a few numbers an
-episode, which can be kept on disk, so that a stopped evaluation goes on with the pool that it had come to.
+Objects come in pools of equal size (`services.evaluate.pools`). The result of a pool is a few numbers per episode. They
+can be stored on disk, so that a stopped evaluation resumes at its current pool.
 """
 
-import concurrent.futures
 import contextlib
 import dataclasses
 import functools
-import itertools
 import json
-import logging
 import pathlib
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.outline import Outline, outline
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
-from congrasp.common.objects import procedural
-from congrasp.common.objects.distance import DistanceField, distance_field
-from congrasp.common.objects.pool import object_scale, scale_objects
-from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
-from congrasp.common.runtime.parallel import parallel_map
-from congrasp.common.task.sampling.bank import ConstraintBank
-from congrasp.common.task.sampling.build import build_bank, headings_of
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
-from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.evaluator import MEASURED, STRESSED, batch_of, simulate
-from congrasp.services.evaluate.exam import FAMILIES, Exam, first_seed
 from congrasp.services.evaluate.plan import batches, plan_row
+from congrasp.services.evaluate.pools import Pool, Pools, one_ahead, prepared
 from congrasp.services.evaluate.protocol import protocol, two_seconds
 from congrasp.services.evaluate.scores import Row, Sample, joined, object_groups, summarise
 
 _ROW = "heading"
-_MOST = {True: 4096, False: 128}
-"""Objects of a pool, for engines on a device and for others; each has a compiled scene in the latter."""
-_MESHES = 512
-"""Objects of a pool of a folder, whose surfaces may be large."""
-_log = logging.getLogger(__name__)
-_Item = TypeVar("_Item")
-
-
-class Loaded(NamedTuple):
-    """Objects of a pool, and names of those that could not be imported."""
-
-    objects: list[GraspObject]
-    left_out: list[str]
-
-
-class Pools(NamedTuple):
-    """Objects that are made pool by pool."""
-
-    source: str
-    """What they are, as far as results depend on it."""
-    size: int
-    """Objects of a pool; the last pools may have one less."""
-    make: list[Callable[[], Loaded]]
-
-
-def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
-    """At least `count` procedural objects of an exam, in pools of one size."""
-    number, size = _divided(count, _MOST[ENGINES[physics].on_device])
-    seed = first_seed(exam, number * size)
-    families = procedural.family_turns(number * size, seed, FAMILIES)
-
-    def make(start: int) -> Loaded:
-        seeds = range(seed + start, seed + start + size)
-        return Loaded(parallel_map(procedural.generate, seeds, families[start:][:size]), [])
-
-    starts = range(0, number * size, size)
-    return Pools(f"procedural {seed}", size, [functools.partial(make, start) for start in starts])
-
-
-def folder_pools(path: pathlib.Path, physics: PhysicsName) -> Pools:
-    """The objects of a path; meshes are imported when their turn comes, and those that cannot be are left out."""
-    found = objects_at(path)
-    number, size = _divided(len(found), min(_MOST[ENGINES[physics].on_device], _MESHES))
-
-    def make(part: list[ObjectAt]) -> Loaded:
-        left_out: list[str] = []
-
-        def leave_out(one: ObjectAt, error: CongraspError) -> None:
-            _log.warning("%s is left out: %s", one.name, error)
-            left_out.append(one.name)
-
-        return Loaded(load_each(part, on_error=leave_out), left_out)
-
-    parts = [[found[i] for i in part] for part in np.array_split(np.arange(len(found)), number)]
-    names = ",".join(one.name for one in found)
-    return Pools(f"{path} {names}", size, [functools.partial(make, part) for part in parts])
 
 
 def evaluate_objects(
@@ -115,22 +46,22 @@ def evaluate_objects(
     keep: pathlib.Path | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[Row]:
-    """Rows of the heading constraint: all objects, then by size, mass and family.
+    """Evaluates rows of the heading constraint: all objects, then by size, mass and family.
 
     Args:
       bundle: the policy.
-      pools: the objects.
-      episodes: in all, at least; every object has the same number of them.
-      physics: engine; not `auto`.
-      batch: worlds that run side by side; 0 chooses by the engine.
+      pools: pools of objects.
+      episodes: least total number; every object has the same number.
+      physics: engine, except `auto`.
+      batch: number of parallel worlds; 0 uses the engine's default.
       threads: threads of the `native` engine.
       seed: seed of constraints and episodes.
       friction: sliding friction between hand and object.
-      keep: folder for results of pools, from which an evaluation with the same arguments goes on; None keeps none.
-      progress: is told how many episodes there are.
+      keep: folder for results of pools, from which an evaluation with the same arguments resumes; None stores none.
+      progress: called with the number of finished episodes.
 
     Raises:
-      CongraspError: no object is left that the hand can approach.
+      CongraspError: the hand can approach none of the objects.
     """
     hold, hand, number = two_seconds(bundle.task), get_hand(bundle.spec.hand), len(pools.make)
     task = protocol(bundle.task, hold, friction)
@@ -145,7 +76,7 @@ def evaluate_objects(
     with contextlib.ExitStack() as stack:
         running: Episodes | None = None
         measured = pools.size * number <= MEASURED
-        for pool in stack.enter_context(_one_ahead(_prepared(hand, task, pools, seed, todo, measured))):
+        for pool in stack.enter_context(one_ahead(prepared(hand, task, pools, seed, todo, measured))):
             done = sum(result.episodes for result in found.values())
             if pool.bank is None:
                 result = _nothing(pool.left_out)
@@ -164,21 +95,8 @@ def evaluate_objects(
     return _rows([found[n] for n in sorted(found)], hand, task.method)
 
 
-class _Pool(NamedTuple):
-    """A pool that is ready to be simulated."""
-
-    number: int
-    objects: list[GraspObject]
-    """In the hand's size; those from `real` on repeat others, so that all pools have one size."""
-    bank: ConstraintBank | None
-    """None where no object is left."""
-    field: DistanceField | None
-    real: int
-    left_out: list[str]
-
-
 class _Result(NamedTuple):
-    """What is kept of a pool: its episodes, and of each object its name, largest side (m), mass (kg) and family."""
+    """Result of a pool: its episodes, and name, largest side (m), mass (kg) and family of each object."""
 
     sample: Sample
     names: list[str]
@@ -194,89 +112,21 @@ class _Result(NamedTuple):
 
 
 def _nothing(left_out: list[str]) -> _Result:
-    """The result of a pool of which no object is left."""
+    """Returns the result of a pool without objects."""
     return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], np.zeros((0, 2)), [], left_out)
-
-
-def _divided(count: int, most: int) -> tuple[int, int]:
-    """Number of pools and their size, for so many objects, of which a pool has at most `most`."""
-    number = -(-count // most)
-    return number, -(-count // number)
-
-
-@contextlib.contextmanager
-def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
-    """The same items, each made in a thread while the one before it is in use."""
-    with concurrent.futures.ThreadPoolExecutor(1) as background:
-
-        def taken() -> Iterator[_Item]:
-            coming = background.submit(next, items, None)
-            while (item := coming.result()) is not None:
-                coming = background.submit(next, items, None)
-                yield item
-
-        yield taken()
-
-
-def _prepared(
-    hand: Hand, task: TaskConfig, pools: Pools, seed: int, wanted: Sequence[int], measured: bool
-) -> Iterator[_Pool]:
-    """Pools with their constraints."""
-    for number in wanted:
-        loaded, left_out = pools.make[number]()
-        objects = scale_objects(hand, task, loaded)
-        kept, bank = _with_bank(hand, task, objects, pools.size, seed + number)
-        left_out = [*left_out, *(obj.name for obj in objects if all(obj is not other for other in kept))]
-        filled = _filled(kept, pools.size)
-        field = distance_field(filled) if measured and kept else None
-        yield _Pool(number, filled, bank, field, len(kept), left_out)
-
-
-def _filled(objects: Sequence[GraspObject], size: int) -> list[GraspObject]:
-    """So many objects, the first ones again where there are fewer."""
-    return list(itertools.islice(itertools.cycle(objects), size))
-
-
-def _with_bank(
-    hand: Hand, task: TaskConfig, objects: list[GraspObject], size: int, seed: int
-) -> tuple[list[GraspObject], ConstraintBank | None]:
-    """Those objects that the hand can approach in some resting pose, and the bank of `size` of them (`_filled`)."""
-    while objects:
-        filled = _filled(objects, size)
-        try:
-            return objects, build_bank(hand, task, filled, seed)
-        except CongraspError as error:
-            scale, seeds = object_scale(hand, task), [(seed, n) for n in range(size)]
-            own = itertools.repeat(outline(hand), size)
-            fine = parallel_map(_approachable, [task] * size, filled, seeds, [scale] * size, own)
-            if all(fine):
-                raise
-            _log.warning("%s", error)
-            lost = {id(obj) for obj, good in zip(filled, fine, strict=True) if not good}
-            objects = [obj for obj in objects if id(obj) not in lost]
-    return [], None
-
-
-def _approachable(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, own: Outline) -> bool:
-    """True if an object has a heading for the hand with this outline."""
-    try:
-        headings_of(task, obj, seed, None, scale, own)
-    except CongraspError:
-        return False
-    return True
 
 
 def _simulated(
     running: Episodes,
     hand: Hand,
     task: TaskConfig,
-    pool: _Pool,
+    pool: Pool,
     each: int,
     seed: int,
     progress: Callable[[int], None],
     stressed: int,
 ) -> _Result:
-    """The episodes of a pool."""
+    """Simulates the episodes of a pool."""
     assert pool.bank is not None
     plan = plan_row(task, pool.bank, pool.objects, _ROW, each * len(pool.objects))
     conditions = batches(hand, task, pool.bank, plan, seed, running.batch)
@@ -288,16 +138,16 @@ def _simulated(
 
 
 def _without_forces(sample: Sample) -> Sample:
-    """Only the metrics: forces are read from the first pool."""
+    """Drops everything but the metrics: forces are read from the first pool."""
     return dataclasses.replace(sample, link_force=sample.link_force[:0], torque=sample.torque[:0])
 
 
 def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
-    """All objects, then groups of them."""
+    """Returns the rows of all objects, then of groups."""
     left_out = [name for result in results for name in result.left_out]
     results = [result for result in results if result.episodes]
     if not results:
-        raise CongraspError("None of the objects can be approached.", "Scale them to the hand, or name others.")
+        raise CongraspError("None of the objects can be approached.", "Scale them for the hand, or pass others.")
     firsts = np.cumsum([0, *(len(result.names) for result in results)])
     for result, first in zip(results, firsts, strict=False):
         result.sample.values["object_index"] = result.sample.values["object_index"] + first
@@ -317,12 +167,12 @@ def _rows(results: Sequence[_Result], hand: Hand, method: str) -> list[Row]:
 
 
 def _file(folder: pathlib.Path, number: int) -> pathlib.Path:
-    """Where the result of a pool is kept."""
+    """Path of a pool's result."""
     return folder / f"pool-{number:05d}.safetensors"
 
 
 def _write(path: pathlib.Path, result: _Result, about: dict[str, Any]) -> None:
-    """Keeps a result beside what it depends on."""
+    """Writes a result and its identity."""
     arrays = {f"values/{name}": column for name, column in result.sample.values.items()}
     arrays |= {"link_force": result.sample.link_force, "torque": result.sample.torque, "traits": result.traits}
     lists = {"names": result.names, "families": result.families, "left_out": result.left_out}
@@ -330,7 +180,7 @@ def _write(path: pathlib.Path, result: _Result, about: dict[str, Any]) -> None:
 
 
 def _read(path: pathlib.Path, about: dict[str, Any]) -> _Result | None:
-    """A kept result of the same arguments, if there is one and it is whole."""
+    """Reads a result with the same arguments; returns None if it is missing or damaged."""
     try:
         message = decode(read_file(path, MAX_MESSAGE))
         if message.meta["about"] != json.dumps(about):

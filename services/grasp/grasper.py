@@ -15,9 +15,11 @@ from scipy.spatial.transform import Rotation
 from congrasp.actors.attempts import Attempts, Outcome
 from congrasp.actors.initial import RequestedEpisodes, handover_speed
 from congrasp.actors.stress import ASSESSED, SURVIVAL
+from congrasp.common import mirror
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, ContradictionError
-from congrasp.common.hands import get_hand
+from congrasp.common.hands import get_hand, known_hand
+from congrasp.common.hands.left import left_hand, right_name
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
@@ -33,6 +35,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.client.left import mirrored_request
 from congrasp.services.export.motion_file import GraspMotion, motion_of_episode
 from congrasp.services.grasp.approaches import headings, prescribed, valid_rests
 from congrasp.services.grasp.parse import read_request
@@ -44,17 +47,17 @@ if TYPE_CHECKING:
 ATTEMPTS = 16
 """Grasps that are simulated side by side."""
 ROUNDS = 4
-"""How often that many others are attempted while none holds."""
+"""Number of further rounds of attempts while none holds."""
 HOLD_SECONDS = 2.0
-"""How long the object should be held without the table."""
+"""Required hold of the object without the table."""
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
 _SCALES |= {"moved_at_removal": 0.01, "force_link_max": 10.0, "slip": 0.02}
-"""What weighs as much as one another, among grasps that hold: errors, the object's way before table removal (m), the
-strongest link's force (N), and the object's way after it went (m)."""
+"""Scales that make costs of grasps that hold comparable: errors, displacement of the object before table removal (m),
+force of the strongest link (N), and displacement after removal (m)."""
 _FIRM = ("clean", *SURVIVAL)
-"""What counts one against a grasp that lacks it, likewise."""
+"""Cost of a grasp that lacks it."""
 _UNLIKELY = 0.5
-"""What each resting pose that comes before its own weighs against a grasp, likewise."""
+"""Cost of each resting pose that precedes a grasp's own."""
 _TOUCHED = 0.2
 """Share of touches on what must not be touched from which others are attempted."""
 
@@ -70,21 +73,21 @@ class Grasp:
     episode: Message
     """The whole episode, as recordings keep it."""
     motion: GraspMotion
-    """What the NPZ holds."""
+    """Content of the NPZ."""
     attempts: int
-    """How many were simulated."""
+    """Number of simulated attempts."""
     held: int
-    """How many of them held the object to the end."""
+    """Number of those that held the object to the end."""
     rest: int
-    """Which of the object's resting poses it starts from."""
+    """Index of the initial resting pose."""
     active: tuple[str, ...]
-    """Which constraints are active and why, in sentences."""
+    """Active constraints and the reasons, in sentences."""
     arm: "ArmMotion | None" = None
     """The same on an arm, if there is one."""
 
     @property
     def success(self) -> bool:
-        """Whether this one held the object to the end."""
+        """True if this one held the object to the end."""
         return self.motion.metrics["held"] > 0
 
     @property
@@ -141,6 +144,7 @@ class Grasper:
         threads: int = 0,
         seed: int = 0,
         arm: "ArmPlanner | None" = None,
+        left: bool = False,
     ):
         """Compiles nothing yet.
 
@@ -154,16 +158,18 @@ class Grasper:
           threads: of the physics; 0 takes one a core.
           seed: draws what is attempted.
           arm: the arm that must be able to do it.
+          left: the hand is the left one of the policy's: the right one grasps the mirrored object (`common.mirror`).
         """
         self._arm = arm
-        self.hand = get_hand(policy.spec.hand)
+        self._hand, self._left = get_hand(policy.spec.hand), left
+        self.hand = left_hand(self._hand) if left else self._hand
         self.task = dataclasses.replace(policy.task, end_when_fallen=False)
         self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
         self._compiled = False
         self._approach, self._lift = approach, lift
         hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
         self._attempts = Attempts(
-            self.hand,
+            self._hand,
             self.task,
             policy,
             hold=hold,
@@ -189,6 +195,8 @@ class Grasper:
         """
         request = request or GraspRequest()
         require_known(request.constraints, self.task)
+        if self._left:
+            obj, request = obj.mirrored(), mirrored_request(request)
         best: tuple[float, Outcome, Goal, int, np.ndarray] | None = None
         refused: collections.Counter[str] = collections.Counter()
         held = attempted = 0
@@ -257,16 +265,16 @@ class Grasper:
         """Attempts under the constraints, (B,) the resting pose of each, and how many of them are different."""
         batch = self._attempts_count
         labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
-        episodes = repeated(self.hand, self.task, labelled, request, batch)
+        episodes = repeated(self._hand, self.task, labelled, request, batch)
         path = prescribed(request)
         if path is None:
-            position, direction, cross, rests = headings(self.hand, labelled, request, batch, rng)
+            position, direction, cross, rests = headings(self._hand, labelled, request, batch, rng)
             found = {"position": position, "direction": direction, "cross": cross}
             found = {name: value.astype(np.float32) for name, value in found.items()}
             episodes = episodes._replace(goal=episodes.goal.replace("heading", **found))
             different = batch
         else:
-            reference = valid_rests(self.hand, obj, *path)
+            reference = valid_rests(self._hand, obj, *path)
             if request.rest is not None:
                 reference = reference[reference == request.rest]
             if not len(reference):
@@ -299,12 +307,14 @@ class Grasper:
         }
         episode = self._attempts.episode(outcome, index, surface_of(self.task, labelled), obj, about)
         if self._approach:
-            episode = with_reach(episode, self.hand, self._reach(obj, episode))
+            episode = with_reach(episode, self._hand, self._reach(obj, episode))
+        if self._left:
+            episode = _mirrored(episode)
         asked = tuple(request.constraints)
         active = explain(asked, bool(outcome.redirected[index]))
         written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
         avoid = labelled.non_graspable_points
-        active += [found.message for found in contradictions(self.hand, obj.points, avoid, wanted.row(index), written)]
+        active += [found.message for found in contradictions(self._hand, obj.points, avoid, wanted.row(index), written)]
         return Grasp(episode, motion_of_episode(episode), attempts, held, int(rests[index]), tuple(active))
 
     def _reach(self, obj: GraspObject, episode: Message) -> Reach:
@@ -315,7 +325,7 @@ class Grasper:
         first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
         heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(arrays["goal/heading_direction"])
         dt, speed, side = self.task.control_dt, self._attempts.speed, self._arm.side if self._arm else None
-        return plan_reach(self.hand, obj, rest, heading, first, self._approach, dt, speed, side)
+        return plan_reach(self._hand, obj, rest, heading, first, self._approach, dt, speed, side)
 
 
 def grasp(
@@ -331,10 +341,16 @@ def grasp(
 ) -> Grasp:
     """The best grasp motion of an object under constraints; what is compiled is kept for the next call.
 
+    Example:
+      import congrasp
+
+      found = congrasp.grasp("mug:7", heading="above", attempts=8)
+      print(found.success, found.held, "of", found.attempts, "attempts hold it")
+
     Args:
-      mesh: a mesh (STL, OBJ, PLY, GLB), an object file, or an object.
+      mesh: a mesh (STL, OBJ, PLY, GLB), an object file, FAMILY:SEED of the generator, or an object.
       policy: a policy file; the one that comes with the package if none is named.
-      hand: name of the hand whose pretrained policy is taken.
+      hand: name of the hand whose pretrained policy is taken; `human:left` is its left hand.
       options: how a mesh becomes an object.
       attempts: grasps that are simulated side by side.
       seed: draws what is attempted.
@@ -345,21 +361,22 @@ def grasp(
     Raises:
       CongraspError: the object cannot be imported, or a constraint cannot be read or kept.
     """
-    file = policy_file(None if policy is None else pathlib.Path(policy), hand)
-    grasper = _grasper(file, file.stat().st_mtime_ns, attempts, seed)
+    right, left = right_name(hand)
+    file = policy_file(None if policy is None else pathlib.Path(policy), right)
+    grasper = _grasper(file, file.stat().st_mtime_ns, attempts, seed, left)
     obj = mesh if isinstance(mesh, GraspObject) else one_object(pathlib.Path(mesh), options or ImportOptions("guess"))
     request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **constraints)
     return grasper.grasp(obj, request, progress)
 
 
 @functools.lru_cache(maxsize=2)
-def _grasper(file: pathlib.Path, changed: int, attempts: int, seed: int) -> Grasper:
+def _grasper(file: pathlib.Path, changed: int, attempts: int, seed: int, left: bool) -> Grasper:
     """The grasper of a policy file as it was when it changed last."""
-    return Grasper(bundles.load(file), attempts=attempts, seed=seed)
+    return Grasper(bundles.load(file), attempts=attempts, seed=seed, left=left)
 
 
 def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int) -> RequestedEpisodes:
-    """What is asked for of a labelled object, `batch` times, in the resting pose that the request names."""
+    """Request for a labelled object, repeated `batch` times, in the requested resting pose."""
     rest = np.asarray(obj.rest_poses[request.rest or 0], np.float32)
     goal, surface, rest = jax.tree.map(
         lambda array: np.broadcast_to(array, (batch, *np.shape(array))),
@@ -380,6 +397,13 @@ def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
     return dataclasses.replace(
         obj, part_names=("graspable", "non-graspable"), graspable=np.array([True, False]), labels=avoid.astype(np.int32)
     )
+
+
+def _mirrored(episode: Message) -> Message:
+    """The episode of the left hand, of one of the right hand with the mirrored object."""
+    hand, origin = known_hand(episode.meta["hand"]), mirror.vector(episode.meta["object_file_origin"]).tolist()
+    meta = {**episode.meta, "hand": left_hand(hand).reference, "object_file_origin": origin}
+    return Message(mirror.fields(episode.arrays), meta)
 
 
 def _errors_of(constraints: tuple[str, ...]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The task as a Gymnasium vector environment, for other people's learners."""
+"""The task as a Gymnasium vector environment, for external learners."""
 
 import dataclasses
 from typing import Any, Literal
@@ -27,11 +27,11 @@ ACTION = 3.0
 
 
 class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
-    """Hands that grasp objects under sampled constraints, side by side (`actors.env`).
+    """Vector environment of hands that grasp objects under sampled constraints (`actors.env`).
 
-    An episode ends with its time limit while the object is up (truncated), or without it up (terminated). Ended
-    environments begin anew in the same step: `infos["final_obs"]` (num_envs, D) holds their last observations, and
-    `infos["episode"]` metrics of ended episodes by name (num_envs,), where `infos["_final_obs"]` is true.
+    An episode ends with its time limit while the object is held (truncated), or when it is not held (terminated). Ended
+    environments are reset in the same step: `infos["final_obs"]` (num_envs, D) holds their last observations, and
+    `infos["episode"]` the metrics of ended episodes by name (num_envs,), where `infos["_final_obs"]` is true.
     """
 
     def __init__(
@@ -45,16 +45,16 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         autoreset: bool = True,
         **task: Any,
     ):
-        """Makes objects, their constraints and the engine; the first call of `reset` and of `step` compile.
+        """Creates objects, their constraints and the engine; the first calls of `reset` and `step` compile.
 
         Args:
-          num_envs: hands side by side.
+          num_envs: number of parallel environments.
           hand: name or file of the hand.
-          objects: procedural objects, of the families of the hand's training.
+          objects: number of procedural objects, of the families of the hand's training.
           physics: engine, see `congrasp train --physics`.
-          arrays: what observations, rewards and flags come as. Those of JAX stay on the device, and other libraries
-            take them through DLPack.
-          autoreset: ended environments begin anew by themselves; otherwise all wait for `reset`.
+          arrays: array type of observations, rewards and flags. JAX arrays stay on the device, and other libraries can
+            import them through DLPack.
+          autoreset: resets ended environments automatically; otherwise all wait for `reset`.
           **task: fields of `TaskConfig` other than those of the hand's training.
 
         Raises:
@@ -81,11 +81,11 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Fresh episodes everywhere: observations (num_envs, D).
+        """Starts new episodes in all environments; returns observations (num_envs, D).
 
         Args:
-          seed: of everything that is drawn from now on.
-          options: none is known.
+          seed: seed of all later draws.
+          options: not supported.
         """
         if seed is not None:
             self._key = jax.random.key(seed)
@@ -93,7 +93,7 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         return self._given_out(self._worker.observe()), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """One control step under actions (num_envs, A): observations, rewards, terminated, truncated, infos."""
+        """Simulates one control step under actions (num_envs, A): obs, rewards, terminated, truncated, infos."""
         rollout = self._worker.collect(jax.numpy.asarray(actions, np.float32), 1)
         observation, infos = rollout.last_observation, {}
         ended = np.asarray(rollout.terminal[0])
@@ -106,11 +106,11 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         return (*map(self._given_out, found), infos)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Ends the engine."""
+        """Closes the engine."""
         self._worker.physics.close()
 
     def _drawn(self) -> initial.InitialConditions:
-        """Episodes that are about to begin."""
+        """Draws initial conditions of episodes."""
         self._key, key = jax.random.split(self._key)
         return self._sample(self._bank, key)
 
@@ -123,37 +123,37 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         return {"episode": found, "_episode": ended}
 
     def _given_out(self, array: Any) -> Any:
-        """An array as the caller wants it."""
+        """Converts an array to the requested type."""
         return np.asarray(array) if self._arrays == "numpy" else jax.numpy.asarray(array)
 
 
 class GraspEnv(gym.Env[np.ndarray, np.ndarray]):
-    """One hand and one object: the vector environment with one environment, which waits for `reset` at an end."""
+    """One hand and one object: a vector environment of size one, which waits for `reset` at the end."""
 
     def __init__(self, **settings: Any):
-        """For the arguments see `GraspVectorEnv`."""
+        """Creates the environment; for the arguments see `GraspVectorEnv`."""
         self._vector = GraspVectorEnv(1, autoreset=False, **settings)
         self.observation_space = self._vector.single_observation_space
         self.action_space = self._vector.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """A fresh episode: its first observation (D,)."""
+        """Starts a new episode; returns its first observation (D,)."""
         super().reset(seed=seed)
         observation, infos = self._vector.reset(seed=seed)
         return observation[0], infos
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One control step under an action (A,)."""
+        """Simulates one control step under an action (A,)."""
         observation, reward, terminated, truncated, infos = self._vector.step(action[None])
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), infos
 
     def close(self) -> None:
-        """Ends the engine."""
+        """Closes the engine."""
         self._vector.close()
 
 
 def make_vec(id: str = ID, num_envs: int = 64, **settings: Any) -> GraspVectorEnv:
-    """A vector environment by its id; for the settings see `GraspVectorEnv`.
+    """Creates a vector environment by its id; for the settings see `GraspVectorEnv`.
 
     Raises:
       CongraspError: there is no such environment, hand, engine or field of the task.
@@ -164,12 +164,12 @@ def make_vec(id: str = ID, num_envs: int = 64, **settings: Any) -> GraspVectorEn
 
 
 def _given(action: Any, observation: Any, key: Any) -> tuple[Any, Any]:
-    """The policy of someone else's learner: its parameters are the actions."""
+    """Policy of an external learner: its parameters are the actions."""
     return action, jax.numpy.zeros(action.shape[0])
 
 
 def _known(task: dict[str, Any]) -> dict[str, Any]:
-    """Fields of the task as they are given, if there are such fields."""
+    """Returns the given fields of the task; raises a CongraspError for an unknown one."""
     names = [field.name for field in dataclasses.fields(TaskConfig)]
     for name in task:
         if name not in names:

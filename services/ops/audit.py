@@ -1,8 +1,8 @@
-"""Compares the answers that actors got with what the learner did: was every accepted rollout used once, as sent?
+"""Compares the replies to actors with the actions of the learner: was every accepted rollout used once and unchanged?
 
-Actors note what they made, with a checksum, and every answer to it; the learner notes what it used, with a
-checksum taken when the update began, what it dropped, and where its sessions began and ended. Neither reads the other's
-journal; nothing here uses the code that decided.
+Actors record what they sent, with a checksum, and every reply; the learner records what it used, with a checksum from
+the start of the update, what it dropped, and where its sessions began and ended. Neither reads the other's journal, and
+this module does not use the code that decided.
 
 What a journal's missing or damaged lines told cannot be known: what they may have been about is no fault, but counted
 as not in the journals, and reported as unjudged. A journal whose last lines were cut off looks like that of a process
@@ -30,26 +30,26 @@ UNJUDGED = "not in the journals"
 
 
 class Made(NamedTuple):
-    """A rollout as its actor saw it."""
+    """A rollout as recorded by its actor."""
 
     version: int
     checksum: str
     answers: list[tuple[str, str]]
-    """(outcome, session of the learner that gave it)."""
+    """(outcome, session id of the learner)."""
 
 
 class Report(NamedTuple):
     """Outcome of every rollout of a run."""
 
     counts: dict[str, int]
-    """How many were made and accepted, and the outcomes of those that were accepted; the last ones are faults."""
+    """Numbers of rollouts made and accepted, and the outcomes of accepted ones; the last ones are faults."""
     faults: list[str]
-    """A line for each rollout that was lost, duplicated, corrupted or unmatched."""
+    """One line for each rollout that was lost, duplicated, corrupted or unmatched."""
     lag_mean: float
     lag_max: int
     max_staleness: int
     holes: int
-    """Lines that a full disk kept out of the journals, or that were cut at the end."""
+    """Lines missing from the journals because of a full disk, or cut at the end."""
     damaged: int
     """Lines of the journals that are not what was written."""
     missing: int
@@ -59,7 +59,7 @@ class Report(NamedTuple):
 
     @property
     def exit_code(self) -> int:
-        """0 if nothing was found, else that of the gravest kind."""
+        """0 without findings, else that of the most serious kind."""
         damaged = self.damaged or self.counts.get("damaged on disk")
         kinds = {FAULTS[name] for name in FAULTS if self.counts[name]} | ({"damage"} if damaged else set())
         if self.missing or self.counts.get(UNJUDGED) or not self.counts["made"]:
@@ -68,7 +68,7 @@ class Report(NamedTuple):
 
 
 class _Gaps(NamedTuple):
-    """Whether lines are missing in the journals."""
+    """True for kinds of journals with missing lines."""
 
     actors: bool
     learners: bool
@@ -78,8 +78,8 @@ def audit(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
     """Compares the journals of a run.
 
     Args:
-      run_dir: the run's directory.
-      more: journals of actors that are elsewhere.
+      run_dir: directory of the run.
+      more: journals of actors on other machines.
 
     Raises:
       CongraspError: there are no journals.
@@ -91,7 +91,7 @@ def audit(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
         kind = "actor" if learners else "learner"
         raise CongraspError(
             f"There is no journal of {'an' if kind == 'actor' else 'a'} {kind} in {folder}.",
-            "Actors elsewhere write theirs with 'congrasp actor --audit FILE'; name these files.",
+            "Actors on other machines write theirs with 'congrasp actor --audit FILE'; pass these files.",
         )
     notes = [read_journal(path, _is_entry) for path in actors]
     books = [read_uses(path) for path in learners]
@@ -100,61 +100,61 @@ def audit(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
 
 
 def _is_entry(entry: dict[str, Any]) -> bool:
-    """Whether a line is one that an actor writes."""
+    """True if a line is a valid entry of an actor."""
     if "made" in entry:
         return has_fields(entry, made=int, version=int, checksum=str)
     if "answer" in entry:
-        return has_fields(entry, answer=int, outcome=str, life=str)
+        return has_fields(entry, answer=int, outcome=str, session_id=str)
     return has_fields(entry, actor=str, incarnation=str)
 
 
 def _made(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
-    """What actors made, and the answers that they got."""
+    """Rollouts sent by actors, and the replies they received."""
     made: dict[Identity, Made] = {}
     for journal in journals:
         who: tuple[str, str] | None = None
         for entry in journal.entries:
             if entry is None:
-                who = None  # the lines that follow may be another incarnation's, if they do not name it
+                who = None  # unnamed lines that follow may belong to another incarnation
                 continue
             if has_fields(entry, actor=str, incarnation=str):
                 who = entry["actor"], entry["incarnation"]
             if who is not None and "made" in entry:
                 made[*who, entry["made"]] = Made(entry["version"], entry["checksum"], [])
             elif who is not None and (identity := (*who, entry.get("answer", -1))) in made:
-                made[identity].answers.append((entry["outcome"], entry["life"]))
+                made[identity].answers.append((entry["outcome"], entry["session_id"]))
     return made
 
 
 @dataclasses.dataclass
 class _Session:
-    """What a session of a learner began with, and what it noted of rollouts that it did not use."""
+    """Initial state of a learner's session, and its record of unused rollouts."""
 
-    life: str
+    session_id: str
     run_id: str
     version: int
     max_staleness: int
     kept: bool
-    """What it accepted was on disk before it was acknowledged; older versions of congrasp kept nothing."""
+    """Accepted rollouts were written to disk before the acknowledgement; older versions of congrasp did not."""
     falls_back: bool
-    """It began from an earlier checkpoint than the newest, which was damaged or gone."""
+    """It began from a checkpoint older than the newest, which was damaged or missing."""
     started: bool
-    """It took up what was on disk, from when on it accepts."""
+    """It recovered rollouts from disk, after which it accepts."""
     taken: set[Identity] = dataclasses.field(default_factory=set)
     unwritten: set[Identity] = dataclasses.field(default_factory=set)
     waiting: set[Identity] | None = None
-    """What waited at its end; None while it runs, or if it was killed."""
+    """Queued rollouts at its end; None while it runs, or if it was killed."""
 
     def had(self, identity: Identity, accepted_by: set[str]) -> bool:
-        """Whether it accepted a rollout, or took it up from an earlier session."""
-        return self.life in accepted_by or identity in self.taken
+        """True if it accepted a rollout, or recovered it from an earlier session."""
+        return self.session_id in accepted_by or identity in self.taken
 
 
 class _Outcomes(NamedTuple):
-    """What the learners did with rollouts."""
+    """Actions of the learners on rollouts."""
 
     books: list[list[_Session]]
-    """The sessions of each."""
+    """Sessions of each learner."""
     standing: dict[Identity, list[Used]]
     undone: set[Identity]
     dropped: set[Identity]
@@ -162,7 +162,7 @@ class _Outcomes(NamedTuple):
 
 
 def _outcomes(books: Iterable[list[dict[str, Any]]]) -> _Outcomes:
-    """The outcomes of which the learners' journals tell."""
+    """Collects outcomes from the learners' journals."""
     found = _Outcomes([], collections.defaultdict(list), set(), set(), set())
     for book in books:
         found.books.append(_sessions(book))
@@ -177,15 +177,15 @@ def _outcomes(books: Iterable[list[dict[str, Any]]]) -> _Outcomes:
 
 
 def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
-    """The sessions of one learner, in their order, without those that were killed before they took anything up."""
+    """Sessions of one learner, in order, without those killed before they recovered anything."""
     sessions: list[_Session] = []
     saved = -1
     for entry in book:
-        if "life" in entry:
-            begin = entry["life"], entry["epoch"], entry["version"], entry["max_staleness"]
+        if "session_id" in entry:
+            begin = entry["session_id"], entry["run_id"], entry["version"], entry["max_staleness"]
             kept = entry.get("kept") is True
             sessions.append(_Session(*begin, kept, entry["version"] < saved, started=not kept))
-        saved = entry.get("saved", entry["version"] if "life" in entry else saved)
+        saved = entry.get("saved", entry["version"] if "session_id" in entry else saved)
         if sessions:
             sessions[-1].started |= "taken" in entry
             sessions[-1].taken.update(_rows(entry, "taken"))
@@ -196,18 +196,18 @@ def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
 
 
 def _rows(entry: dict[str, Any], name: str) -> set[Identity]:
-    """The rollouts that a field of a line names."""
+    """Rollouts named by a field of a line."""
     return {(actor, incarnation, sequence) for actor, incarnation, sequence in entry.get(name, ())}
 
 
 def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals: Sequence[JournalLines]) -> Report:
-    """Judges every rollout by what its actor was told and by what the learner's sessions did with it."""
+    """Compares every rollout's replies with the actions of the learner's sessions."""
     standing = found.standing
     counts = collections.Counter({"made": len(made)})
     faults: list[str] = []
 
     def fault(kind: str, identity: Identity, text: str) -> None:
-        """Counts a fault, and notes which rollout has it."""
+        """Counts a fault, and records the rollout."""
         counts[kind] += 1
         faults.append(f"{'/'.join(map(str, identity))}: {text}")
 
@@ -220,10 +220,10 @@ def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals
             if gaps.actors:
                 counts["used, not in the journals"] += 1
             else:
-                fault("unmatched", identity, "used, but never made")
+                fault("unmatched", identity, "used, but never sent")
         elif any(use.checksum != made[identity].checksum for use in uses):
-            fault("corrupted", identity, "used with another content than it was made with")
-        if len(uses) > 1 and not gaps.learners:  # the line may be missing by which a resume undid one of them
+            fault("corrupted", identity, "used with different content than sent")
+        if len(uses) > 1 and not gaps.learners:  # the line with which a resume undid one of them may be missing
             fault("duplicated", identity, f"used {len(uses)} times")
     for identity, rollout in made.items():
         outcomes = [outcome for outcome, _ in rollout.answers]
@@ -235,7 +235,7 @@ def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals
         if outcome == "lost" and any(gaps):
             outcome = UNJUDGED
         if outcome == "lost":
-            fault("lost", identity, "accepted, and never seen again")
+            fault("lost", identity, "accepted, but missing afterwards")
         else:
             counts[outcome] += 1
     lags = [use.lag for uses in standing.values() for use in uses]
@@ -253,14 +253,14 @@ def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals
 
 
 def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
-    """What became of an accepted rollout, by the last session that had it and the one that followed."""
+    """Outcome of an accepted rollout, from the last session that had it and the next one."""
     if identity in found.standing:
         return "used"
     if identity in found.dropped:
         return "dropped"
     if identity in found.spoilt:
         return "damaged on disk"
-    accepted_by = {life for outcome, life in rollout.answers if outcome in ("accepted", "duplicate")}
+    accepted_by = {session for outcome, session in rollout.answers if outcome in ("accepted", "duplicate")}
     for book in found.books:
         had = [n for n, session in enumerate(book) if session.had(identity, accepted_by)]
         if not had:
@@ -273,7 +273,7 @@ def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
 
 
 def _without_trace(identity: Identity, version: int, last: _Session, after: _Session, *, undone: bool) -> str:
-    """Why the session after the last that had a rollout did not take it up; it is lost if there is no reason."""
+    """Reason why the session after the last that had a rollout did not recover it; "lost" without a reason."""
     if abs(version - after.version) > after.max_staleness or after.run_id != last.run_id:
         return "undone" if undone else "too old after a restart"
     if not last.kept or identity in last.unwritten or after.falls_back:

@@ -1,9 +1,9 @@
-"""A private authority and the certificates that it issues, one for each run, role and number: `human.actor.3`.
+"""A private certificate authority, with one certificate for each run, role and number: `human.actor.3`.
 
-The common name of a certificate is `<run>.<role>.<number>`. Zenoh compares common names as a whole and reads its rules
-once, so those who listen allow all numbers below `NUMBERS` from the start, and a certificate that is issued later works
-at once. One that is lost is revoked: its common name goes into the file `revoked`, which listeners look at. Keys are
-elliptic (P-256), in files that their owner alone can read.
+The common name of a certificate is `<run>.<role>.<number>`. Zenoh compares whole common names and reads its rules once.
+Listeners therefore allow all numbers below `NUMBERS` from the start, and a certificate issued later works at once. A
+lost certificate is revoked: its common name is added to the file `revoked`, which listeners check. Keys are elliptic
+(P-256), in files readable only by their owner.
 """
 
 import datetime
@@ -37,34 +37,34 @@ from congrasp.common.transport.security import (
 CA_KEY_FILE = "ca.key"
 CA_DAYS, DAYS = 3650, 365
 RUN = "quickstart"
-"""Name of the run for which an authority issues certificates unless told otherwise."""
-_LONGEST_NAME = 64  # characters of a common name (RFC 5280)
+"""Default run of an authority."""
+_LONGEST_NAME = 64  # limit of a common name in characters (RFC 5280)
 _ORGANIZATION = "congrasp"
 _LOOPBACK = ("localhost", "127.0.0.1")
-_CLOCKS = datetime.timedelta(minutes=5)  # by which the clocks of two machines may differ
+_CLOCKS = datetime.timedelta(minutes=5)  # tolerance between the clocks of two machines
 
 
 def create_authority(folder: pathlib.Path, *, run: str = RUN, force: bool = False) -> Certificate:
-    """Makes an authority: `ca.crt`, which everyone gets, and `ca.key`, which stays where it is.
+    """Creates an authority: `ca.crt`, which all peers get, and `ca.key`, which must not be copied.
 
     Args:
-      folder: made if it is not there.
-      run: name of the run for which it issues certificates where no other is named.
-      force: replace an authority that is there, which makes all certificates that it issued useless.
+      folder: created if needed.
+      run: default run of its certificates.
+      force: replaces an existing authority, which invalidates all of its certificates.
 
     Raises:
-      CongraspError: there is one already, or a value makes no sense.
+      CongraspError: there is one already, or a value is not valid.
     """
     if not force and ((folder / CA_FILE).exists() or (folder / CA_KEY_FILE).exists()):
         raise CongraspError(
-            f"{folder} holds an authority already.", "Issue certificates with it, or replace it with --force."
+            f"{folder} already holds an authority.", "Issue certificates with it, or pass --force to replace it."
         )
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name(
         [
             x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION),
             x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, check_name("run", run)),
-            x509.NameAttribute(NameOID.SERIAL_NUMBER, secrets.token_hex(8)),  # tells authorities apart
+            x509.NameAttribute(NameOID.SERIAL_NUMBER, secrets.token_hex(8)),  # distinguishes authorities
         ]
     )
     usage = x509.KeyUsage(
@@ -97,24 +97,29 @@ def issue(
     """Issues a certificate.
 
     Args:
-      folder: holds the authority, and takes the new folder `<role>.<number>` with `ca.crt`, `tls.crt` and `tls.key`.
+      folder: folder of the authority; the new folder `<role>.<number>` with `ca.crt`, `tls.crt` and `tls.key` is
+        created in it.
       role: one of `ROLES`.
-      run: name of the run that it is for; by default the authority's.
-      number: by default the lowest that has no folder yet and is not revoked.
-      hosts: names and addresses under which its owner may listen besides loopback.
-      days: until it expires; never later than the authority.
-      force: replace the one that is there.
+      run: name of the run; by default the authority's.
+      number: number of the certificate; by default the lowest without a folder that is not revoked.
+      hosts: names and addresses at which its owner may listen, in addition to loopback.
+      days: validity in days, at most that of the authority.
+      force: replaces an existing certificate.
 
     Returns:
       The new folder: copy it to the machine where the role runs.
 
     Raises:
-      CongraspError: there is no authority, the certificate is there already, or a value makes no sense.
+      CongraspError: there is no authority, the certificate exists already, or a value is not valid.
     """
     if role not in ROLES:
-        raise CongraspError(f"There is no certificate role {ascii(role)[:40]}.", f"Choose one of: {', '.join(ROLES)}.")
+        raise CongraspError(
+            f"There is no role {ascii(role)[:40]} for certificates.", f"Choose one of: {', '.join(ROLES)}."
+        )
     if hosts and role not in LISTENERS:
-        raise CongraspError(f"A certificate of the role {role} names no hosts.", f"Only {' and '.join(LISTENERS)} do.")
+        raise CongraspError(
+            f"A certificate of the role {role} cannot name hosts.", f"Only {' and '.join(LISTENERS)} can."
+        )
     ca, ca_key = _authority(folder)
     run = check_name("run", run or read(folder / CA_FILE).run)
     revoked = Credentials(folder, role).revoked()
@@ -122,12 +127,12 @@ def issue(
     if number is None:
         number = next((i for i in range(NUMBERS) if not taken(i)), NUMBERS)
     if not 0 <= number < NUMBERS:
-        raise CongraspError(f"{role}.{number} cannot be issued.", f"Numbers go from 0 to {NUMBERS - 1}.")
+        raise CongraspError(f"{role}.{number} cannot be issued.", f"Numbers range from 0 to {NUMBERS - 1}.")
     target, identity = folder / f"{role}.{number}", Identity(run, role, number)
     if target.exists() and not force:
-        raise CongraspError(f"{target} is there already.", "Choose another --number, or replace it with --force.")
+        raise CongraspError(f"{target} exists already.", "Pass another --number, or --force to replace it.")
     if str(identity) in revoked:
-        raise CongraspError(f"{identity} is revoked.", "Choose another --number.")
+        raise CongraspError(f"{identity} is revoked.", "Pass another --number.")
     if len(str(identity)) > _LONGEST_NAME:
         raise CongraspError(f"{identity} is longer than {_LONGEST_NAME} characters.", "Give the run a shorter name.")
     key = ec.generate_private_key(ec.SECP256R1())
@@ -161,13 +166,13 @@ def issue(
 
 
 def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = None) -> str:
-    """Revokes a certificate: its common name goes into the list of the authority and of everyone in its folder.
+    """Revokes a certificate: adds its common name to the list of the authority and in all folders within its folder.
 
     Args:
-      folder: of the authority.
+      folder: folder of the authority.
       role: one of `ROLES`.
-      number: the certificate's.
-      run: name of the run that it was for; by default the authority's.
+      number: number of the certificate.
+      run: run of the certificate; by default the authority's.
 
     Returns:
       The common name.
@@ -186,7 +191,7 @@ def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = No
 
 
 def certificates(folder: pathlib.Path) -> list[Certificate]:
-    """All certificates in a folder, the authority's first.
+    """Returns all certificates in a folder, the authority's first.
 
     Raises:
       CongraspError: there are none, or one is damaged.
@@ -194,7 +199,7 @@ def certificates(folder: pathlib.Path) -> list[Certificate]:
     files = [folder / CA_FILE, folder / CERTIFICATE_FILE, *folder.glob(f"*.*/{CERTIFICATE_FILE}")]
     found = [read(path) for path in files if path.exists()]
     if not found:
-        raise CongraspError(f"{folder} holds no certificates.", f"Make them: congrasp certs init {folder}")
+        raise CongraspError(f"{folder} holds no certificates.", f"Create them: congrasp certs init {folder}")
     return sorted(found, key=lambda one: one.identity or Identity("", "", 0))
 
 
@@ -205,10 +210,10 @@ def _builder(
     days: float,
     at_most: datetime.datetime | None = None,
 ) -> x509.CertificateBuilder:
-    """What all certificates have: names, key, serial number and the time for which they are good."""
+    """Common fields of all certificates: names, key, serial number and validity."""
     now = datetime.datetime.now(datetime.UTC)
     if not -CA_DAYS <= days <= 2 * CA_DAYS:
-        raise CongraspError(f"A certificate cannot be good for {days:g} days.", f"Choose at most {2 * CA_DAYS}.")
+        raise CongraspError(f"A certificate cannot be valid for {days:g} days.", f"Pass at most {2 * CA_DAYS}.")
     end = now + datetime.timedelta(days=days)
     return (
         x509.CertificateBuilder()
@@ -223,7 +228,7 @@ def _builder(
 
 
 def _host(name: str) -> x509.GeneralName:
-    """A host's name or address as certificates hold it."""
+    """Converts a host's name or address for a certificate."""
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:
@@ -237,17 +242,17 @@ def _host(name: str) -> x509.GeneralName:
 
 
 def _authority(folder: pathlib.Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """Certificate and key of the authority in a folder."""
+    """Loads certificate and key of the authority in a folder."""
     try:
         key = serialization.load_pem_private_key((folder / CA_KEY_FILE).read_bytes(), None)
     except (OSError, ValueError):
-        raise CongraspError(f"{folder} holds no authority.", f"Make one: congrasp certs init {folder}") from None
+        raise CongraspError(f"{folder} holds no authority.", f"Create one: congrasp certs init {folder}") from None
     assert isinstance(key, ec.EllipticCurvePrivateKey)
     return load(folder / CA_FILE), key
 
 
 def _write_secret(path: pathlib.Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """Writes a key that its owner alone can read."""
+    """Writes a key that only its owner can read."""
     path.unlink(missing_ok=True)
     text = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()

@@ -1,4 +1,4 @@
-"""Checks of a machine and an installation, each with what to do where it fails."""
+"""Checks of a machine and an installation, each with a remedy if it fails."""
 
 import importlib.metadata
 import os
@@ -24,19 +24,19 @@ from congrasp.services.ops.status import ask
 
 _PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "flax", "eclipse-zenoh")
 _PAIRS = (("mujoco", "mujoco-mjx"), ("jax", "jaxlib"))
-"""Packages whose versions must be the same."""
+"""Packages whose versions must match."""
 _PORT = int(LEARNER_URL.rpartition(":")[2])
 _LEAST_GIB = 2.0
 _LEAST_MB_S, _SAMPLE = 5.0, 16 << 20
 _DRIVER = 580
-_LEAST_DAYS = 14.0  # before a certificate expires
-_OFFSET = 1.0  # seconds by which a clock may differ from the learner's
-_BETWEEN = 0.05  # seconds between two requests, of which a secured learner takes a hundred a second
+_LEAST_DAYS = 14.0  # warning before a certificate expires, days
+_OFFSET = 1.0  # tolerated offset from the learner's clock, s
+_BETWEEN = 0.05  # seconds between two requests; a secured learner accepts a hundred per second
 _NVIDIA = "/dev/nvidia0"
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at."""
+    """Result of one check."""
 
     what: str
     fine: bool
@@ -49,13 +49,13 @@ def examine(
     folder: pathlib.Path = pathlib.Path(),
     certs: pathlib.Path | None = None,
 ) -> list[Finding]:
-    """Runs all checks; nothing is left changed.
+    """Runs all checks, without side effects.
 
     Args:
-      connect: a learner's endpoint that should be reachable, if any.
+      connect: endpoint of a learner to test, if any.
       run: name of its run.
-      folder: where runs are to be written.
-      certs: a folder of certificates to look at, and to use for the connection.
+      folder: folder for runs.
+      certs: folder of certificates to check, and to use for the connection.
     """
     checks: list[Callable[[], Iterator[Finding]]] = [_python, _packages, _gpu, _jax, _warp, _ports]
     checks += [lambda: _disk(folder), _clock]
@@ -67,22 +67,22 @@ def examine(
 
 
 def _tried(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
-    """A check that breaks is a finding, too."""
+    """Runs a check; an exception is a failed finding."""
     try:
         yield from check()
     except Exception as error:
         name = getattr(check, "__name__", "").strip("_<>") or "check"
-        yield Finding(name, False, f"could not be looked at: {type(error).__name__}: {str(error).splitlines()[0]}")
+        yield Finding(name, False, f"could not be checked: {type(error).__name__}: {str(error).splitlines()[0]}")
 
 
 def _python() -> Iterator[Finding]:
-    """The version of Python."""
+    """Checks the version of Python."""
     fine = (3, 11) <= sys.version_info[:2] < (3, 14)
     yield Finding("python", fine, platform.python_version() + ("" if fine else ": 3.11, 3.12 or 3.13 is needed"))
 
 
 def _packages() -> Iterator[Finding]:
-    """Versions that congrasp asks for, by its own metadata, and those that must be alike."""
+    """Checks versions required by the package's metadata, and those that must match."""
     gpu = os.path.exists(_NVIDIA)
     wanted = {}
     for text in importlib.metadata.requires("congrasp") or ():
@@ -106,12 +106,12 @@ def _packages() -> Iterator[Finding]:
     for one, other in _PAIRS:
         versions = [importlib.metadata.version(name) for name in (one, other)] if one in have else ["", ""]
         if versions[0] != versions[1]:
-            text = f"{versions[0]} and {versions[1]} do not go together; run: pip install '{other}=={versions[0]}'"
+            text = f"{versions[0]} and {versions[1]} do not match; run: pip install '{other}=={versions[0]}'"
             yield Finding(f"{one}, {other}", False, text)
 
 
 def _gpu() -> Iterator[Finding]:
-    """Name, memory and driver of each NVIDIA GPU."""
+    """Reports name, memory and driver of each NVIDIA GPU."""
     if not os.path.exists(_NVIDIA):
         yield Finding("gpu", True, "no NVIDIA GPU here; actors use the native engine")
         return
@@ -129,8 +129,8 @@ def _gpu() -> Iterator[Finding]:
 
 
 def _jax() -> Iterator[Finding]:
-    """That JAX sees the machine's devices, and that a small program runs."""
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a learner may be at work on this GPU
+    """Checks that JAX finds the machine's devices, and that a small program runs."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a learner may be using this GPU
     import jax
     import jax.numpy as jnp
 
@@ -138,13 +138,13 @@ def _jax() -> Iterator[Finding]:
     backend = jax.default_backend()
     computed = float(jax.jit(lambda x: (x * x).sum())(jnp.arange(4.0)))
     missing = backend == "cpu" and os.path.exists(_NVIDIA)
-    wrong = ": there is an NVIDIA GPU that it does not see; run: pip install 'congrasp[cuda]'" if missing else ""
+    wrong = ": an NVIDIA GPU is not found; run: pip install 'congrasp[cuda]'" if missing else ""
     wrong = wrong or ("" if computed == 14.0 else f": a small program gave {computed}, not 14; reinstall it")
     yield Finding("jax", not wrong, f"{jax.__version__} on {backend} ({devices}), a small program runs{wrong}")
 
 
 def _warp() -> Iterator[Finding]:
-    """That Warp sees the GPU, and that a small kernel runs."""
+    """Checks that Warp finds the GPU, and that a small kernel runs."""
     if not os.path.exists(_NVIDIA):
         return
     import warp as wp
@@ -156,9 +156,7 @@ def _warp() -> Iterator[Finding]:
 
     devices = wp.get_cuda_devices()
     if not devices:
-        yield Finding(
-            "warp", False, "it does not see the GPU; run: pip install 'congrasp[cuda]', and update the driver"
-        )
+        yield Finding("warp", False, "no GPU found; run: pip install 'congrasp[cuda]', and update the driver")
         return
     values = wp.full(4, 3.0, dtype=float, device=devices[0])
     wp.launch(double, dim=4, inputs=[values], device=devices[0])
@@ -170,22 +168,22 @@ def _warp() -> Iterator[Finding]:
 
 
 def _ports() -> Iterator[Finding]:
-    """Those that a learner takes by default."""
+    """Checks the default ports of a learner."""
     last = _PORT + len(FLOWS) - 1
     for port in range(_PORT, last + 1):
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
-                text = f"{port} is in use (a learner runs here?); choose others with --listen"
+                text = f"{port} is in use (by another learner?); pass others with --listen"
                 yield Finding("ports", True, text)
                 return
     yield Finding("ports", True, f"{_PORT}-{last} are free")
 
 
 def _disk(folder: pathlib.Path) -> Iterator[Finding]:
-    """Space, and the speed of a write that reaches the disk."""
+    """Checks free space, and the speed of a synchronous write."""
     free = shutil.disk_usage(folder).free / 2**30
     if free < _LEAST_GIB:
-        text = f"{free:.1f} GiB free: a run needs some {_LEAST_GIB:g} GiB; free some, or choose another --run-dir"
+        text = f"{free:.1f} GiB free: a run needs about {_LEAST_GIB:g} GiB; free some, or pass another --run-dir"
         yield Finding("disk", False, text)
         return
     try:
@@ -197,29 +195,27 @@ def _disk(folder: pathlib.Path) -> Iterator[Finding]:
             os.fsync(file.fileno())
             speed = _SAMPLE / 1e6 / (time.monotonic() - began)
     except OSError as error:
-        yield Finding(
-            "disk", False, f"{folder.absolute()} cannot be written: {error.strerror}; choose another --run-dir"
-        )
+        yield Finding("disk", False, f"{folder.absolute()} cannot be written: {error.strerror}; pass another --run-dir")
         return
     fine = speed >= _LEAST_MB_S
-    slow = "" if fine else f": checkpoints and recordings need some {_LEAST_MB_S:g} MB/s; choose another --run-dir"
+    slow = "" if fine else f": checkpoints and recordings need about {_LEAST_MB_S:g} MB/s; pass another --run-dir"
     yield Finding("disk", fine, f"{free:.1f} GiB free, written at {speed:.0f} MB/s{slow}")
 
 
 def _clock() -> Iterator[Finding]:
-    """That the calendar is plausible, and that the monotonic clock goes as fast as it."""
+    """Checks that the date is plausible, and that the monotonic clock runs at the same rate."""
     began, monotonic = time.time(), time.monotonic()
     time.sleep(0.2)
     drift = abs((time.time() - began) - (time.monotonic() - monotonic))
     behind = began < 1.7e9
     now = time.strftime("%Y-%m-%d %H:%M:%S %Z")
     wrong = ": it is years behind; set it (timedatectl set-ntp true)" if behind else ""
-    wrong = wrong or (f": it jumped by {drift:.2f} s in 0.2 s; look at the time service" if drift > 0.1 else "")
+    wrong = wrong or (f": it jumped by {drift:.2f} s in 0.2 s; check the time service" if drift > 0.1 else "")
     yield Finding("clock", not wrong, now + wrong)
 
 
 def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
-    """Until when each certificate is good."""
+    """Reports the expiry of each certificate."""
     try:
         found = certificates(folder)
     except CongraspError as error:
@@ -227,13 +223,15 @@ def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
         return
     for one in found:
         fine = one.days > _LEAST_DAYS
-        text = f"{one.name}: good until {one.expires:%Y-%m-%d}" if one.days > 0 else f"{one.name}: expired"
-        remedy = "" if fine else "; 'congrasp certs issue --force' makes it anew, 'certs init --force' all of them"
+        text = f"{one.name}: valid until {one.expires:%Y-%m-%d}" if one.days > 0 else f"{one.name}: expired"
+        remedy = (
+            "" if fine else "; run 'congrasp certs issue --force' to renew it, 'certs init --force' for all of them"
+        )
         yield Finding("certificate", fine, text + remedy)
 
 
 def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Iterator[Finding]:
-    """Whether a learner answers, and how far its clock is from this one."""
+    """Checks that a learner responds, and the offset of its clock."""
     try:
         with urls.connect(connect, "observer", certs=certs, wait=5.0, run=run) as transport:
             ask(transport, run)
@@ -244,8 +242,8 @@ def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Itera
     except CongraspError as error:
         yield Finding("learner", False, str(error))
         return
-    yield Finding("learner", True, f"{connect} answers in {1e3 * (ended - began):.1f} ms, version {status['version']}")
+    yield Finding("learner", True, f"{connect} responds in {1e3 * (ended - began):.1f} ms, version {status['version']}")
     offset = status["time"] - (began + ended) / 2
     fine = abs(offset) < _OFFSET + (ended - began) / 2
-    remedy = "" if fine else ": times in recordings will not fit; let a time service set both"
+    remedy = "" if fine else ": times in recordings will not match; synchronise both clocks"
     yield Finding("its clock", fine, f"{offset:+.3f} s from this one (± {(ended - began) / 2:.3f}){remedy}")

@@ -1,4 +1,4 @@
-"""A Prometheus endpoint for each role; docs/operations.md lists what they offer."""
+"""A Prometheus endpoint for each role; docs/operations.md lists the metrics."""
 
 import collections
 import contextlib
@@ -26,10 +26,10 @@ _MILLISECONDS = (0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 @contextlib.contextmanager
 def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
-    """Offers collectors at http://HOST:PORT/metrics while the block runs, and this process's memory and CPU time.
+    """Context that serves collectors at http://HOST:PORT/metrics, with this process's memory and CPU time.
 
     Raises:
-      CongraspError: it cannot listen there.
+      CongraspError: the port cannot be used.
     """
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
@@ -40,7 +40,7 @@ def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
     except (OSError, OverflowError) as error:
         reason = getattr(error, "strerror", None) or error
         raise CongraspError(
-            f"The metrics cannot be offered at {host}:{port} ({reason}).", "Choose another --metrics-port."
+            f"The metrics cannot be served at {host}:{port} ({reason}).", "Pass another --metrics-port."
         ) from None
     try:
         yield
@@ -51,23 +51,23 @@ def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
 
 
 class LearnerMetrics:
-    """A learner's status at the moment of the scrape, and the metrics of its last update."""
+    """Status of a learner at the time of the scrape, and the metrics of its last update."""
 
     def __init__(self, ask: Callable[[], Mapping[str, Any]]):
-        """The function returns what `services.ops.status.ask` does."""
+        """Uses a function with the result of `services.ops.status.ask`."""
         self._ask = ask
         self._values: Mapping[str, float] = {}
 
     def update(self, values: Mapping[str, float]) -> None:
-        """Takes the metrics of an update."""
+        """Stores the metrics of an update."""
         self._values = values
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing: what there is depends on the run."""
+        """Yields nothing, because the metrics depend on the run."""
         return ()
 
     def collect(self) -> Iterator[Metric]:
-        """See the class."""
+        """Yields the metrics of the class."""
         try:
             status = self._ask()
         except TransportError:
@@ -81,7 +81,7 @@ class LearnerMetrics:
         yield _gauge("queue_limit", "Rollouts that may wait.", status["queue"]["limit"])
         for name, value in status["rates"].items():
             yield _gauge(name, "Over the last ten seconds.", value)
-        yield from self._ledger(status["ledger"])
+        yield from self._counters(status["counters"])
         yield _gauge("roles_unlisted", "Processes beyond those that are listed.", status["unlisted"])
         yield from self._roles(status["roles"])
         update = _gauge("update", "Metrics of the last update, by the names of the log.", labels=["figure"])
@@ -90,11 +90,11 @@ class LearnerMetrics:
         yield update
 
     @staticmethod
-    def _ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:
+    def _counters(counters: Mapping[str, int]) -> Iterator[Metric]:
         """Counters of tickets and rollouts."""
         tickets = CounterMetricFamily("congrasp_learner_tickets", "Tickets by outcome.", labels=["outcome"])
         rollouts = CounterMetricFamily("congrasp_learner_rollouts", "Rollouts by outcome.", labels=["outcome"])
-        for name, value in ledger.items():
+        for name, value in counters.items():
             if name in _GAUGES:
                 yield _gauge(*_GAUGES[name], value)
             elif name != "queued":
@@ -125,26 +125,26 @@ class LearnerMetrics:
 
 
 def _gauge(name: str, help: str, value: float | None = None, labels: Sequence[str] | None = None) -> GaugeMetricFamily:
-    """A gauge of the learner, with its prefix."""
+    """Returns a gauge of the learner, with its prefix."""
     return GaugeMetricFamily(f"congrasp_learner_{name}", help, None if value is None else float(value), labels)
 
 
 class ActorMetrics:
-    """An actor's last rollout."""
+    """Metrics of an actor's last rollout."""
 
     def __init__(self) -> None:
         self._last: Mapping[str, float] = {}
 
     def rollout(self, values: Mapping[str, float]) -> None:
-        """Takes the metrics of a rollout; `rollouts` and `version` among them."""
+        """Stores the metrics of a rollout, including `rollouts` and `version`."""
         self._last = values
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing before the first rollout."""
+        """Yields nothing before the first rollout."""
         return ()
 
     def collect(self) -> Iterator[Metric]:
-        """See the class."""
+        """Yields the metrics of the class."""
         last = dict(self._last)
         yield CounterMetricFamily("congrasp_actor_rollouts", "Rollouts that it made.", last.pop("rollouts", 0.0))
         yield GaugeMetricFamily("congrasp_actor_version", "Policy version that acts.", last.pop("version", -1.0))
@@ -153,7 +153,7 @@ class ActorMetrics:
 
 
 class ServerMetrics:
-    """A policy server's answers and batches, and its health at the moment of the scrape."""
+    """Replies and batches of a policy server, and its health at the time of the scrape."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -161,7 +161,7 @@ class ServerMetrics:
         """Queries by outcome."""
         self._seconds = Histogram(
             "congrasp_policy_seconds",
-            "From the arrival of a query to its answer.",
+            "Time from the arrival of a query to its reply.",
             registry=None,
             buckets=[1e-3 * bound for bound in _MILLISECONDS],
         )
@@ -169,25 +169,25 @@ class ServerMetrics:
             "congrasp_policy_batch", "States in a batch.", registry=None, buckets=[1, 2, 4, 8, 16, 32, 64, 128]
         )
         self.health: Callable[[], Mapping[str, Any]] = dict
-        """Of the server, once there is one."""
+        """Health of the server, once there is one."""
 
     def answer(self, outcome: str, seconds: float) -> None:
-        """Takes note of an answer: answered, refused, overloaded or late."""
+        """Counts a reply: answered, refused, overloaded or late."""
         with self._lock:
             self.outcomes[outcome] += 1
         if outcome == "answered":
             self._seconds.observe(seconds)
 
     def batch(self, size: int) -> None:
-        """Takes note of a batch."""
+        """Counts a batch."""
         self._batch.observe(size)
 
     def describe(self) -> Iterable[Metric]:
-        """Nothing before there is a server."""
+        """Yields nothing before there is a server."""
         return ()
 
     def collect(self) -> Iterator[Metric]:
-        """See the class."""
+        """Yields the metrics of the class."""
         health = self.health()
         for name, help in (
             ("ready", "Whether it answers."),

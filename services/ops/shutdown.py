@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: drain, but never for longer than a few seconds."""
+"""Handling of Ctrl-C and SIGTERM: drains within a few seconds."""
 
 import contextlib
 import ctypes
@@ -13,18 +13,18 @@ import weakref
 from collections.abc import Iterator
 
 GRACE = 3.5
-"""Seconds between a signal and the end of the process at the latest."""
+"""Longest time between a signal and the end of the process, s."""
 PARENT_VARIABLE = "CONGRASP_PARENT"
-"""Environment variable by which a process makes its children end with it."""
-_REAP = 0.5  # seconds for all children to be gone
+"""Environment variable with which a process makes its children end with it."""
+_REAP = 0.5  # deadline for the end of all children, s
 _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 
 
 class Stop(threading.Event):
-    """Set by the first SIGINT or SIGTERM; loops poll it or wait on it.
+    """Event set by the first SIGINT or SIGTERM; loops poll it or wait on it.
 
     Attributes:
-      signal: number of the signal that came, or None.
+      signal: number of the received signal, or None.
     """
 
     def __init__(self) -> None:
@@ -33,22 +33,22 @@ class Stop(threading.Event):
 
     @property
     def exit_code(self) -> int:
-        """What the shell expects of a process that a signal ended; zero if none came."""
+        """Exit code of a process that a signal ended, for the shell; zero without a signal."""
         return 128 + self.signal if self.signal else 0
 
 
 @contextlib.contextmanager
 def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop]:
-    """A `Stop` that signals set while the block runs; only in the main thread.
+    """Context with a `Stop` that signals set; only in the main thread.
 
-    Python runs its handlers between two bytecodes of the main thread, which may sit in a compiler for a minute. The
-    interpreter's wake-up file descriptor is written at once, so a thread that reads it sets the event, and ends the
-    process if it has not ended by itself within `grace` seconds, or at once if a second signal comes: from a user who
-    is in a hurry, or from the kernel because the parent has ended (`follow_parent`).
+    Python runs handlers between two bytecodes of the main thread, which may be inside a compiler for a minute. The
+    interpreter's wake-up file descriptor is written at once, so a thread that reads it sets the event. It ends the
+    process if it is still running after `grace` seconds, or at once on a second signal, from the user or from the
+    kernel because the parent has ended (`follow_parent`).
 
     Args:
       grace: seconds from the signal to the forced end.
-      interrupt: also raise KeyboardInterrupt in the main thread, for code that polls nothing.
+      interrupt: also raises KeyboardInterrupt in the main thread, for code that does not poll.
     """
     stop = Stop()
     reader, writer = socket.socketpair()
@@ -63,7 +63,7 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
         ends = time.monotonic() + grace
         reader.settimeout(grace)
         with contextlib.suppress(TimeoutError):
-            if not reader.recv(1):  # the block has ended; what follows it has the rest of the time
+            if not reader.recv(1):  # the block has ended; later code has the remaining time
                 time.sleep(max(0.0, ends - time.monotonic()))
         _end(stop.exit_code)
 
@@ -84,12 +84,12 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
 
 
 def register_child(child: subprocess.Popen[bytes]) -> None:
-    """Registers a child, which a forced end of this process ends, too."""
+    """Registers a child, which a forced end of this process kills as well."""
     _children.add(child)
 
 
 def _end(code: int) -> None:
-    """Ends this process at once, and its children before it."""
+    """Ends this process at once, after its children."""
     children = list(_children)
     for child in children:
         child.kill()
@@ -101,7 +101,7 @@ def _end(code: int) -> None:
 
 
 def follow_parent() -> None:
-    """Asks the kernel for SIGTERM when the parent dies, if the parent wants that (Linux; elsewhere nothing happens)."""
+    """Requests SIGTERM from the kernel when the parent dies, if the parent wants that (Linux; elsewhere a no-op)."""
     parent = os.environ.pop(PARENT_VARIABLE, None)
     if parent is None or not sys.platform.startswith("linux"):
         return

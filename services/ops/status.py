@@ -1,4 +1,4 @@
-"""The status of a run: asks its learner, checks that its counters add up, and shows them as tables."""
+"""Status of a run: queries its learner, checks its counters, and formats them as tables."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -18,23 +18,23 @@ _SUMS = {
     "granted": ("running", "redeemed", "returned", "expired"),
     "accepted": ("consumed", "dropped", "queued"),
 }
-"""Counters that are the sums of others: no ticket and no accepted rollout is lost."""
+"""Counters that are sums of others: no ticket and no accepted rollout is lost."""
 _ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/s", "steps/s")
-_SHOWN = 100  # processes in a table
+_SHOWN = 100  # most processes in a table
 
 
 def ask(transport: Transport, run: str) -> dict[str, Any]:
-    """The status of a run by its learner, with `warnings`: a line for each counter that is wrong.
+    """Queries the status of a run from its learner, with `warnings`: a line for each inconsistent counter.
 
     Raises:
-      TransportError: there is no response for this run.
+      TransportError: no learner of this run responds.
     """
     found = dict(transport.query(Keys(run).status, Message({}, {}), timeout=_TIMEOUT).meta)
     return {**found, "warnings": warnings(found)}
 
 
 def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, Any] | None]:
-    """The status, again and again; None while the learner is disconnected."""
+    """Yields the status periodically; None while the learner is disconnected."""
     while True:
         began = time.monotonic()
         try:
@@ -45,26 +45,26 @@ def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, A
 
 
 def warnings(status: Mapping[str, Any]) -> list[str]:
-    """What does not add up in a learner's status; one line each."""
-    ledger, queue = status["ledger"], status["queue"]
+    """Inconsistencies of a learner's status, one line each."""
+    counters, queue = status["counters"], status["queue"]
     found = []
     for total, parts in _SUMS.items():
-        if ledger[total] != sum(ledger[part] for part in parts):
-            found.append(f"The counters do not add up: {total} {ledger[total]} is not {_sum(ledger, parts)}.")
-    if ledger["queued"] != queue["length"]:
-        found.append(f"{ledger['queued']} rollouts are counted as queued; the queue holds {queue['length']}.")
+        if counters[total] != sum(counters[part] for part in parts):
+            found.append(f"The counters are inconsistent: {total} {counters[total]} is not {_sum(counters, parts)}.")
+    if counters["queued"] != queue["length"]:
+        found.append(f"{counters['queued']} rollouts are counted as queued, but the queue holds {queue['length']}.")
     return found
 
 
-def _sum(ledger: Mapping[str, int], parts: tuple[str, ...]) -> str:
-    """A sum of counters as a formula."""
-    return " + ".join(f"{part} {ledger[part]}" for part in parts)
+def _sum(counters: Mapping[str, int], parts: tuple[str, ...]) -> str:
+    """Formats a sum of counters as a formula."""
+    return " + ".join(f"{part} {counters[part]}" for part in parts)
 
 
 def tables(status: Mapping[str, Any]) -> Group:
-    """The status for a terminal."""
+    """Formats the status for a terminal."""
     ended = ", finished" if status["finished"] else ""
-    roles = Table(title=f"{status['run']}, version {status['version']}, run id {status['epoch']}{ended}")
+    roles = Table(title=f"{status['run']}, version {status['version']}, run id {status['run_id']}{ended}")
     refused = any(role.get("refused") for role in status["roles"])
     for column in (*_ROLE, "refused") if refused else _ROLE:
         roles.add_column(column, justify="left" if column in _ROLE[:3] else "right")
@@ -74,18 +74,18 @@ def tables(status: Mapping[str, Any]) -> Group:
         counts = (version, role.get("lag", ""), role.get("rollouts", ""), *rates)
         who = (Text(ascii(role[name])[1:70].rstrip("'")) for name in ("role", "id", "incarnation"))
         roles.add_row(*who, *map(str, counts), *([str(role.get("refused", ""))] if refused else []))
-    ledger = Table(title="Counters: tickets and rollouts")
-    ledger.add_column("count")
-    ledger.add_column("number", justify="right")
-    ledger.add_column("which is")
-    for name, value in status["ledger"].items():
-        ledger.add_row(name, str(value), " + ".join(_SUMS.get(name, ())))
+    counters = Table(title="Counters: tickets and rollouts")
+    counters.add_column("count")
+    counters.add_column("number", justify="right")
+    counters.add_column("which is")
+    for name, value in status["counters"].items():
+        counters.add_row(name, str(value), " + ".join(_SUMS.get(name, ())))
     rates, queue = status["rates"], status["queue"]
     line = (
         f"{rates['rollouts_per_second']:.2f} rollouts/s, {rates['steps_per_second']:.0f} steps/s; "
         f"{queue['length']} rollout(s) of at most {queue['limit']} waiting"
     )
     more = len(status["roles"][_SHOWN:]) + status["unlisted"]
-    others = [Text(f"{more} more process(es) show that they are alive.")] if more else []
+    others = [Text(f"{more} more live process(es).")] if more else []
     wrong = (Text(f"Warning: {text}", style="yellow") for text in status["warnings"])
-    return Group(roles, *others, ledger, Text(line), *wrong)
+    return Group(roles, *others, counters, Text(line), *wrong)

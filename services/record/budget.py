@@ -1,7 +1,7 @@
-"""What the logs of one identity may cost a recorder: names that it keeps something of, and bytes a second.
+"""Budgets of the logs of one identity in a recorder: number of names, and bytes per second.
 
-An identity is a role and, of actors, a certificate. What exceeds a budget is left out, and the others' logs are not
-touched by it.
+An identity is a role and, for actors, a certificate. The excess over a budget is dropped; the logs of others are not
+affected.
 """
 
 import collections
@@ -12,22 +12,22 @@ from congrasp.common.errors import CongraspError
 from congrasp.learner.hub.rate_limit import certificate
 
 Name = tuple[str, str]
-"""Role and name of who publishes."""
+"""Role and name of a publisher."""
 
-_NAMES = 64  # of one identity
+_NAMES = 64  # names of one identity
 _IDENTITIES = 1024
-_IDLE = 60.0  # seconds after which a name makes room for another one
-_PER_SECOND, _MOST = 16 << 20, 256 << 20  # bytes that an identity's entries may have, and save up
+_IDLE = 60.0  # seconds after which a silent name may be replaced
+_PER_SECOND, _MOST = 16 << 20, 256 << 20  # bytes per second of an identity's entries, and their burst
 
 
 class LogBudget:
-    """Names and bytes by identity. Not safe for several threads."""
+    """Names and bytes by identity. Not thread-safe."""
 
     def __init__(self, on_forget: Callable[[Name], None], clock: Callable[[], float] = time.monotonic):
-        """Nobody is known.
+        """Starts without names.
 
         Args:
-          on_forget: given a name that made room for another one.
+          on_forget: called with a name that is replaced by another.
           clock: seconds, monotonic.
         """
         self._on_forget, self._clock = on_forget, clock
@@ -35,10 +35,10 @@ class LogBudget:
         self._bytes: dict[Name, tuple[float, float]] = {}
 
     def admit(self, who: Name) -> None:
-        """Notes that somebody publishes.
+        """Admits a message of a publisher.
 
         Raises:
-          CongraspError: his identity has too many names, or has used its bytes up.
+          CongraspError: its identity has too many names, or has used up its bytes.
         """
         identity, now = _identity(who), self._clock()
         if identity not in self._heard and len(self._heard) >= _IDENTITIES:
@@ -56,7 +56,7 @@ class LogBudget:
             raise CongraspError(f"One certificate publishes more than {_PER_SECOND >> 20} MiB of logs a second.")
 
     def charge(self, who: Name, size: int) -> None:
-        """Notes that so many bytes were recorded for somebody."""
+        """Charges a publisher for recorded bytes."""
         identity, now = _identity(who), self._clock()
         self._bytes[identity] = self._level(identity, now) - size, now
 

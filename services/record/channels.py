@@ -1,7 +1,7 @@
-"""What a recorder writes: entries on channels, whether into an MCAP file or to a live viewer.
+"""Output of a recorder: entries on channels, for an MCAP file or a live viewer.
 
-Metrics and signals are JSON with a JSON schema, so that their numbers can be plotted; events and scenes are Foxglove's
-Protobuf messages, which Rerun reads too; rollouts and raw episodes are the bytes of `common.wire.codec`.
+Metrics and signals are JSON with a JSON schema, so that viewers can plot them; events and scenes are Foxglove's
+Protobuf messages, which Rerun also reads; rollouts and raw episodes are the bytes of `common.wire.codec`.
 """
 
 import collections
@@ -18,12 +18,12 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import finite
 
 OPAQUE = "x-safetensors"
-"""Encoding of messages that are the bytes of `common.wire.codec`."""
+"""Encoding of messages in the format of `common.wire.codec`."""
 ROLLOUT_SCHEMA = "congrasp.Rollout"
 """Name of the schema of rollouts."""
 
 _FIELDS, _GROWTHS = 512, 32
-"""Fields of a topic, and times that its schema may grow: every schema is written whole."""
+"""Limits of a topic's fields, and of the growth of its schema, which is written in full each time."""
 _LONGEST_NAME, _DEEPEST = 128, 8
 
 CONVENTIONS = {
@@ -32,7 +32,7 @@ CONVENTIONS = {
     "frames": "world: z up, table's top at z = 0; <actor>/<link> and <actor>/object as in the simulation",
     "joints": "finger joints by name, in the order of the hand's 'q'; wrist x, y, z, then intrinsic x-y-z angles",
 }
-"""Written into every file: what the numbers mean."""
+"""Metadata of every file: meaning of the numbers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,12 +41,12 @@ class Channel:
 
     topic: str
     encoding: str
-    """Of the messages: json, protobuf or x-safetensors."""
+    """Encoding of the messages: json, protobuf or x-safetensors."""
     schema_name: str
     schema_encoding: str
     schema: bytes
     latched: bool = False
-    """Sent seldom and needed by whoever joins later: a live viewer that subscribes is given the last message."""
+    """Sent rarely and needed by late subscribers: a live viewer that subscribes receives the last message."""
 
 
 class Entry(NamedTuple):
@@ -54,43 +54,43 @@ class Entry(NamedTuple):
 
     channel: Channel
     time: int
-    """Nanoseconds since 1970: when the message happened, by the recorder's clock."""
+    """Nanoseconds since 1970 of the event, by the recorder's clock."""
     data: bytes
 
 
 @functools.lru_cache(maxsize=4096)
 def protobuf_channel(topic: str, kind: type[Protobuf], *, latched: bool = False) -> Channel:
-    """A channel of one of Foxglove's messages, with the descriptors a reader needs."""
-    own: Any = kind  # hashable, which its type does not say
+    """Returns a channel of one of Foxglove's messages, with the descriptors that readers need."""
+    own: Any = kind  # hashable, although its type does not declare it
     return Channel(topic, "protobuf", kind.DESCRIPTOR.full_name, "protobuf", _descriptors(own), latched)
 
 
 @functools.cache
 def _descriptors(kind: Any) -> bytes:
-    """The schema of one of Foxglove's messages, one object for all channels."""
+    """Schema of one of Foxglove's messages, shared by all channels."""
     return build_file_descriptor_set(kind).SerializeToString()
 
 
 @functools.lru_cache(maxsize=4096)
 def opaque_channel(topic: str, name: str) -> Channel:
-    """A channel of encoded `common.wire.codec.Message`s; `name` says of which kind."""
+    """Returns a channel of encoded `common.wire.codec.Message`s of the kind `name`."""
     return Channel(topic, OPAQUE, name, "", b"")
 
 
 class JsonChannels:
-    """Channels of JSON objects whose schemas grow when new fields appear: a schema must name a field to plot it.
+    """Channels of JSON objects whose schemas grow with new fields, since a field must be in the schema to be plotted.
 
-    They grow up to a number of fields and of times; what comes after that is left out.
+    The numbers of fields and of changes are limited; further fields are dropped.
     """
 
     def __init__(self) -> None:
-        """No topic is known."""
+        """Starts without topics."""
         self._fields: dict[str, dict[str, Any]] = {}
         self._channels: dict[str, Channel] = {}
         self._growths: collections.Counter[str] = collections.Counter()
 
     def entry(self, topic: str, time: int, value: Mapping[str, Any]) -> Entry:
-        """The object as an entry; fields that are NaN or infinite are left out, because JSON has no such numbers."""
+        """Returns the object as an entry, without fields that are NaN or infinite, which JSON cannot represent."""
         plain = finite(value)
         fields = self._fields.setdefault(topic, {})
         known = _known(fields, plain)
@@ -98,7 +98,7 @@ class JsonChannels:
             plain = known
         if _merge(fields, plain) or topic not in self._channels:
             self._growths[topic] += 1
-            # Schemas are known by their name, so every topic has its own.
+            # Schemas are identified by name, so every topic has a separate one.
             schema = json.dumps(_schema(fields)).encode()
             self._channels[topic] = Channel(topic, "json", f"congrasp{topic.replace('/', '.')}", "jsonschema", schema)
         return Entry(self._channels[topic], time, json.dumps(plain, separators=(",", ":")).encode())
@@ -110,16 +110,16 @@ class JsonChannels:
 
 
 def check_field(name: str) -> str:
-    """Returns a field's name; a CongraspError if it is too long, or a group of groups of too many groups."""
+    """Returns a field's name; raises a CongraspError if it is too long, or nested too deep."""
     if len(name) > _LONGEST_NAME or name.count("/") > _DEEPEST:
-        raise CongraspError(f"{ascii(name)[:60]} is too long or too deep for the name of a metric.")
+        raise CongraspError(f"{ascii(name)[:60]} is too long or nested too deep for the name of a metric.")
     return name
 
 
 def nest(values: Mapping[str, float]) -> dict[str, Any]:
-    """`{"term/contact": 1}` as `{"term": {"contact": 1}}`; the inverse of `flatten`.
+    """Converts `{"term/contact": 1}` to `{"term": {"contact": 1}}`; the inverse of `flatten`.
 
-    A name that is also the beginning of another (`loss` beside `loss/policy`) becomes that group's empty name.
+    A name that is also a prefix of another (`loss` and `loss/policy`) becomes that group's empty name.
     """
     tree: dict[str, Any] = {}
     groups = {name.rsplit("/", i)[0] for name in values for i in range(1, name.count("/") + 1)}
@@ -133,7 +133,7 @@ def nest(values: Mapping[str, float]) -> dict[str, Any]:
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """`{"term": {"contact": 1}}` as `{"term/contact": 1}`."""
+    """Converts `{"term": {"contact": 1}}` to `{"term/contact": 1}`."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         path = f"{prefix}/{name}".strip("/")
@@ -145,7 +145,7 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _merge(fields: dict[str, Any], value: Mapping[str, Any]) -> bool:
-    """Adds the fields of an object to those known; true if any was new."""
+    """Adds the fields of an object to the known ones; returns True if any is new."""
     grown = False
     for name, item in value.items():
         if isinstance(item, Mapping):
@@ -158,7 +158,7 @@ def _merge(fields: dict[str, Any], value: Mapping[str, Any]) -> bool:
 
 
 def _known(fields: Mapping[str, Any], value: Mapping[str, Any]) -> dict[str, Any]:
-    """What of an object is in the fields that are known."""
+    """Returns the part of an object in known fields."""
     kept = {name: item for name, item in value.items() if name in fields}
     return {
         name: _known(fields[name], item) if isinstance(item, Mapping) and isinstance(fields[name], dict) else item
@@ -167,18 +167,18 @@ def _known(fields: Mapping[str, Any], value: Mapping[str, Any]) -> dict[str, Any
 
 
 def _count(fields: Mapping[str, Any]) -> int:
-    """Fields at any depth."""
+    """Number of fields at any depth."""
     return sum(_count(item) if isinstance(item, Mapping) else 1 for item in fields.values())
 
 
 def _kind(item: Any) -> str:
-    """The JSON type of a value."""
+    """JSON type of a value."""
     if isinstance(item, bool):
         return "boolean"
     return "number" if isinstance(item, int | float) else "string"
 
 
 def _schema(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """The JSON schema of known fields."""
+    """JSON schema of known fields."""
     properties = {name: _schema(kind) if isinstance(kind, dict) else {"type": kind} for name, kind in fields.items()}
     return {"type": "object", "properties": properties}

@@ -1,4 +1,4 @@
-"""Log messages as they travel (`congrasp/<run>/log/<kind>/<role>/<name>`), turned into what a recorder writes.
+"""Converts log messages (`congrasp/<run>/log/<kind>/<role>/<name>`) to the entries of a recorder.
 
 Kinds: `metrics` (meta: time, update or version, values), `event` (time, level, text), `version` (any scalars),
 `rollout` (some worlds of an actor's rollout, opaque) and `episode` (see `services.record.scene`).
@@ -26,20 +26,20 @@ from congrasp.services.record.channels import (
 from congrasp.services.record.scene import check_episode, duration, episode_entries
 
 _AHEAD = 60_000_000_000
-"""ns by which an actor's episodes may be behind one another; those that would come later are left out."""
+"""Longest queue of an actor's episodes in ns; later ones are dropped."""
 _TIMES = 2**62
-"""ns since 1970 that a time may be."""
+"""Limit of times, ns since 1970."""
 _LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
 
 
 class Converter:
-    """Remembers what spans messages: the schemas' fields, the actors' places, and when each actor's episode ends.
+    """State across messages: fields of schemas, slots of actors, and the end of each actor's episode.
 
-    All that is kept is bounded, for every identity by itself (`services.record.budget`).
+    All of it is bounded, separately for every identity (`services.record.budget`).
     """
 
     def __init__(self) -> None:
-        """Nothing has come yet."""
+        """Starts without messages."""
         self._json = JsonChannels()
         self._budget = LogBudget(self._forget)
         self._slots: dict[str, int] = {}
@@ -53,25 +53,25 @@ class Converter:
         }
 
     def __call__(self, key: str, message: Message, now: int) -> list[Entry]:
-        """Entries of one message that arrived at `now` (ns since 1970).
+        """Converts one message that arrived at `now` (ns since 1970) to entries.
 
         Raises:
-          CongraspError: it is not a whole log message, or beyond what its sender may record.
+          CongraspError: it is not a valid log message, or exceeds its sender's budget.
         """
         *_, kind, role, name = ("", "", *key.split("/"))
         if kind not in self._kinds:
-            raise CongraspError(f"{ascii(kind)[:60]} is no kind of log message.")
+            raise CongraspError(f"{ascii(kind)[:60]} is not a kind of log message.")
         who = check_name("role", role), check_name("role", name)
         self._budget.admit(who)
         try:
             entries = list(self._kinds[kind](role, name, Message(message.arrays, finite(message.meta)), now))
         except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
-            raise CongraspError(f"It is no whole {kind} message ({type(error).__name__}).") from None
+            raise CongraspError(f"It is not a valid {kind} message ({type(error).__name__}).") from None
         self._budget.charge(who, sum(len(entry.data) for entry in entries))
         return entries
 
     def _forget(self, who: Name) -> None:
-        """Frees what is kept of one that has been silent."""
+        """Drops the state of a silent publisher."""
         role, name = who
         for topic in (f"/metrics/{role}/{name}", f"/version/{role}/{name}", f"/episode/{name}/signals"):
             self._json.forget(topic)
@@ -79,17 +79,17 @@ class Converter:
         self._ends.pop(name, None)
 
     def _metrics(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
-        """Numbers of an update or a rollout."""
+        """Yields the numbers of an update or a rollout."""
         validate(_timed(message, now), METRICS)
         values = {check_field(key): float(value) for key, value in message.meta["values"].items()}
         yield self._json.entry(f"/metrics/{role}/{name}", now, {**_scalars(message.meta), "values": nest(values)})
 
     def _version(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
-        """A published version."""
+        """Yields a published version."""
         yield self._json.entry(f"/version/{role}/{name}", now, _scalars(message.meta))
 
     def _event(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
-        """A line of the log."""
+        """Yields a line of the log."""
         validate(event := _timed(message, now), EVENT)
         level = _LEVELS.get(event.meta["level"].lower(), Log.UNKNOWN)
         log = Log(level=level, message=event.meta["text"], name=f"{role}/{name}")
@@ -97,16 +97,16 @@ class Converter:
         yield Entry(protobuf_channel(f"/events/{role}/{name}", Log), now, log.SerializeToString())
 
     def _rollout(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
-        """A rollout as it came."""
+        """Yields a rollout unchanged."""
         yield Entry(opaque_channel(f"/rollout/{name}", ROLLOUT_SCHEMA), now, encode(message))
 
     def _episode(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
-        """An episode's scene, step by step."""
+        """Yields an episode's scene, step by step."""
         check_episode(message)
-        # An episode that comes while the one before it still plays waits for its end.
+        # An episode that arrives while the previous one is playing waits for its end.
         start = max(now, self._ends.get(name, 0))
         if start > now + _AHEAD:
-            raise CongraspError(f"The episodes before it still play for {(start - now) / 1e9:.0f} s.")
+            raise CongraspError(f"The previous episodes are still playing for {(start - now) / 1e9:.0f} s.")
         taken = set(self._slots.values())
         slot = self._slots.setdefault(name, next(i for i in range(len(taken) + 1) if i not in taken))
         yield from episode_entries(name, message, start, slot, self._json)
@@ -114,12 +114,12 @@ class Converter:
 
 
 def _timed(message: Message, now: int) -> Message:
-    """The message with the time of its arrival (ns) where it has none of its own."""
+    """Returns the message with its time of arrival (ns) if it has no time."""
     return Message(message.arrays, {"time": now / 1e9, **message.meta})
 
 
 def _scalars(meta: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a message's meta data is a plain value of bounded length."""
+    """Returns the entries of a message's metadata that are plain values of bounded length."""
     return {
         check_field(key): value
         for key, value in meta.items()

@@ -1,4 +1,4 @@
-"""Offers log entries to the Foxglove app over its WebSocket while they happen."""
+"""Serves log entries to the Foxglove app over its WebSocket as they happen."""
 
 import collections
 import heapq
@@ -12,26 +12,26 @@ from congrasp.common.errors import CongraspError
 from congrasp.services.record.channels import Channel, Entry
 
 _HOST = "127.0.0.1"
-_BACKLOG, _BYTES = 20000, 256 << 20  # entries that may wait for their time; beyond it the newest are left out
-_TOPICS = 4096  # that are open at a time; beyond it the one that was silent for longest is closed
-_KEPT = 64 << 20  # bytes of latched messages that are kept for whoever subscribes later
+_BACKLOG, _BYTES = 20000, 256 << 20  # entries queued for their time; the newest beyond this are dropped
+_TOPICS = 4096  # open channels; beyond this the one that was silent for longest is closed
+_KEPT = 64 << 20  # bytes of latched messages kept for late subscribers
 
 
 class LiveServer:
     """A WebSocket server; a sink of `services.record.recorder.Recorder`.
 
-    An episode arrives at once, after it has happened; its entries are sent when their time comes, so that the viewer
-    plays it. Whoever subscribes later is given the last message of latched channels.
+    An episode arrives as a whole after its end; its entries are sent at their times, so that the viewer plays it. A
+    late subscriber receives the last message of latched channels.
     """
 
     def __init__(self, port: int):
-        """Listens on the loopback interface: there is no authentication, and anyone who reaches it sees the run.
+        """Listens on the loopback interface: there is no authentication, and every client can watch the run.
 
         Args:
-          port: TCP port; 0 takes a free one (see `port`).
+          port: TCP port; 0 uses a free one (see `port`).
 
         Raises:
-          CongraspError: the package is absent, or the port is busy.
+          CongraspError: the package is not installed, or the port is in use.
         """
         try:
             import foxglove
@@ -43,13 +43,13 @@ class LiveServer:
         self._context = foxglove.Context()
         self._topics: collections.OrderedDict[str, tuple[Channel, Any]] = collections.OrderedDict()
         self._last: collections.OrderedDict[str, Entry] = collections.OrderedDict()
-        self._kept = self._held = 0  # bytes of these, and of what waits
-        self._changed = threading.Lock()  # of `_held`, `left_out`
+        self._kept = self._held = 0  # bytes of these, and of queued entries
+        self._changed = threading.Lock()  # guards `_held` and `left_out`
         self._waiting: list[tuple[int, int, Entry]] = []
         self._number = itertools.count()
         self._incoming: queue.SimpleQueue[Entry | str | None] = queue.SimpleQueue()
         self.left_out: collections.Counter[str] = collections.Counter()
-        """Entries that were not sent because too many waited, by topic."""
+        """Number of entries dropped because the queue was full, by topic."""
         live = self
 
         class Listener(foxglove.websocket.ServerListener):
@@ -62,14 +62,14 @@ class LiveServer:
             )
         except (OSError, RuntimeError) as error:
             raise CongraspError(
-                f"The live view cannot listen on {_HOST}:{port} ({error}).", "Choose another port with --live."
+                f"The live view cannot listen on {_HOST}:{port} ({error}).", "Pass another port with --live."
             ) from None
         self.port = self._server.port
         self._thread = threading.Thread(target=self._work, daemon=True, name="live view")
         self._thread.start()
 
     def write(self, entry: Entry) -> None:
-        """Takes an entry; it is sent at its time, or left out if too much waits."""
+        """Queues an entry until its time, or drops it if the queue is full."""
         with self._changed:
             if self._held + len(entry.data) > _BYTES or self._incoming.qsize() > _BACKLOG:
                 self.left_out[entry.channel.topic] += 1
@@ -78,13 +78,13 @@ class LiveServer:
         self._incoming.put(entry)
 
     def close(self, timeout: float = 3.0) -> None:
-        """Ends the server; entries whose time has not come are not sent."""
+        """Stops the server; queued entries are not sent."""
         self._incoming.put(None)
         self._thread.join(timeout)
         self._server.stop()
 
     def __enter__(self) -> "LiveServer":
-        """The server itself."""
+        """Returns the server."""
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -92,7 +92,7 @@ class LiveServer:
         self.close()
 
     def _work(self) -> None:
-        """Sends entries when their time comes, and latched ones to new subscribers."""
+        """Sends entries at their times, and latched ones to new subscribers."""
         while True:
             wait = max(0.0, (self._waiting[0][0] - time.time_ns()) / 1e9) if self._waiting else None
             try:
@@ -113,7 +113,7 @@ class LiveServer:
                     self.left_out[item.channel.topic] += 1
 
     def _let_go(self, entry: Entry) -> Entry:
-        """Returns an entry that no longer waits."""
+        """Removes an entry from the accounting of the queue, and returns it."""
         with self._changed:
             self._held -= len(entry.data)
         return entry
@@ -129,7 +129,7 @@ class LiveServer:
         self._topics[topic][1].log(entry.data, log_time=entry.time)
 
     def _keep(self, entry: Entry) -> None:
-        """Keeps the last message of a latched channel, as long as the newest of all topics have room."""
+        """Keeps the last message of a latched channel, within the limit of all topics."""
         before = self._last.pop(entry.channel.topic, None)
         self._last[entry.channel.topic] = entry
         self._kept += len(entry.data) - (len(before.data) if before else 0)
@@ -137,7 +137,7 @@ class LiveServer:
             self._kept -= len(self._last.popitem(last=False)[1].data)
 
     def _advertise(self, channel: Channel) -> None:
-        """Opens a channel; a topic whose schema has grown gets a new one in place of the old."""
+        """Opens a channel; a topic whose schema has grown gets a new one."""
         if channel.topic in self._topics:
             self._topics.pop(channel.topic)[1].close()
         elif len(self._topics) >= _TOPICS:

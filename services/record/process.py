@@ -1,4 +1,4 @@
-"""The recorder as a process of its own."""
+"""The recorder as a separate process."""
 
 import contextlib
 import functools
@@ -28,7 +28,7 @@ def record_run(
     structured: bool = False,
     certs: urls.Certs = None,
 ) -> int:
-    """Records until `duration` seconds have passed, Ctrl-C, or, without a live view, the disk refuses.
+    """Records until `duration` seconds have passed, Ctrl-C is pressed or, without a live view, the disk fails.
 
     Args:
       connect: endpoint of the learner.
@@ -36,14 +36,14 @@ def record_run(
       out: folder for the files.
       live: port of the live view, or None.
       duration: seconds, or None.
-      structured: write to the log alone, without a progress line.
+      structured: writes only to the log, without a progress line.
       certs: folder of an observer's certificate, or None.
 
     Returns:
       Zero.
 
     Raises:
-      CongraspError: recording stopped, or nothing could be recorded at all.
+      CongraspError: recording stopped, or nothing could be recorded.
     """
     console = Console(stderr=True, quiet=structured)
     warn = functools.partial(log, "warning") if structured else lambda text: console.print(f"congrasp: {text}")
@@ -70,14 +70,14 @@ def record_run(
                     print(file)
             console.print(_state(recorder))
     if recorder.error:
-        raise CongraspError(recorder.error, "Free space and start again; a new file begins.")
+        raise CongraspError(recorder.error, "Free space and restart the recorder, which begins a new file.")
     if not recorder.messages:
-        console.print(f"Nothing came from the run '{run}'. Is that its name? 'congrasp status' shows who works on it.")
+        console.print(f"No messages from the run '{run}'. Check its name; 'congrasp status' lists its processes.")
     return 0
 
 
 def _state(recorder: Recorder) -> str:
-    """One line about what was recorded so far."""
+    """Summary of the recording so far."""
     size = sum(file.stat().st_size for file in recorder.files if file.exists())
     return (
         f"{recorder.messages} messages recorded, {size / 1e6:.1f} MB; "

@@ -1,4 +1,4 @@
-"""Reads recordings, whole, cut off or damaged: a killed writer's file reads up to its last flush."""
+"""Reads recordings, complete, cut off or damaged: a killed writer's file is readable up to its last flush."""
 
 import collections
 import logging
@@ -36,30 +36,30 @@ def log_files(path: pathlib.Path) -> list[pathlib.Path]:
     """The recordings at `path`, a file or a folder (with those below it), in the order of their names.
 
     Raises:
-      CongraspError: there are none.
+      CongraspError: there are no recordings.
     """
     if not path.exists():
-        raise CongraspError(f"There is no file or folder {path}.", "Name a run's folder or an MCAP file.")
+        raise CongraspError(f"There is no file or folder {path}.", "Pass a run's folder or an MCAP file.")
     if path.is_file():
         return [path]
     found = sorted([*path.rglob("*.mcap"), *path.rglob(f"*.mcap{PART}")], key=lambda file: (file.name, file))
     if not found:
-        raise CongraspError(f"There is no recording (*.mcap) in {path}.", "Name a run's folder or an MCAP file.")
+        raise CongraspError(f"There is no recording (*.mcap) in {path}.", "Pass a run's folder or an MCAP file.")
     return found
 
 
 def read_records(
     path: pathlib.Path, wanted: Callable[[str], bool] = lambda topic: True, warn: Callable[[str], None] = _log.warning
 ) -> Iterator[Record]:
-    """Messages of one file in the order in which they were written, as far as the file is intact.
+    """Yields the messages of one file in the order of writing, as far as the file is intact.
 
     Args:
       path: the file.
-      wanted: which topics to read.
-      warn: called with one line at the end if damage kept messages from being read, which says how many and where.
+      wanted: predicate of the topics to read.
+      warn: called at the end with the number and places of messages lost by damage, if any.
 
     Raises:
-      CongraspError: the file cannot be opened, or is no MCAP file.
+      CongraspError: the file cannot be opened, or is not an MCAP file.
     """
     try:
         file = open_file(path)
@@ -68,7 +68,7 @@ def read_records(
     with file:
         start = file.read(len(MCAP0_MAGIC))
         if not MCAP0_MAGIC.startswith(start):
-            raise CongraspError(f"{path} is not an MCAP file.", "Name a file that 'congrasp record' wrote.")
+            raise CongraspError(f"{path} is not an MCAP file.", "Pass a file written by 'congrasp record'.")
         dropped = Dropped()
         try:
             for schema, channel, message in read_messages(file, dropped):
@@ -82,16 +82,16 @@ def read_records(
 
 
 def is_episode(topic: str) -> bool:
-    """Whether a topic is that of an actor's whole episodes."""
+    """True if a topic is that of an actor's whole episodes."""
     return topic.startswith("/episode/") and topic.endswith("/raw")
 
 
 def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Every metric of a run's recordings, by `<role>/<name>/<metric>`.
+    """Reads every metric of a run's recordings, by `<role>/<name>/<metric>`.
 
     Returns:
-      For each metric its steps (n,), rising (updates, else versions, else seconds since the first message), and
-      values (n,). Where a run was resumed from a checkpoint, the later value of a step counts.
+      For each metric its steps (n,), rising (updates, else versions, else seconds since the first message), and values
+      (n,). If a run was resumed from a checkpoint, the later value of a step is used.
     """
     series: dict[str, dict[float, float]] = collections.defaultdict(dict)
     first: int | None = None
@@ -109,24 +109,24 @@ def read_metrics(path: pathlib.Path) -> dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def metrics_of(record: Record) -> dict[str, Any]:
-    """The object of a record of metrics: `values` {name: number, or a group}, and numbers beside it.
+    """Returns the object of a record of metrics: `values` {name: number, or a group}, and further numbers.
 
     Raises:
-      CongraspError: it is none.
+      CongraspError: the record is not valid.
     """
     found = parse_json(record.data, f"A record of {ascii(record.topic)[:100]}")
     values = found.get("values") if isinstance(found, dict) else None
     steps = [found.get(name, 0) for name in ("update", "version")] if isinstance(found, dict) else []
     if not isinstance(values, dict) or not all(isinstance(n, int | float) for n in [*flatten(values).values(), *steps]):
-        raise CongraspError(f"A record of {ascii(record.topic)[:100]} holds no metrics.")
+        raise CongraspError(f"A record of {ascii(record.topic)[:100]} has no metrics.")
     return found
 
 
 def read_episodes(path: pathlib.Path) -> Iterator[Message]:
-    """The recorded episodes at `path`, a file or a folder, as the actors sent them, in the order of recording.
+    """Yields the recorded episodes at `path`, a file or a folder, as sent by the actors, in the order of recording.
 
     Raises:
-      CongraspError: one is no whole episode.
+      CongraspError: an episode is not valid.
     """
     for episode in _messages(path, EPISODE_SCHEMA, is_episode):
         check_episode(episode)
@@ -134,15 +134,15 @@ def read_episodes(path: pathlib.Path) -> Iterator[Message]:
 
 
 def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Message:
-    """One of the recorded episodes at `path`.
+    """Returns one of the recorded episodes at `path`.
 
     Args:
       path: a file or a folder.
-      index: from 0; -1 is the last.
-      success: count only episodes that succeeded.
+      index: index from 0; -1 is the last.
+      success: counts only successful episodes.
 
     Raises:
-      CongraspError: there is none of this index; the line says how many there are.
+      CongraspError: there is no such index; the message gives their number.
     """
     last: collections.deque[Message] = collections.deque(maxlen=max(1, -index))
     count = 0
@@ -154,12 +154,12 @@ def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Me
                 break
     if not -count <= index < count:
         kind = "successful episodes" if success else "episodes"
-        raise CongraspError(f"{path} holds {count} {kind}, not one with index {index}.")
+        raise CongraspError(f"{path} holds {count} {kind}, none with index {index}.")
     return last[0 if index < 0 else -1]
 
 
 def read_rollouts(path: pathlib.Path) -> Iterator[Message]:
-    """The recorded rollouts at `path`, a file or a folder, as the actors sent them, in the order of recording.
+    """Yields the recorded rollouts at `path`, a file or a folder, as sent by the actors, in the order of recording.
 
     Axes are (T, B, ...); `meta["layout"]` lists the blocks of an observation with their sizes.
     """
@@ -167,7 +167,7 @@ def read_rollouts(path: pathlib.Path) -> Iterator[Message]:
 
 
 def _messages(path: pathlib.Path, schema: str, wanted: Callable[[str], bool]) -> Iterator[Message]:
-    """Decoded messages of one schema on the wanted topics."""
+    """Yields decoded messages of one schema on the wanted topics."""
     for file in log_files(path):
         for record in read_records(file, wanted):
             if record.schema == schema:

@@ -1,4 +1,4 @@
-"""Records what a run publishes under `log/**`, in a thread of its own, and never holds the run up."""
+"""Records the messages that a run publishes under `log/**`, in a separate thread, without blocking the run."""
 
 import pathlib
 import sys
@@ -17,14 +17,14 @@ from congrasp.services.record.entries import Converter
 from congrasp.services.record.writer import LogWriter
 
 FLUSH_SECONDS = 0.5
-"""A killed recorder loses at most this much."""
+"""Greatest time that a killed recorder loses."""
 
 
 class Sink(Protocol):
-    """Where else entries go, such as a live viewer."""
+    """Additional receiver of entries, such as a live viewer."""
 
     def write(self, entry: Entry) -> None:
-        """Takes an entry; must not block."""
+        """Accepts an entry; must not block."""
 
 
 class Recorder:
@@ -32,8 +32,8 @@ class Recorder:
 
     Attributes:
       messages: log messages recorded.
-      damaged: messages that were not what their key says, or too many, and were left out.
-      error: why recording stopped; empty while it continues.
+      damaged: messages that were invalid for their key, or over budget, and were dropped.
+      error: reason why recording stopped; empty while it continues.
     """
 
     def __init__(
@@ -48,17 +48,17 @@ class Recorder:
         max_seconds: float = 600.0,
         warn: Callable[[str], None] = lambda text: print(f"congrasp: {text}", file=sys.stderr, flush=True),
     ):
-        """Subscribes; `start` begins to write.
+        """Subscribes; `start` begins writing.
 
         Args:
-          transport: any endpoint of the run; it stays the caller's.
+          transport: any endpoint of the run; the caller closes it.
           run: name of the run.
-          directory: where files go; None records nothing (for sinks alone).
-          name: how the files' names begin.
-          sinks: who else is given every entry.
-          depth: messages kept when they come faster than they are written; then the oldest are dropped.
+          directory: folder for the files; None only serves the sinks.
+          name: prefix of the files' names.
+          sinks: additional receivers of every entry.
+          depth: messages buffered if they arrive faster than they are written; beyond it the oldest are dropped.
           max_seconds: see `LogWriter`.
-          warn: takes a line about what goes wrong.
+          warn: called with one line for each problem.
         """
         begin = file_name(name, "a recording")
         self._writer = LogWriter(directory, begin, run=run, max_seconds=max_seconds) if directory else None
@@ -72,26 +72,26 @@ class Recorder:
 
     @property
     def dropped(self) -> int:
-        """Messages lost: on the way, or because they came faster than they could be written."""
+        """Number of messages lost in transit, or because they arrived faster than they could be written."""
         return self._subscription.dropped
 
     @property
     def native_id(self) -> int | None:
-        """The kernel's number of the recorder's thread; None before it starts."""
+        """Native id of the recorder's thread; None before it starts."""
         return self._thread.native_id
 
     @property
     def files(self) -> list[pathlib.Path]:
-        """The files so far, the one being written last."""
+        """Files so far, the current one last."""
         return list(self._writer.files) if self._writer else []
 
     def start(self) -> "Recorder":
-        """Begins to record; returns the recorder."""
+        """Starts recording; returns the recorder."""
         self._thread.start()
         return self
 
     def close(self, timeout: float = 5.0) -> None:
-        """Writes what has arrived, finishes the file and ends the thread, within `timeout` seconds."""
+        """Writes received messages, finishes the file and ends the thread, within `timeout` seconds."""
         self._deadline = time.monotonic() + 0.8 * timeout
         self._stop.set()
         if self._thread.ident is not None:
@@ -107,7 +107,7 @@ class Recorder:
         self.close()
 
     def _work(self) -> None:
-        """Receives, writes and flushes until it is told to stop."""
+        """Receives, writes and flushes until it is stopped."""
         flushed = time.monotonic()
         while True:
             received = self._subscription.receive(0.0 if self._stop.is_set() else 0.1)
@@ -121,13 +121,13 @@ class Recorder:
         self._on_disk(lambda writer: writer.close())
 
     def _take(self, key: str, message: Message) -> None:
-        """Converts and writes one message; one that is not what its key says is counted and left out."""
+        """Converts and writes one message; an invalid one is counted and dropped."""
         try:
             entries = self._convert(key, message, time.time_ns())
-        except Exception as error:  # whatever a peer sends, this thread continues
+        except Exception as error:  # this thread continues after any message from a peer
             self.damaged += 1
             if self.damaged == 1:
-                what = f"a log message on {ascii(key)[:100]} was left out: {str(error)[:300]}"
+                what = f"a log message on {ascii(key)[:100]} was dropped: {str(error)[:300]}"
                 self._warn(str(CongraspError(what)))
             return
         self.messages += 1
@@ -137,7 +137,7 @@ class Recorder:
         self._on_disk(lambda writer: writer.write(*entries))
 
     def _on_disk(self, action: Callable[[LogWriter], object]) -> None:
-        """Does something with the writer; when that fails, recording stops and the run continues."""
+        """Runs an action of the writer; if it fails, recording stops and the run continues."""
         if self._writer is None or self.error:
             return
         try:
@@ -148,8 +148,8 @@ class Recorder:
             )
             where = self._writer.files[-1] if self._writer.files else "the first file"
             self.error = (
-                f"Recording stopped, {where} could not be written ({reason}); "
-                "what was recorded before is kept and the run goes on."
+                f"Recording stopped, because {where} could not be written ({reason}). Earlier messages are kept, "
+                "and the run continues."
             )
             self._writer.abandon()
             self._warn(self.error)

@@ -1,7 +1,7 @@
-"""Reads an MCAP file as far as it is intact: damaged chunks are left out and counted, those after them are read.
+"""Reads the intact parts of an MCAP file: damaged chunks are dropped and counted, later ones are read.
 
 The layout is that of https://mcap.dev/spec: records of an opcode (1 byte), a length (8) and content. A chunk's content
-has a CRC-32 of its uncompressed records. Where a record cannot be one, reading goes on at the next Zstandard chunk.
+has a CRC-32 of its uncompressed records. After an invalid record, reading resumes at the next Zstandard chunk.
 """
 
 import dataclasses
@@ -22,30 +22,30 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 DAMAGE = (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError)
-"""What the `mcap` package raises on damaged files."""
+"""Exceptions of the `mcap` package on damaged files."""
 _FRAME = struct.Struct("<BQ")
 _ZSTD = b"\x04\x00\x00\x00zstd"
-_ZSTD_AT = _FRAME.size + 28  # in a chunk's record; before it are times, size and CRC, after it the data's length
+_ZSTD_AT = _FRAME.size + 28  # in a chunk's record; times, size and CRC precede it, the data's length follows
 _HEAD = _ZSTD_AT + len(_ZSTD) + 8
 _FOOTER, _CRC = struct.Struct("<QQI"), struct.Struct("<I")
-_LIMIT = 512 << 20  # bytes of a record, and of what a chunk inflates to
+_LIMIT = 512 << 20  # limit of a record, and of an inflated chunk, bytes
 _BLOCK = 1 << 20
 _PLACES = 5
 
 
 @dataclasses.dataclass
 class Dropped:
-    """What of a file could not be read."""
+    """Parts of a file that could not be read."""
 
     places: list[int] = dataclasses.field(default_factory=list)
-    """Bytes at which damage begins."""
+    """Offsets at which damage begins."""
     messages: int = 0
-    """Messages that are known to have been there, from chunks' indexes, or that are of an unknown channel."""
+    """Messages known to be lost, from chunks' indexes, or of an unknown channel."""
     cut: int = 0
-    """Bytes of an unfinished record at the end: the writer was killed, or is still writing."""
+    """Bytes of an incomplete record at the end: the writer was killed, or is still writing."""
 
     def __str__(self) -> str:
-        """One line; empty if there is nothing to say of a file but that its end is cut."""
+        """One line; empty if at most the end of the file is cut."""
         if not self.places and not self.messages:
             return ""
         more = ", …" if len(self.places) > _PLACES else ""
@@ -55,11 +55,11 @@ class Dropped:
 
 
 def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | None, Channel, Message]]:
-    """Messages with their channels, in the order in which they were written.
+    """Yields messages with their channels, in the order of writing.
 
     Args:
-      file: an MCAP file that can be read at any place.
-      dropped: what could not be read is noted here, completely once the iterator is at its end.
+      file: a seekable MCAP file.
+      dropped: receives the parts that could not be read; complete once the iterator is exhausted.
     """
     size, position = file.seek(0, io.SEEK_END), len(MCAP0_MAGIC)
     schemas: dict[int, Schema] = {}
@@ -68,7 +68,7 @@ def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | N
     while position < size:
         opcode, records, end = _record_at(file, position, size)
         chunked |= opcode == Opcode.CHUNK
-        if opcode == Opcode.MESSAGE and chunked:  # no checksum covers it: another record whose opcode is damaged
+        if opcode == Opcode.MESSAGE and chunked:  # not covered by a checksum: another record with a damaged opcode
             records = None
         if records is None:
             found = end if end is not None else _next_chunk(file, position + 1, size)
@@ -89,7 +89,7 @@ def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | N
             elif isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, Message):
-                if record.channel_id not in channels and not asked:  # it was in a chunk that is damaged
+                if record.channel_id not in channels and not asked:  # it was in a damaged chunk
                     asked = True
                     if summary := intact_summary(file):
                         schemas.update({**summary.schemas, **schemas})
@@ -104,7 +104,7 @@ def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[tuple[Schema | N
 
 
 def _record_at(file: BinaryIO, position: int, size: int) -> tuple[int, list[McapRecord] | None, int | None]:
-    """A record's opcode, the records that it holds (None if it is damaged), and its end (None if that is unknown)."""
+    """Returns a record's opcode, its records (None if damaged), and its end (None if unknown)."""
     head = _read(file, position, _HEAD)
     if head == MCAP0_MAGIC and position + len(head) == size:
         return 0, [], size
@@ -113,7 +113,7 @@ def _record_at(file: BinaryIO, position: int, size: int) -> tuple[int, list[Mcap
     opcode, length = _FRAME.unpack_from(head)
     end = position + _FRAME.size + length
     if head[_ZSTD_AT : _ZSTD_AT + len(_ZSTD)] == _ZSTD and opcode != Opcode.CHUNK_INDEX:
-        # Opcode and length, which no checksum covers, are not needed where the rest fits.
+        # Opcode and length, which no checksum covers, are not needed if the rest is consistent.
         inner = position + _HEAD + int.from_bytes(head[-8:], "little")
         for each in (inner, end):
             if each <= min(size, position + _LIMIT) and (records := _chunk(_read(file, position, each - position))):
@@ -127,13 +127,13 @@ def _record_at(file: BinaryIO, position: int, size: int) -> tuple[int, list[Mcap
     if opcode == Opcode.MESSAGE_INDEX and int.from_bytes(whole[11:15], "little") != length - 6:
         return opcode, None, None
     if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-        hidden = _next_chunk(file, position + 1, end)  # by a length that is too large
+        hidden = _next_chunk(file, position + 1, end)  # the length is too large
         return opcode, [], end if hidden is None else hidden
     return opcode, _parse(opcode, whole[_FRAME.size :]), end
 
 
 def _chunk(whole: bytes) -> list[McapRecord] | None:
-    """The records of a chunk's record; None if it is damaged."""
+    """Returns the records of a chunk's record; None if it is damaged."""
     try:
         chunk = Chunk.read(ReadDataStream(io.BytesIO(whole[_FRAME.size :])))
         compressed = chunk.compression == "zstd"
@@ -145,7 +145,7 @@ def _chunk(whole: bytes) -> list[McapRecord] | None:
 
 
 def _parse(opcode: int, content: bytes) -> list[McapRecord] | None:
-    """A record that is in no chunk; None if it is damaged."""
+    """Returns a record outside any chunk; None if it is damaged."""
     stream = ReadDataStream(io.BytesIO(content))
     try:
         if opcode == Opcode.MESSAGE:
@@ -156,7 +156,7 @@ def _parse(opcode: int, content: bytes) -> list[McapRecord] | None:
 
 
 def _next_chunk(file: BinaryIO, start: int, end: int) -> int | None:
-    """Where the next Zstandard chunk begins whose two lengths agree; None if there is none before `end`."""
+    """Returns the start of the next Zstandard chunk with consistent lengths; None if there is none before `end`."""
     first = start
     while start < end:
         block = _read(file, start, min(_BLOCK, end - start))
@@ -173,7 +173,7 @@ def _next_chunk(file: BinaryIO, start: int, end: int) -> int | None:
 
 
 def _is_cut(file: BinaryIO, position: int, size: int) -> bool:
-    """Whether a record begins here that would end beyond the file's end."""
+    """True if a record begins here that would end beyond the file's end."""
     head = _read(file, position, _FRAME.size)
     if len(head) < _FRAME.size:
         return True
@@ -182,7 +182,7 @@ def _is_cut(file: BinaryIO, position: int, size: int) -> bool:
 
 
 def intact_summary(file: BinaryIO) -> Summary | None:
-    """The summary at the end of a finished file; None if there is none, or it does not match its checksum."""
+    """Returns the summary at the end of a finished file; None if it is missing or does not match its checksum."""
     end = file.seek(0, io.SEEK_END) - FOOTER_SIZE - len(MCAP0_MAGIC)
     try:
         start, _, crc = _FOOTER.unpack_from(_read(file, max(0, end), FOOTER_SIZE), _FRAME.size)

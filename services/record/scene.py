@@ -1,7 +1,7 @@
 """An episode as a 3-D scene: link frames, the hand's surface, object, constraints, contacts and signals, step by step.
 
-Each actor has a frame of its own, side by side under `world`. What stays the same through an episode is sent once, at
-its start; link frames, contacts and signals follow at the control step.
+Each actor has a separate frame in a row under `world`. Constant parts of an episode are sent once, at its start; link
+frames, contacts and signals follow at each control step.
 """
 
 from collections.abc import Iterator, Mapping
@@ -39,7 +39,7 @@ _MOST = {"T": 2000, "V": 200_000, "Fc": 400_000, "N": 4096, "n": 64, "P": 100_00
 _GOAL, _ARRAYS = 10_000, 128
 _OPEN = ("reward/", "error/", "goal/", "active/")
 SPACING = 0.8
-"""Metres between two actors' frames in the world."""
+"""Distance between the frames of two actors in the world frame, m."""
 Colour = tuple[float, float, float, float]
 _GHOST, _OBJECT, _TABLE = (*HEADING, 0.25), (*OBJECT, 1.0), (*TABLE, 1.0)
 _HEADING, _WAYPOINT, _FORCE = (*HEADING, 1.0), (*WAYPOINT, 1.0), (0.93, 0.26, 0.21, 1.0)
@@ -51,10 +51,10 @@ _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def check_episode(episode: Message) -> None:
-    """Checks an episode that anyone may have sent, before anything is made of it.
+    """Validates an episode from an untrusted peer.
 
     Raises:
-      CongraspError: naming the array or the entry, and the rule that it breaks.
+      CongraspError: the episode is invalid; the text names the array or the entry, and the violated rule.
     """
     hand = known_hand(episode.meta.get("hand"))
     sizes = validate(episode, EPISODE, L=len(hand.links), F=len(hand.joints))
@@ -65,12 +65,12 @@ def check_episode(episode: Message) -> None:
         raise CongraspError("The episode's control_dt is not above 0 and at most 1 s.")
     faces = episode.arrays["visual_faces"]
     if faces.min() < 0 or faces.max() >= sizes["V"]:
-        raise CongraspError("The episode's visual_faces name vertices that are not there.")
+        raise CongraspError("The episode's visual_faces name vertices that do not exist.")
     if ("colour_points" in episode.arrays) != ("colour_values" in episode.arrays):
-        raise CongraspError("The episode has colour_points or colour_values without the other.")
+        raise CongraspError("The episode has colour_points without colour_values, or the reverse.")
     for name in ("visual_vertices", "colour_points"):
         if np.abs(episode.arrays.get(name, 0.0)).max() > LARGEST:
-            raise CongraspError(f"The episode's {name} are more than {LARGEST:g} m from the object's middle.")
+            raise CongraspError(f"The episode's {name} are more than {LARGEST:g} m from the object's centre.")
     if any(array.size > _GOAL for name, array in episode.arrays.items() if name.startswith("goal/")):
         raise CongraspError(f"The episode has a goal array of more than {_GOAL} values.")
     if sum(name.startswith(_OPEN) for name in episode.arrays) > _ARRAYS:
@@ -78,17 +78,17 @@ def check_episode(episode: Message) -> None:
 
 
 def episode_entries(actor: str, episode: Message, start: int, slot: int, channels: JsonChannels) -> Iterator[Entry]:
-    """Everything that a recorder writes for one episode.
+    """Yields all entries of a recorder for one episode.
 
     Args:
-      actor: name of the actor; topics and frames begin with it.
+      actor: name of the actor, the prefix of topics and frames.
       episode: the message (see `services.record`).
       start: time of its first step, ns.
-      slot: the actor's place in the row of actors.
+      slot: position of the actor in the row of actors.
       channels: schemas of the JSON signals.
 
     Raises:
-      LookupError, ValueError: a goal array that an active block needs is absent, or has another shape.
+      LookupError, ValueError: a goal array of an active block is missing, or has the wrong shape.
     """
     topic = f"/episode/{actor}"
     arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
@@ -98,7 +98,7 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
     yield _protobuf(f"{topic}/scene", start, _static_scene(hand, actor, arrays, episode.meta, start), latched=True)
     yield _protobuf(f"{topic}/surface", start, _surface(actor, arrays, start), latched=True)
     for link, (points, colours) in zip(hand.links, surface_points(hand), strict=True):
-        # Rerun draws point clouds and no scenes; a topic holds one frame's cloud.
+        # Rerun draws point clouds but no scenes; a topic holds one frame's cloud.
         cloud = _cloud(f"{actor}/{link.name}", points, colours, start)
         yield _protobuf(f"{topic}/hand/{link.name}", start, cloud, latched=True)
     for i in range(len(arrays["object_position"])):
@@ -114,7 +114,7 @@ def duration(episode: Message) -> int:
 
 
 def _protobuf(topic: str, time: int, message: Any, *, latched: bool = False) -> Entry:
-    """An entry of one of Foxglove's messages."""
+    """Returns an entry of one of Foxglove's messages."""
     kind: Any = type(message)
     return Entry(protobuf_channel(topic, kind, latched=latched), time, message.SerializeToString())
 
@@ -139,7 +139,7 @@ def _transforms(
 def _static_scene(
     hand: Hand, actor: str, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], now: int
 ) -> SceneUpdate:
-    """Hand, object and constraints; begins by removing what the episode before it left."""
+    """Hand, object and constraints; first removes those of the previous episode."""
     update = SceneUpdate()
     update.deletions.add(type=SceneEntityDeletion.ALL).timestamp.FromNanoseconds(now)
     for link, parts in zip(hand.links, surface_parts(hand), strict=True):
@@ -163,12 +163,12 @@ def _static_scene(
 
 
 def _label(meta: Mapping[str, Any]) -> str:
-    """What is written above the object."""
+    """Text above the object."""
     return f"{meta['object']}, version {meta['version']}, {'success' if meta['success'] else 'no success'}"
 
 
 def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mapping[str, np.ndarray], now: int) -> None:
-    """Markers of the active constraints; the avoid region is in the cloud of surface points."""
+    """Adds markers of the active constraints; the avoid region is in the cloud of surface points."""
     for name, marker in markers(arrays):
         if isinstance(marker, Paint):
             continue
@@ -183,7 +183,7 @@ def _add_constraints(update: SceneUpdate, hand: Hand, frame: str, arrays: Mappin
 
 
 def _add_beads(entity: SceneEntity, points: np.ndarray) -> None:
-    """Adds balls (n, 3) on a string."""
+    """Adds balls (n, 3) on a line."""
     line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.003)
     line.pose.orientation.w = 1.0
     _set_colour(line.color, _WAYPOINT)
@@ -193,7 +193,7 @@ def _add_beads(entity: SceneEntity, points: np.ndarray) -> None:
 
 
 def _add_ghost(entity: SceneEntity, hand: Hand, ghost: Ghost) -> None:
-    """Adds the axes of a wrist, and the surface of its hand where the finger angles are given."""
+    """Adds the axes of a wrist, and the surface of its hand if the finger angles are given."""
     wrist = Rotation.from_quat(ghost.quaternion, scalar_first=True)
     for axis, colour in zip(wrist.as_matrix().T, _AXES, strict=True):
         _add_arrow(entity, ghost.position, axis, 0.05, 0.003, colour)
@@ -209,7 +209,7 @@ def _add_ghost(entity: SceneEntity, hand: Hand, ghost: Ghost) -> None:
 
 def _surface(actor: str, arrays: Mapping[str, np.ndarray], now: int) -> PointCloud:
     """The object's surface points: graspable region green, avoid region red."""
-    colours = np.where(arrays["surface_minus"][:, None], AVOID, GRASPABLE)
+    colours = np.where(arrays["surface_avoid"][:, None], AVOID, GRASPABLE)
     return _cloud(f"{actor}/object", arrays["surface_points"], colours, now)
 
 
@@ -217,11 +217,11 @@ def _cloud(frame: str, points: np.ndarray, colours: np.ndarray, now: int) -> Poi
     """Points (N, 3) of a frame with colours (N, 3) from 0 to 1."""
     packed = np.zeros(len(points), [("position", "<f4", 3), ("colour", "u1", 4)])
     packed["position"] = points
-    # Foxglove's packed colours lie as red, green, blue, alpha in memory, one field of a byte each.
+    # Foxglove's packed colours are red, green, blue, alpha in memory, one byte field each.
     packed["colour"][:, :3], packed["colour"][:, 3] = np.multiply(colours, 255), 255
     cloud = PointCloud(frame_id=frame, point_stride=packed.dtype.itemsize, data=packed.tobytes())
     cloud.timestamp.FromNanoseconds(now)
-    cloud.pose.position.SetInParent()  # readers may miss a position that is not there
+    cloud.pose.position.SetInParent()  # readers may miss an absent position
     cloud.pose.orientation.w = 1.0
     kinds = [("x", 0), ("y", 4), ("z", 8), ("red", 12), ("green", 13), ("blue", 14), ("alpha", 15)]
     for name, offset in kinds:
@@ -231,7 +231,7 @@ def _cloud(frame: str, points: np.ndarray, colours: np.ndarray, now: int) -> Poi
 
 
 def _contacts(actor: str, arrays: Mapping[str, np.ndarray], i: int, now: int, step: int) -> SceneUpdate:
-    """Table and contact forces of one step; they vanish by themselves shortly after it."""
+    """Table and contact forces of one step, with a short lifetime."""
     update = SceneUpdate()
     if arrays["table"][i]:
         entity = _entity(update, "table", actor, now, lifetime=2 * step)
@@ -269,7 +269,7 @@ def _signals(hand: Hand, arrays: Mapping[str, np.ndarray], i: int, control_dt: f
 
 
 def _entity(update: SceneUpdate, name: str, frame: str, now: int, *, lifetime: int = 0) -> SceneEntity:
-    """An entity that moves with its frame; without a lifetime it stays until it is replaced or removed."""
+    """Adds an entity that moves with its frame; without a lifetime it stays until it is replaced or removed."""
     entity = update.entities.add(id=name, frame_id=frame, frame_locked=True)
     entity.timestamp.FromNanoseconds(now)
     entity.lifetime.FromNanoseconds(lifetime)
@@ -288,7 +288,7 @@ def _add_triangles(entity: SceneEntity, points: np.ndarray, faces: np.ndarray, c
 
 
 def _add_capsules(entity: SceneEntity, link: Link, colour: Colour) -> None:
-    """Adds a link's capsules, which fill the inside of its skin where bent joints open it."""
+    """Adds a link's capsules, which fill gaps in its skin at bent joints."""
     for capsule, (start, end) in zip(link.capsules, capsule_ends(link), strict=True):
         length = float(np.linalg.norm(end - start))
         if length > 0:
@@ -323,7 +323,7 @@ def _add_arrow(
 
 
 def _turn_onto(axis: list[float], direction: np.ndarray) -> np.ndarray:
-    """A quaternion (w, x, y, z) that turns a unit axis onto a unit direction (3,)."""
+    """Quaternion (w, x, y, z) that rotates a unit axis to a unit direction (3,)."""
     return Rotation.align_vectors([direction], [axis])[0].as_quat(scalar_first=True)
 
 

@@ -1,8 +1,8 @@
-"""The hand's surface link by link, as recordings show it: rigid parts, each sent once in the frame of its link.
+"""The hand's surface by link for recordings: rigid parts, each sent once in the frame of its link.
 
-Robots' surfaces are rigid, so that their parts are all there is. A human hand's skin deforms, but its points at every
-step would make a recording many times as large. There a triangle belongs to every link that moves it noticeably, so
-that the parts of two links overlap where a joint bends.
+Surfaces of robots are rigid. A human hand's skin deforms, but its points at every step would make a recording many
+times as large. A triangle of skin therefore belongs to every link with a noticeable weight on it, so that the parts of
+two links overlap at a bent joint.
 """
 
 import contextlib
@@ -14,14 +14,15 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.skeleton import skeleton_of
-from congrasp.common.hands.skin import Skin, skin_of, skin_on
+from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
-from congrasp.services.record.palette import FLESH, JOINT, SKIN, Colour
+from congrasp.services.record.palette import MATERIALS as COLOURS
+from congrasp.services.record.palette import Colour
 
-_OVERLAP = 0.4  # weight of a link on a point of a triangle from which the triangle belongs to it, too
-_MOST_FACES = 12_000  # of a hand; links' own meshes may have more
-_GRID = 2.0**-14  # m, of coordinates: few digits, which compress well
-_POINTS = 2048  # on a hand
+_OVERLAP = 0.4  # weight of a link on a vertex above which the triangle belongs to the link
+_MOST_FACES = 12_000  # triangles of a hand; meshes of links may have more
+_GRID = 2.0**-14  # resolution of coordinates, m: few digits compress well
+_POINTS = 2048  # points on a hand
 
 
 class Part(NamedTuple):
@@ -31,12 +32,12 @@ class Part(NamedTuple):
     points: np.ndarray
     """(V, 3), within 0.05 mm."""
     faces: np.ndarray
-    """(E, 3) int; they wind outwards."""
+    """(E, 3) int, with outward normals."""
 
 
 @functools.lru_cache(maxsize=16)
 def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
-    """The parts of each link: its own, and what is drawn darker of its joints."""
+    """Parts of each link, one of each material."""
     skin = _skin(hand)
     strongest = np.eye(len(hand.links), dtype=bool)[skin.weights[skin.faces].sum(1).argmax(-1)]
     members = strongest | (skin.weights[skin.faces].max(1) >= _OVERLAP)
@@ -44,10 +45,10 @@ def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
     found = []
     for member, origin in zip(members.T, skin.origins, strict=True):
         parts = []
-        for of_joint, colour in ((False, FLESH if skin.flesh else SKIN), (True, JOINT)):
-            faces = skin.faces[member & (skin.joint[skin.faces[:, 0]] == of_joint)]
+        for number, name in enumerate(MATERIALS):
+            faces = skin.faces[member & (skin.material[skin.faces[:, 0]] == number)]
             if len(faces):
-                parts.append(Part(colour, *_light(skin.points[faces] - origin, kept)))
+                parts.append(Part(COLOURS[name], *_light(skin.points[faces] - origin, kept)))
         found.append(tuple(parts))
     return tuple(found)
 
@@ -69,14 +70,14 @@ def surface_points(hand: Hand) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
 
 
 def _skin(hand: Hand) -> Skin:
-    """The hand's surface; made of its capsules where the user's own meshes of it cannot be read."""
+    """Surface of the hand; made of its capsules if custom meshes cannot be read."""
     with contextlib.suppress(CongraspError):
         return skin_of(hand)
     return skin_on(skeleton_of(hand))
 
 
 def _light(corners: np.ndarray, kept: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points and faces of triangles (E, 3, 3), of which a share is kept, on a grid and each point once."""
+    """Points and faces of a share of triangles (E, 3, 3), on a grid and without duplicate points."""
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
     if kept < 1.0:
         mesh = mesh.simplify_quadric_decimation(face_count=max(4, int(kept * len(mesh.faces))))
@@ -87,5 +88,5 @@ def _light(corners: np.ndarray, kept: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mesh(part: Part) -> trimesh.Trimesh:
-    """A part as trimesh has it."""
+    """Returns a part as a trimesh mesh."""
     return trimesh.Trimesh(part.points, part.faces, process=False)

@@ -1,4 +1,4 @@
-"""MCAP files that survive: flushed often, rotated, named `*.mcap` only when they are finished."""
+"""MCAP files that survive a kill: flushed often, rotated, and renamed to `*.mcap` only when finished."""
 
 import contextlib
 import datetime
@@ -21,7 +21,7 @@ _INDEXES = IndexType.CHUNK | IndexType.MESSAGE | IndexType.METADATA
 class LogWriter:
     """Writes entries to `<directory>/<name>-<UTC time>-<number>.mcap`, one file after another.
 
-    Every file holds all channels and schemas it needs. Not safe for several threads.
+    Every file holds all channels and schemas it needs. Not thread-safe.
     """
 
     def __init__(
@@ -34,23 +34,23 @@ class LogWriter:
         max_seconds: float = 600.0,
         open_file: Callable[[pathlib.Path], IO[bytes]] = lambda path: path.open("xb"),
     ):
-        """Makes the directory; the first file begins with the first entry.
+        """Creates the directory; the first entry opens the first file.
 
         Args:
-          directory: where files go.
-          name: how their names begin.
-          run: name of the run, kept in every file.
+          directory: folder for the files.
+          name: prefix of their names.
+          run: name of the run, stored in every file.
           max_bytes: size at which a file is finished and the next begins.
-          max_seconds: age of a file's first entry at which the same happens.
+          max_seconds: age of a file's first entry at which the next file begins.
           open_file: opens a new file for writing.
 
         Raises:
-          CongraspError: the directory cannot be made.
+          CongraspError: the directory cannot be created.
         """
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise CongraspError(f"The folder {directory} cannot be made: {error.strerror}.") from None
+            raise CongraspError(f"The folder {directory} cannot be created: {error.strerror}.") from None
         self._directory, self._name, self._run = directory, name, run
         self._max_bytes, self._max_ns, self._open_file = max_bytes, round(1e9 * max_seconds), open_file
         self._number = 0
@@ -59,10 +59,10 @@ class LogWriter:
         self.files: list[pathlib.Path] = []
 
     def write(self, *entries: Entry) -> None:
-        """Adds entries that belong together: they come into one file.
+        """Writes entries that belong together to one file.
 
         Raises:
-          OSError: the disk is full or broken; what was flushed before stays readable.
+          OSError: the disk is full or broken; flushed entries stay readable.
         """
         if not entries:
             return
@@ -78,15 +78,15 @@ class LogWriter:
             self._writer.add_message(channel, entry.time, entry.data, entry.time, sequence)
 
     def _is_over(self, file: IO[bytes], time: int) -> bool:
-        """Whether an entry of this time (ns) belongs into the next file."""
-        # A clock that was set back must not keep a file open for ever.
+        """True if an entry of this time (ns) belongs to the next file."""
+        # A clock that was set back must not keep a file open forever.
         return file.tell() > self._max_bytes or abs(time - self._first) > self._max_ns
 
     def flush(self) -> None:
-        """Hands everything so far to the operating system; a killed writer loses only what comes after.
+        """Flushes to the operating system; a killed writer loses only later entries.
 
         Raises:
-          OSError: as `write`.
+          OSError: see `write`.
         """
         if self._file is not None:
             self._writer.flush()
@@ -95,7 +95,7 @@ class LogWriter:
         """Finishes the file and gives it its final name; the next entry begins a new one.
 
         Raises:
-          OSError: as `write`; the unfinished file stays, with its suffix `.part`.
+          OSError: see `write`; the unfinished file keeps its suffix `.part`.
         """
         file, self._file = self._file, None
         if file is None:
@@ -107,23 +107,23 @@ class LogWriter:
         self.files[-1] = final
 
     def abandon(self) -> None:
-        """After an OSError: lets go of the file without writing more to it."""
+        """Drops the file after an OSError, without writing to it."""
         file, self._file = self._file, None
         if file is not None:
             with contextlib.suppress(OSError):
                 file.close()
 
     def _begin(self, time: int) -> None:
-        """Opens a new file under a name that no other recorder has taken."""
+        """Opens a new file under an unused name."""
         stamp = datetime.datetime.fromtimestamp(time / 1e9, datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
         while self._file is None:
             self._path = self._directory / f"{self._name}-{stamp}-{self._number:03d}.mcap{PART}"
             self._number += 1
-            with contextlib.suppress(FileExistsError):  # another recorder's
+            with contextlib.suppress(FileExistsError):  # of another recorder
                 file = self._open_file(self._path)
                 if not self._path.with_suffix("").exists():
                     self._file = file
-                else:  # that of another recorder of this second, which is finished
+                else:  # finished by another recorder within this second
                     file.close()
                     self._path.unlink()
         self._first = time
@@ -137,7 +137,7 @@ class LogWriter:
         self._writer.flush()
 
     def _register(self, channel: Channel) -> int:
-        """The file's id of a channel, whose schema is written with it."""
+        """Returns the file's id of a channel, writing its schema first if needed."""
         known = (channel.schema_name, channel.schema)
         if known not in self._schemas:
             self._schemas[known] = self._writer.register_schema(

@@ -1,1 +1,1 @@
-"""From nothing to the paper's tables: trains what is missing, evaluates, and writes a page, JSON and LaTeX."""
+"""Reproduces the paper's tables: trains missing policies, evaluates, and writes a page, JSON and LaTeX."""

@@ -1,4 +1,4 @@
-"""Every figure of the paper beside what was measured here, or why nothing that was measured is comparable."""
+"""Every figure of the paper with our measurement, or the reason why there is no comparable one."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
@@ -6,27 +6,26 @@ from collections.abc import Iterator, Mapping, Sequence
 from congrasp.services.evaluate.paper import PaperLine, paper_lines
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.reproduce.evaluation import Result
-from congrasp.services.reproduce.plan import Policy
+from congrasp.services.reproduce.plan import RequiredPolicy
 
 SUCCESS = "success"
 CAPTURED_DATA = {"captured": "GRAB and OakInk", "cross": "DexYCB"}
 CONDITIONS = (
-    "MuJoCo stands in for the paper's simulator; contacts, friction, servos and the hands' models differ.",
-    "The human hand stands in for MANO. It has 20 anatomical joints; the paper's has MANO's.",
-    "Procedural objects that training never sees stand in for the objects of the paper's table of hands, and for "
-    "Objaverse in its table of large-scale objects. Sizes there are terciles of the objects here; the paper gives no "
+    "MuJoCo replaces the paper's simulator; contacts, friction, servos and the hands' models differ.",
+    "The human hand replaces MANO. It has 20 anatomical joints; the paper's has MANO's.",
+    "Procedural objects that are never used in training replace the objects of the paper's table of hands, and "
+    "Objaverse in its table of large-scale objects. Sizes there are terciles of our objects; the paper gives no "
     "bounds.",
-    "References of the table of hands are grasps of this project's own reference policies, made as the paper makes its "
-    "own.",
-    "Success is the paper's: the object has not fallen a quarter of a second after the table is removed. Whether it is "
-    "held for two seconds, and whether fingers pass through anything meanwhile, the paper does not report.",
+    "References of the table of hands are grasps of this project's reference policies, generated as in the paper.",
+    "Success is the paper's: the object has not fallen a quarter of a second after the table is removed. The "
+    "paper does not report whether it is held for two seconds, nor whether fingers penetrate anything.",
 )
-"""What is different in every table."""
+"""Differences that apply to every table."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A figure of the paper, and ours if there is a comparable one."""
+    """A figure of the paper, and ours if it is comparable."""
 
     table: str
     """`services.evaluate.paper.TABLES`."""
@@ -39,34 +38,34 @@ class Cell:
     """`success`, or the name of an error."""
     paper: float
     data: str = ""
-    """Captured data set of ours; empty for procedural constraints."""
+    """Our captured data set; empty for procedural constraints."""
     episodes: int = 0
     ours: float | None = None
     low: float | None = None
     high: float | None = None
     """95 % interval: of a rate with objects as clusters, 1.96 standard errors around a mean error."""
     difference: float | None = None
-    """Ours less the paper's."""
+    """Our figure minus the paper's."""
     nearest: float | None = None
-    """What is not comparable: the same hand, method and constraint with procedural references."""
+    """Nearest figure that is not comparable: same hand, method and constraint with procedural references."""
     reason: str = ""
-    """Why nothing is comparable."""
+    """Reason if there is no comparable figure."""
 
     @property
     def verdict(self) -> str:
-        """better or worse where the whole interval is, else empty."""
+        """ "better" or "worse" if the whole interval is, else empty."""
         if self.low is None or self.high is None or self.low <= self.paper <= self.high:
             return ""
         return "better" if (self.low > self.paper) == (self.quantity == SUCCESS) else "worse"
 
 
-def compare(results: Sequence[Result], absent: Mapping[Policy, str], hands: Sequence[str]) -> list[Cell]:
-    """A cell for every figure of the paper and every result that is comparable with it.
+def compare(results: Sequence[Result], absent: Mapping[RequiredPolicy, str], hands: Sequence[str]) -> list[Cell]:
+    """Returns a cell for every figure of the paper and every comparable result.
 
     Args:
-      results: of all parts.
-      absent: why there is no policy.
-      hands: those that were asked for.
+      results: results of all parts.
+      absent: reasons for missing policies.
+      hands: requested hands.
     """
     cells: list[Cell] = []
     for line in paper_lines():
@@ -83,7 +82,7 @@ def compare(results: Sequence[Result], absent: Mapping[Policy, str], hands: Sequ
 
 
 def unmatched(results: Sequence[Result]) -> list[tuple[Result, Row]]:
-    """Our rows that stand beside none of the paper's."""
+    """Returns our rows without a counterpart in the paper."""
     lines = paper_lines()
     return [
         (result, row)
@@ -94,25 +93,25 @@ def unmatched(results: Sequence[Result]) -> list[tuple[Result, Row]]:
 
 
 def _rows(result: Result, line: PaperLine) -> Iterator[tuple[str, Row]]:
-    """A result's rows that are of a line's hand, method, constraint and group, and the data set."""
+    """Yields a result's rows of a line's hand, method, constraint and group, with the data set."""
     for row in result.rows:
         if _is_of(row, line):
             yield result.part.data.resolve().name if result.part.data else "", row
 
 
 def _is_of(row: Row, line: PaperLine) -> bool:
-    """Whether a row is of a line's hand, method, constraint and group."""
+    """True if a row has a line's hand, method, constraint and group."""
     same = (row.hand, row.method, row.constraint) == (line.hand, line.method, line.constraint)
     return same and row.group.split(" ")[0] == line.group
 
 
 def _figure(row: Row, quantity: str) -> float | None:
-    """A row's success or error."""
+    """Success or error of a row."""
     return row.success if quantity == SUCCESS else row.errors[quantity]
 
 
 def _filled(cell: Cell, data: str, row: Row) -> Cell:
-    """The cell with our figure; without a successful episode there is no error to compare."""
+    """Returns the cell with our figure; without a successful episode there is no error to compare."""
     cell = dataclasses.replace(cell, data=data, episodes=row.episodes)
     if (ours := _figure(row, cell.quantity)) is None:
         return dataclasses.replace(cell, reason="no episode succeeded")
@@ -122,15 +121,17 @@ def _filled(cell: Cell, data: str, row: Row) -> Cell:
     return dataclasses.replace(cell, ours=ours, low=low, high=high, difference=ours - cell.paper)
 
 
-def _reason(line: PaperLine, results: Sequence[Result], absent: Mapping[Policy, str], hands: Sequence[str]) -> str:
-    """Why no result is comparable with a line."""
+def _reason(
+    line: PaperLine, results: Sequence[Result], absent: Mapping[RequiredPolicy, str], hands: Sequence[str]
+) -> str:
+    """Reason why no result is comparable with a line."""
     if line.hand not in hands:
-        return f"the hand '{line.hand}' was not asked for"
-    if reason := absent.get(Policy(line.hand, line.method)):
+        return f"the hand '{line.hand}' was not requested"
+    if reason := absent.get(RequiredPolicy(line.hand, line.method)):
         return f"no policy of the method '{line.method}': {reason}"
     if line.source in CAPTURED_DATA and not any(result.source == line.source for result in results):
         return (
-            f"of captured constraints of {CAPTURED_DATA[line.source]}, which nobody may hand on; --captured takes your "
-            "own copy"
+            f"needs captured constraints of {CAPTURED_DATA[line.source]}, which may not be redistributed; "
+            "--captured uses your copy"
         )
     return "not evaluated"

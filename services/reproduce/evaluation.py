@@ -1,4 +1,4 @@
-"""Evaluates the parts of a reproduction, each once: its rows are kept as `congrasp evaluate --json` writes them."""
+"""Evaluates the parts of a reproduction, each once; rows are stored like those of `congrasp evaluate --json`."""
 
 import dataclasses
 import pathlib
@@ -23,7 +23,7 @@ from congrasp.services.viz.sheets import save_png
 
 _LARGEST = 1 << 28
 OBJECTS, CONSTRAINTS = "objects", "constraints"
-"""Folders of a captured data set, as `congrasp constraints import` makes them by default."""
+"""Folders of a captured data set, with the default names of `congrasp constraints import`."""
 _CAPTURED_TABLES = {"cross": ("cross",), "captured": ("single", "composed"), "": ("single", "composed")}
 _SOURCES = {"objects": "objects", "noise": ""}
 _PICTURED = 2
@@ -32,40 +32,40 @@ _POOLS = ".pools"
 
 @dataclasses.dataclass(frozen=True)
 class Numbers:
-    """How much is evaluated, and how."""
+    """Sizes and settings of an evaluation."""
 
     episodes: int
-    """Of a row."""
+    """Episodes of a row."""
     pool: int
     """Procedural objects of rows."""
     many: int
-    """Episodes, and most objects, of the table of many objects."""
+    """Episodes and most objects of the table of many objects."""
     physics: PhysicsName
-    """`auto` only until it is resolved."""
+    """Engine; `auto` until it is resolved."""
     seed: int
     friction: float
 
 
 class Result(NamedTuple):
-    """What a part came to."""
+    """Result of a part."""
 
     part: Part
     source: str
-    """What its episodes are drawn from (`services.evaluate.paper`)."""
+    """Source of its episodes (`services.evaluate.paper`)."""
     rows: list[Row]
     about: Mapping[str, Any]
-    """What else its JSON file says: policy, settings, pictures, references, rows left out, seconds."""
+    """Further content of its JSON file: policy, settings, pictures, references, skipped rows, seconds."""
     fresh: bool
-    """Whether it was evaluated now."""
+    """True if it was evaluated in this session."""
 
 
 def evaluate_part(part: Part, entrant: Entrant, numbers: Numbers, out: pathlib.Path, track: Track) -> Result:
-    """The rows of a part, from its file if that was made with the same policy and numbers.
+    """Returns the rows of a part, from its file if that has the same policy and settings.
 
     Args:
-      part: what is evaluated.
-      entrant: its policy.
-      numbers: how much, and how.
+      part: part to evaluate.
+      entrant: policy of the part.
+      numbers: sizes and settings.
       out: folder of `tables/` and `pictures/`.
       track: shows progress.
 
@@ -102,7 +102,7 @@ def evaluate_part(part: Part, entrant: Entrant, numbers: Numbers, out: pathlib.P
 
 
 def _read(file: pathlib.Path, part: Part, settings: Mapping[str, Any]) -> Result | None:
-    """A part's file, if it is whole and of these settings."""
+    """Reads a part's file; returns None if it is missing, damaged or has other settings."""
     try:
         about = read_json(file, _LARGEST)
         rows = [Row.from_json(row) for row in about.pop("rows")]
@@ -114,12 +114,13 @@ def _read(file: pathlib.Path, part: Part, settings: Mapping[str, Any]) -> Result
 
 
 def _captured(part: Part, track: Track) -> Captured:
-    """The constraint sets of a captured data set, all of them: no policy of a reproduction was trained with any."""
+    """Returns all constraint sets of a captured data set, since no policy of a reproduction was trained with them."""
     assert part.data is not None
     for name in (OBJECTS, CONSTRAINTS):
         if not (part.data / name).is_dir():
             raise CongraspError(
-                f"{part.data} has no folder '{name}'.", "Run 'congrasp constraints import' in it, or name another."
+                f"{part.data} has no folder '{name}'.",
+                "Run 'congrasp constraints import' in it, or pass another folder.",
             )
     return captured(part.data / CONSTRAINTS, "all", objects_of(part.data / OBJECTS, track=track))
 
@@ -127,7 +128,7 @@ def _captured(part: Part, track: Track) -> Captured:
 def _evaluate(
     part: Part, entrant: Entrant, numbers: Numbers, data: Captured | None, file: pathlib.Path, track: Track
 ) -> Found:
-    """The part's rows."""
+    """Evaluates the part's rows."""
     many = part.table == "objects"
     setup = Setup(
         numbers.many if many else numbers.episodes,
@@ -145,12 +146,12 @@ def _evaluate(
 
 
 def _is_pictured(part: Part) -> bool:
-    """Whether episodes are drawn: those of the full system, under constraints without noise."""
+    """True if episodes are drawn: those of the full system, under constraints without noise."""
     return part.policy.method == "ours" and part.table not in ("objects", "noise")
 
 
 def _draw(part: Part, entrant: Entrant, found: Found, folder: pathlib.Path) -> list[dict[str, str]]:
-    """Draws failures and successes of every row; the title, caption and file of each picture."""
+    """Draws failures and successes of every row; returns title, caption and file of each picture."""
     if found.evaluator is None or not _is_pictured(part):
         return []
     pictures = list[dict[str, str]]()

@@ -1,4 +1,4 @@
-"""The paper's tables as LaTeX, for documents that load booktabs and graphicx."""
+"""Tables of the paper as LaTeX, for documents that load booktabs and graphicx."""
 
 from collections.abc import Sequence
 
@@ -23,22 +23,22 @@ _ESCAPED = {
 
 
 def escape(text: str) -> str:
-    """Text as LaTeX shows it literally."""
+    """Escapes text for LaTeX."""
     return "".join(_ESCAPED.get(character, character) for character in text)
 
 
 def latex(tables: Sequence[Table], conditions: str) -> str:
-    """One `table` environment for each table.
+    """Returns one `table` environment for each table.
 
     Args:
-      tables: what they hold.
+      tables: the tables.
       conditions: a sentence on objects, engine and seed, for the captions.
     """
     return "\n".join(_table(table, conditions) for table in tables)
 
 
 def _table(table: Table, conditions: str) -> str:
-    """A table; a rule where the constraint changes."""
+    """Returns a table, with a rule where the constraint changes."""
     lines = [
         r"\begin{table}",
         rf"  \caption{{{escape(table.title)}. {escape(conditions)}}}",
@@ -58,5 +58,5 @@ def _table(table: Table, conditions: str) -> str:
 
 
 def _row(cells: Sequence[str]) -> str:
-    """Cells of a line."""
+    """Joins the cells of a line."""
     return " & ".join(map(escape, cells)) + r" \\"

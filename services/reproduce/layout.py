@@ -1,4 +1,4 @@
-"""Cells as lines of text, for the page and for LaTeX alike."""
+"""Cells as lines of text, for the page and for LaTeX."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -22,18 +22,18 @@ COLUMNS = (
 )
 """Names of columns, and of their styles."""
 NONE = "\N{EN DASH}"
-"""Where there is no figure."""
+"""Placeholder for a missing figure."""
 _OBJECTS, _ERRORS = slice(3, 4), slice(8, 11)
-"""Columns that some tables do not need."""
+"""Columns that some tables omit."""
 
 
 class Line(NamedTuple):
     """Figures of one line of the paper."""
 
     cells: tuple[str, ...]
-    """By the table's columns."""
+    """Cells by the table's columns."""
     verdict: str
-    """Of success: better, worse or nothing."""
+    """Verdict on success: better, worse or empty."""
 
 
 class Table(NamedTuple):
@@ -41,12 +41,12 @@ class Table(NamedTuple):
 
     title: str
     columns: list[tuple[str, str]]
-    """Those of `COLUMNS` in which some line or the paper has something."""
+    """Columns of `COLUMNS` that are not empty."""
     lines: list[Line]
 
 
 def tables(cells: Sequence[Cell]) -> list[Table]:
-    """The paper's tables; none is missing, and none of their lines."""
+    """Returns all of the paper's tables, with all of their lines."""
     found = []
     for name, title in TABLES.items():
         lines = _lines([cell for cell in cells if cell.table == name])
@@ -58,7 +58,7 @@ def tables(cells: Sequence[Cell]) -> list[Table]:
 
 
 def not_comparable(cells: Sequence[Cell]) -> list[tuple[str, str, str]]:
-    """Lines without a comparable figure: what, why, and the nearest success that was measured."""
+    """Lines without a comparable figure: description, reason, and the nearest measured success."""
     return [
         (
             f"{TABLES[cell.table]}: {cell.constraint}, {cell.hand}, {cell.method}"
@@ -72,7 +72,7 @@ def not_comparable(cells: Sequence[Cell]) -> list[tuple[str, str, str]]:
 
 
 def _has(lines: Sequence[Line], columns: slice) -> bool:
-    """Whether anything stands in these columns."""
+    """True if any of these columns is not empty."""
     return any(cell != NONE for line in lines for cell in line.cells[columns])
 
 
@@ -93,28 +93,28 @@ def _lines(cells: Sequence[Cell]) -> list[Line]:
 
 
 def _joined(errors: Sequence[Cell], show: Callable[[Cell], str]) -> str:
-    """All errors of a line with their units."""
+    """Joins all errors of a line with their units."""
     if all(show(cell) == NONE for cell in errors):
         return NONE
     return " / ".join(f"{show(cell)} {UNITS[cell.quantity]}".strip() for cell in errors)
 
 
 def _percent(cell: Cell) -> str:
-    """Such as "98.4 (94.5-99.6)"."""
+    """Formats a rate, such as "98.4 (94.5-99.6)"."""
     if cell.ours is None or cell.low is None or cell.high is None:
         return NONE
     return f"{100 * cell.ours:.1f} ({100 * cell.low:.1f}-{100 * cell.high:.1f})"
 
 
 def _error(cell: Cell) -> str:
-    """Such as "0.137 ± 0.004"."""
+    """Formats an error, such as "0.137 ± 0.004"."""
     if cell.ours is None:
         return NONE
     return f"{cell.ours:.3f}" + ("" if cell.high is None else f" ± {cell.high - cell.ours:.3f}")
 
 
 def _difference(cell: Cell) -> str:
-    """Percentage points, or the error's unit; with its sign."""
+    """Formats a signed difference in percentage points, or in the error's unit."""
     if cell.difference is None:
         return NONE
     return f"{100 * cell.difference:+.1f}" if cell.quantity == SUCCESS else f"{cell.difference:+.3f}"

@@ -1,4 +1,4 @@
-"""The page, the JSON file and the LaTeX tables of a reproduction."""
+"""Page, JSON file and LaTeX tables of a reproduction."""
 
 import collections
 import dataclasses
@@ -16,40 +16,40 @@ from congrasp.services.reproduce.comparison import CONDITIONS, SUCCESS, Cell, un
 from congrasp.services.reproduce.evaluation import Result
 from congrasp.services.reproduce.latex import latex
 from congrasp.services.reproduce.layout import not_comparable, tables
-from congrasp.services.reproduce.plan import Policy
+from congrasp.services.reproduce.plan import RequiredPolicy
 
 PAGE, JSON, LATEX = "reproduction.html", "reproduction.json", "tables.tex"
 _LARGEST_PICTURE = 32 << 20
 
 
 class Account(NamedTuple):
-    """All that a reproduction came to."""
+    """Results of a reproduction."""
 
     results: list[Result]
     cells: list[Cell]
-    policies: list[tuple[Policy, str]]
-    """Each policy, and which file it is or why there is none."""
+    policies: list[tuple[RequiredPolicy, str]]
+    """Policies, each with its file or the reason why there is none."""
     failures: list[str]
     conditions: str
     """A sentence on objects, engine and seed."""
     command: str
-    """The command line that makes it again."""
+    """Command line that reproduces it."""
     curves: list[Picture]
-    """Of trainings."""
+    """Curves of trainings."""
     seconds: dict[str, float]
-    """Of trainings and of evaluations, those of earlier sessions too."""
+    """Durations of trainings and of evaluations, including earlier sessions, s."""
 
 
 def page() -> Any:
-    """The page's template; a CongraspError if jinja2 is absent."""
+    """Returns the page's template; raises a CongraspError if jinja2 is not installed."""
     return template(pathlib.Path(__file__).with_suffix(".html"))
 
 
 def write(account: Account, out: pathlib.Path) -> None:
-    """Writes page, JSON and LaTeX into a folder, each whole or not at all.
+    """Writes page, JSON and LaTeX into a folder, each atomically.
 
     Raises:
-      CongraspError: one cannot be written, or jinja2 is absent.
+      CongraspError: a file cannot be written, or jinja2 is not installed.
     """
     shown = tables(account.cells)
     absent = not_comparable(account.cells)
@@ -72,7 +72,7 @@ def write(account: Account, out: pathlib.Path) -> None:
 
 
 def to_json(account: Account) -> dict[str, Any]:
-    """What the JSON file holds."""
+    """Returns the content of the JSON file."""
     return {
         "conditions": account.conditions,
         "command": account.command,
@@ -93,32 +93,32 @@ def to_json(account: Account) -> dict[str, Any]:
 
 
 def summary(cells: Sequence[Cell]) -> str:
-    """How many of the paper's figures have one beside them, and where those lie."""
+    """Summarises how many of the paper's figures have a counterpart, and how they compare."""
     rates = [cell for cell in cells if cell.quantity == SUCCESS]
     compared = [cell for cell in rates if cell.ours is not None]
     above = sum(cell.ours >= cell.paper for cell in compared if cell.ours is not None)
     verdicts = collections.Counter(cell.verdict for cell in compared)
     return (
-        f"{len(compared)} of the paper's {len(rates)} success rates have a comparable one beside them. "
-        f"It is at or above the paper's in {above}; the whole 95 % interval is above it in {verdicts['better']}, "
-        f"and below it in {verdicts['worse']}."
+        f"{len(compared)} of the paper's {len(rates)} success rates have a comparable one. It is at or above the "
+        f"paper's in {above}; the whole 95 % interval is above it in {verdicts['better']}, and below it in "
+        f"{verdicts['worse']}."
     )
 
 
 def _different(results: Sequence[Result]) -> list[str]:
-    """What is different in every table, and of each hand how many headings its rules leave."""
+    """Differences that apply to every table, and for each hand the share of headings that its rules keep."""
     rules = dict.fromkeys(result.about["heading_rules"] for result in results if result.about["heading_rules"])
     return [*CONDITIONS, *rules]
 
 
 def _times(seconds: Mapping[str, float]) -> str:
-    """Such as "Evaluation took 12.3 min."."""
+    """Formats durations, such as "Evaluation took 12.3 min."."""
     took = [f"{what} took {amount / 60:.1f} min" for what, amount in seconds.items() if amount]
     return f"{', '.join(took).capitalize()}." if took else ""
 
 
 class _Details(NamedTuple):
-    """A table of our own rows."""
+    """A table of further rows of ours."""
 
     title: str
     columns: tuple[str, ...]
@@ -126,12 +126,14 @@ class _Details(NamedTuple):
 
 
 def _details(results: Sequence[Result]) -> list[_Details]:
-    """Rates of rows that the paper does not have, and the plausibility of all."""
+    """Rates of rows without a counterpart in the paper, and the plausibility of all."""
     own = ("table", "hand", "method")
     rates, of_rate = RATES[:-1], _of(lambda row: rate_cells(row)[:-1])
     all_rows = [(result, row) for result in results for row in result.rows]
     return [
-        _Details("Rows beside none of the paper's", (*own, *rates), [of_rate(*pair) for pair in unmatched(results)]),
+        _Details(
+            "Rows without a counterpart in the paper", (*own, *rates), [of_rate(*pair) for pair in unmatched(results)]
+        ),
         _Details(
             "Held for two seconds, and plausibility",
             (*own, "constraint", "held 2 s", *PLAUSIBILITY[1:]),
@@ -141,7 +143,7 @@ def _details(results: Sequence[Result]) -> list[_Details]:
 
 
 def _of(cells: Callable[[Row], tuple[str, ...]]) -> Callable[[Result, Row], tuple[str, ...]]:
-    """A row's cells behind its table, hand and method."""
+    """Prepends table, hand and method to the cells of a row."""
     return lambda result, row: (result.part.name.removeprefix(f"{result.part.policy.name}-"), row.hand, row.method,
                                 *cells(row))  # fmt: skip
 
@@ -153,7 +155,7 @@ def _plausible(row: Row) -> tuple[str, ...]:
 
 
 def _pictures(results: Sequence[Result]) -> Iterator[Picture]:
-    """Episodes that were drawn, of files that are still there."""
+    """Yields pictures of episodes whose files still exist."""
     for result in results:
         for found in result.about["pictures"]:
             path = pathlib.Path(found["file"])

@@ -1,4 +1,4 @@
-"""What a reproduction consists of: which policies it needs, and the parts that are evaluated one after the other."""
+"""Plan of a reproduction: the policies it needs, and the parts that are evaluated in turn."""
 
 import pathlib
 from collections.abc import Sequence
@@ -7,12 +7,12 @@ from typing import NamedTuple
 from congrasp.common.task.methods import METHODS, STUDENT
 
 BASELINES = tuple(name for name in METHODS if name not in ("ours", STUDENT))
-"""Methods beside the full system, all of one hand."""
+"""Methods compared with the full system, all for one hand."""
 _ON_MANY_OBJECTS = ("ours", "graspxl", "no-dynamic-center")
-"""Methods that the paper tests on large-scale objects."""
+"""Methods tested by the paper on large-scale objects."""
 
 
-class Policy(NamedTuple):
+class RequiredPolicy(NamedTuple):
     """A policy that a reproduction needs."""
 
     hand: str
@@ -20,14 +20,14 @@ class Policy(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Of its run, and in texts."""
+        """Name of its run, and in texts."""
         return f"{self.hand}-{self.method}"
 
 
 class Part(NamedTuple):
-    """Rows that are evaluated together, and kept together."""
+    """Rows that are evaluated and stored together."""
 
-    policy: Policy
+    policy: RequiredPolicy
     table: str
     """`services.evaluate.tables.evaluate_tables`, or `captured`."""
     data: pathlib.Path | None = None
@@ -35,23 +35,23 @@ class Part(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Name of its files."""
         return f"{self.policy.name}-{self.data.resolve().name if self.data else self.table}"
 
 
-def policies(hands: Sequence[str], methods: Sequence[str]) -> list[Policy]:
-    """The full system of every hand, then the other methods of the first hand, learning or not."""
-    full = [Policy(hand, "ours") for hand in hands]
-    return full + [Policy(hands[0], method) for method in BASELINES if method in methods]
+def policies(hands: Sequence[str], methods: Sequence[str]) -> list[RequiredPolicy]:
+    """Returns the full system of every hand, then the other methods of the first hand, learning or not."""
+    full = [RequiredPolicy(hand, "ours") for hand in hands]
+    return full + [RequiredPolicy(hands[0], method) for method in BASELINES if method in methods]
 
 
-def parts(needed: Sequence[Policy], captured: Sequence[pathlib.Path], *, noise: bool) -> list[Part]:
-    """All parts; the first policy is the one with every table.
+def parts(needed: Sequence[RequiredPolicy], captured: Sequence[pathlib.Path], *, noise: bool) -> list[Part]:
+    """Returns all parts; the first policy is the one with every table.
 
     Args:
-      needed: `policies`.
-      captured: folders of captured data sets, of the first policy's hand.
-      noise: whether rows under noise are part of it, which stand in none of the paper's tables.
+      needed: result of `policies`.
+      captured: folders of captured data sets for the first policy's hand.
+      noise: includes rows under noise, which are in none of the paper's tables.
     """
     first = needed[0]
     found = [Part(policy, "single") for policy in needed]

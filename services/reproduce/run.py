@@ -1,4 +1,4 @@
-"""The flow of `congrasp reproduce`: train what is missing, evaluate every part, write the result."""
+"""Flow of `congrasp reproduce`: trains missing policies, evaluates every part, writes the result."""
 
 import dataclasses
 import gc
@@ -21,43 +21,43 @@ from congrasp.services.reproduce import training
 from congrasp.services.reproduce.comparison import compare
 from congrasp.services.reproduce.evaluation import Numbers, Result, evaluate_part
 from congrasp.services.reproduce.page import Account, page, write
-from congrasp.services.reproduce.plan import BASELINES, Policy, parts, policies
+from congrasp.services.reproduce.plan import BASELINES, RequiredPolicy, parts, policies
 
 RUNS = "policies"
-"""Folder of trainings below the output folder."""
+"""Folder of trainings within the output folder."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What is reproduced, and with what."""
+    """Request for a reproduction."""
 
     out: pathlib.Path
     hands: tuple[str, ...]
-    """The first is the one of all tables but that of hands."""
+    """Hands; the first is used in all tables except that of hands."""
     methods: tuple[str, ...]
-    given: Mapping[Policy, Entrant]
+    given: Mapping[RequiredPolicy, Entrant]
     """Policies that need no training."""
     captured: tuple[pathlib.Path, ...]
     quick: bool
-    """Pretrained policies stand in for trained ones."""
+    """Uses pretrained policies instead of training."""
     options: tuple[str, ...]
     """Further options of trainings."""
     patience: float
-    """Seconds of each training."""
+    """Limit of each training, s."""
     command: str
-    """The command line."""
+    """Command line of the request."""
 
 
 class _Policies(NamedTuple):
-    """What there is to evaluate."""
+    """Policies available for evaluation."""
 
-    entrants: dict[Policy, Entrant]
-    absent: dict[Policy, str]
-    """Why there is no policy."""
+    entrants: dict[RequiredPolicy, Entrant]
+    absent: dict[RequiredPolicy, str]
+    """Reasons for missing policies."""
 
 
-def to_train(request: Request) -> list[Policy]:
-    """Policies that the request would have to train."""
+def to_train(request: Request) -> list[RequiredPolicy]:
+    """Returns the policies that the request would have to train."""
     if request.quick:
         return []
     found = policies(request.hands, request.methods)
@@ -70,22 +70,22 @@ def reproduce(
     track: Track,
     note: Callable[[str], None] = lambda text: None,
 ) -> Account:
-    """Trains, evaluates and writes; one that fails does not stop the rest.
+    """Trains, evaluates and writes; a failure does not stop the rest.
 
     Args:
-      request: what is wanted.
-      numbers: how much is evaluated; the engine may be `auto`.
+      request: the request.
+      numbers: sizes and settings of the evaluation; the engine may be `auto`.
       track: shows progress.
-      note: is given what is worth a line.
+      note: called with messages for the user.
 
     Raises:
       CongraspError: nothing could be evaluated, or the result cannot be written.
     """
     page()  # fails before anything else if a package is missing
-    shown: set[Policy] = set()
+    shown: set[RequiredPolicy] = set()
 
-    def show(policy: Policy, line: str) -> None:
-        """A bar for each training; what it prints is in its log."""
+    def show(policy: RequiredPolicy, line: str) -> None:
+        """Shows a bar for each training; its output is in its log."""
         if policy not in shown:
             shown.add(policy)
             track(f"Training {policy.name} (log: {request.out / RUNS / policy.name}.log)", None)
@@ -102,7 +102,7 @@ def reproduce(
     found = _policies(request, failed)
     results: list[Result] = []
     failures = list(failed.values())
-    # Not before: trainings have the device's memory for themselves until this process looks for its engine.
+    # Not earlier: trainings have the whole device memory until this process initialises its engine.
     numbers = dataclasses.replace(numbers, physics=resolve_physics(numbers.physics))
     whole = parts(policies(request.hands, request.methods), request.captured, noise=not request.quick)
     wanted = [part for part in whole if part.policy in found.entrants]
@@ -116,12 +116,14 @@ def reproduce(
         else:
             results.append(result)
             note(f"{part.name}: {_outcome(result)}")
-            if result.fresh:  # its compiled programs serve no other part
+            if result.fresh:  # no other part uses its compiled programs
                 jax.clear_caches()
                 gc.collect()
         advance(done)
     if not results:
-        raise CongraspError("Nothing could be evaluated.", failures[0] if failures else "Name a hand with a policy.")
+        raise CongraspError(
+            "Nothing could be evaluated.", failures[0] if failures else "Pass --hand with a hand that has a policy."
+        )
     account = _account(request, numbers, found, results, failures)
     write(account, request.out)
     return account
@@ -130,13 +132,13 @@ def reproduce(
 def _outcome(result: Result) -> str:
     """One line about a part."""
     if not result.fresh:
-        return "done before"
+        return "evaluated before"
     rates = ", ".join(f"{row.constraint} {100 * row.success:.1f} %" for row in result.rows if not row.group)
     return f"{rates} ({result.about['seconds']:.0f} s)"
 
 
-def _file(request: Request, policy: Policy) -> pathlib.Path | None:
-    """A policy's file, if there is one."""
+def _file(request: Request, policy: RequiredPolicy) -> pathlib.Path | None:
+    """Returns a policy's file, if it exists."""
     if policy in request.given:
         return request.given[policy].file
     if request.quick and policy.method == "ours":
@@ -144,12 +146,12 @@ def _file(request: Request, policy: Policy) -> pathlib.Path | None:
     return training.trained(request.out / RUNS, policy)
 
 
-def _policies(request: Request, failed: Mapping[Policy, str]) -> _Policies:
-    """Reads what there is; methods that do not learn take the full system's hand and geometry."""
+def _policies(request: Request, failed: Mapping[RequiredPolicy, str]) -> _Policies:
+    """Reads the available policies; methods without learning use the full system's hand and geometry."""
     found = _Policies({}, {})
     for policy in policies(request.hands, request.methods):
         learns = get_method(policy.method).learns
-        file = _file(request, policy if learns else Policy(policy.hand, "ours"))
+        file = _file(request, policy if learns else RequiredPolicy(policy.hand, "ours"))
         if policy in request.given:
             found.entrants[policy] = request.given[policy]
         elif file is not None:
@@ -157,16 +159,16 @@ def _policies(request: Request, failed: Mapping[Policy, str]) -> _Policies:
         elif policy in failed:
             found.absent[policy] = failed[policy]
         else:
-            found.absent[policy] = "--quick trains none" if request.quick else "it was not trained"
+            found.absent[policy] = "not trained with --quick" if request.quick else "it was not trained"
     for method in set(BASELINES) - set(request.methods):
-        found.absent[Policy(request.hands[0], method)] = "it was not asked for"
+        found.absent[RequiredPolicy(request.hands[0], method)] = "not requested"
     return found
 
 
 def _account(
     request: Request, numbers: Numbers, found: _Policies, results: Sequence[Result], failures: Sequence[str]
 ) -> Account:
-    """Everything for the page."""
+    """Collects the content of the page."""
     runs = request.out / RUNS
     trainings = {policy: training.seconds(runs, policy) or 0.0 for policy in found.entrants}
     seconds = {

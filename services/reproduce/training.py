@@ -1,46 +1,46 @@
-"""Trains the policies of a reproduction that are missing, one after the other, each in a run of its own."""
+"""Trains the missing policies of a reproduction in turn, each in a separate run."""
 
 import functools
 import pathlib
 from collections.abc import Callable, Sequence
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.reproduce.plan import Policy
+from congrasp.services.reproduce.plan import RequiredPolicy
 from congrasp.services.train import unattended
 from congrasp.services.train.presets import FULL
 
 
-def trained(folder: pathlib.Path, policy: Policy) -> pathlib.Path | None:
-    """The policy file of a run that came to its end, in the folder of all runs; None if there is none."""
+def trained(folder: pathlib.Path, policy: RequiredPolicy) -> pathlib.Path | None:
+    """Policy file of a finished run in the folder of all runs; None if there is none."""
     return unattended.trained(folder / policy.name)
 
 
-def seconds(folder: pathlib.Path, policy: Policy) -> float | None:
-    """How long its training took; of a resumed one the last session."""
+def seconds(folder: pathlib.Path, policy: RequiredPolicy) -> float | None:
+    """Duration of its training in seconds; for a resumed one, that of the last session."""
     return unattended.seconds(folder / policy.name)
 
 
 def train_all(
     folder: pathlib.Path,
-    wanted: Sequence[Policy],
+    wanted: Sequence[RequiredPolicy],
     *,
     options: Sequence[str] = (),
     patience: float,
-    progress: Callable[[Policy, str], None] = lambda policy, line: None,
-) -> dict[Policy, str]:
-    """Trains policies, from the last checkpoint where there is one.
+    progress: Callable[[RequiredPolicy, str], None] = lambda policy, line: None,
+) -> dict[RequiredPolicy, str]:
+    """Trains policies, resuming from the last checkpoint if there is one.
 
     Args:
-      folder: of all runs.
-      wanted: what is trained, in this order; none that is `trained` already.
+      folder: folder of all runs.
+      wanted: policies to train, in this order, without those already `trained`.
       options: further options of `congrasp train`.
-      patience: seconds after which a training is ended, to be resumed another time.
-      progress: is given the last line that a training printed.
+      patience: seconds after which a training is stopped, to be resumed later.
+      progress: called with the last line that a training printed.
 
     Returns:
-      Why a policy was not trained, for those that failed; the others were trained all the same.
+      Reasons for failed trainings; the others succeeded.
     """
-    failures: dict[Policy, str] = {}
+    failures: dict[RequiredPolicy, str] = {}
     for policy in wanted:
         told = functools.partial(progress, policy)
         try:
@@ -52,7 +52,7 @@ def train_all(
     return failures
 
 
-def chosen(policy: Policy) -> list[str]:
-    """The options of `congrasp train` that make the policy's run."""
+def chosen(policy: RequiredPolicy) -> list[str]:
+    """Options of `congrasp train` for the policy's run."""
     method = ["--method", policy.method] if policy.method != "ours" else []
     return ["--preset", FULL, "--hand", policy.hand, *method]

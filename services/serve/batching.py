@@ -1,8 +1,8 @@
-"""Queries that arrive together are answered together: a bounded queue, a worker thread, and none for a lone query.
+"""Batches queries that arrive together: a bounded queue and a worker thread, which a single query bypasses.
 
-Peers take turns in the queue, and none may fill more than its part of it: one that asks without end is refused when
-nobody else would be. While several peers ask, a long query is answered in parts, one in each batch: it delays the
-others by one part.
+Peers take turns in the queue, and each has a limited share of it: one that floods is refused when others would not be.
+While several peers send queries, a long query is answered in parts, one per batch, so that it delays the others by one
+part.
 """
 
 import collections
@@ -24,12 +24,12 @@ _ALONE = 1.0  # seconds without a query of another peer until one counts as alon
 
 
 class Parts(NamedTuple, Generic[T, R]):
-    """How an item is run in parts."""
+    """Splitting of an item into parts."""
 
     most: int
-    """What all that one peer has in a batch may weigh while there are several peers."""
+    """Limit of one peer's weight in a batch while there are several peers."""
     cut: Callable[[T, int, int], T]
-    """(item, first, end) -> what weighs `end` - `first` of it."""
+    """(item, first, end) -> the part of weight `end` - `first`."""
     join: Callable[[T, list[R]], R | Exception]
     """(item, results of its parts in order) -> its result."""
 
@@ -44,34 +44,33 @@ class _Waiting(Generic[T, R]):
     arrival: float
     deadline: float
     taken: int = 0
-    """Weight of the parts that have been in a batch."""
+    """Weight of the parts that were in a batch."""
     results: list[R] = dataclasses.field(default_factory=list)
-    """Of those parts."""
+    """Results of those parts."""
 
 
 class _Part(NamedTuple, Generic[T, R]):
-    """What a batch holds of an item."""
+    """Part of an item in a batch."""
 
     whole: _Waiting[T, R]
     item: T
 
 
 class Batcher(Generic[T, R]):
-    """Runs a function on batches of what callers submit, one batch at a time.
+    """Runs a function on batches of submitted items, one batch at a time.
 
-    An item that finds nothing running and nobody waiting is run in the thread that submits it, since waking another
-    costs a lone caller more than the work. Everything else waits for the worker, which takes what has arrived. It
-    waits for more, `window` seconds at most, only until as many are there as were in the last batch: many callers in
-    step are answered in step.
+    If nothing is running or queued, an item runs in the submitting thread, since waking another costs a single caller
+    more than the work. All others wait for the worker, which takes the queued items. It waits at most `window` seconds
+    until there are as many as in the last batch, so that synchronous callers stay synchronous.
 
     Args:
-      run: the function of a batch and its queueing times in seconds; it returns one result or exception for each item.
-      size: most that the items of one batch may weigh together.
-      window: seconds.
-      depth: most items that wait; one more is refused with `OverloadedError`.
-      share: most items of one peer that wait; by default `depth`.
-      weigh: an item's weight, which is at most `size`.
-      parts: how items are run in parts; without it each is run whole.
+      run: function of a batch and its queueing times in seconds; returns one result or exception for each item.
+      size: limit of the weight of a batch.
+      window: longest wait for further items, s.
+      depth: limit of the queue; further items are refused with `OverloadedError`.
+      share: limit of one peer's queued items; by default `depth`.
+      weigh: returns an item's weight, at most `size`.
+      parts: splitting of items; None runs each as a whole.
     """
 
     def __init__(
@@ -92,7 +91,7 @@ class Batcher(Generic[T, R]):
         self._depth = depth
         self._share = depth if share is None else share
         self._queues: collections.OrderedDict[str, collections.deque[_Waiting[T, R]]] = collections.OrderedDict()
-        self._latest, self._several_until = "", -math.inf  # peer, and when it will count as alone
+        self._latest, self._several_until = "", -math.inf  # peer, and the time at which it counts as alone
         self._changed = threading.Condition()
         self._running = False
         self._expected = 1
@@ -101,23 +100,23 @@ class Batcher(Generic[T, R]):
         self._thread.start()
 
     def check_room(self, peer: str) -> None:
-        """Raises `OverloadedError` if nothing more of a peer may wait."""
+        """Raises an `OverloadedError` if the peer may not queue another item."""
         with self._changed:
             if len(self) >= self._depth:
-                raise OverloadedError(f"Overloaded: {self._depth} queries wait already.", "Ask again later.")
+                raise OverloadedError(f"Overloaded: {self._depth} queries are queued.", "Try again later.")
             if len(self._queues.get(peer, ())) >= self._share:
-                raise OverloadedError(f"Overloaded: {self._share} of your queries wait already.", "Ask again later.")
+                raise OverloadedError(f"Overloaded: {self._share} of your queries are queued.", "Try again later.")
 
     def __len__(self) -> int:
-        """Items that wait."""
+        """Number of queued items."""
         with self._changed:
             return sum(len(queue) for queue in self._queues.values())
 
     def submit(self, item: T, timeout: float, peer: str = "") -> "Future[R]":
-        """Queues an item of a peer that is worth answering for `timeout` seconds.
+        """Queues an item of a peer with a deadline of `timeout` seconds.
 
         Raises:
-          OverloadedError: `depth` items wait already, or `share` of this peer.
+          OverloadedError: `depth` items are queued already, or `share` of this peer.
         """
         now = time.monotonic()
         waiting: _Waiting[T, R] = _Waiting(item, self._weigh(item), Future(), now, now + timeout)
@@ -139,25 +138,27 @@ class Batcher(Generic[T, R]):
         return waiting.future
 
     def close(self, timeout: float = 2.0) -> None:
-        """Refuses what waits and ends the worker."""
+        """Refuses queued items and ends the worker."""
         with self._changed:
             self._closed = True
             self._changed.notify()
         self._thread.join(timeout)
 
     def _work(self) -> None:
-        """Answers batches until the batcher is closed, in the worker."""
+        """Runs batches until the batcher is closed; runs in the worker thread."""
         while batch := self._collect():
             self._answer(batch)
         for waiting in (one for queue in self._queues.values() for one in queue):
             waiting.future.set_exception(CongraspError("The server is shutting down."))
 
     def _answer(self, batch: list[_Part[T, R]]) -> None:
-        """Runs a batch without what is late, and gives every item its outcome once all its parts have run."""
+        """Runs a batch without late items, and resolves every item once all its parts have run."""
         now = time.monotonic()
         for waiting, _ in batch:
             if waiting.deadline < now:
-                late = f"Too late: the query waited {1e3 * (now - waiting.arrival):.0f} ms, beyond its deadline."
+                late = (
+                    f"Too late: the query was queued for {1e3 * (now - waiting.arrival):.0f} ms, beyond its deadline."
+                )
                 self._fail(waiting, LateError(late))
         batch = [part for part in batch if part.whole.deadline >= now]
         results: Sequence[R | Exception]
@@ -181,7 +182,7 @@ class Batcher(Generic[T, R]):
                 waiting.future.set_result(result)
 
     def _collect(self) -> list[_Part[T, R]]:
-        """The next batch; empty once closed."""
+        """Returns the next batch; empty once closed."""
         with self._changed:
             while (self._running or not self._queues) and not self._closed:
                 if not self._changed.wait(self._window if self._expected > 1 else None):
@@ -196,16 +197,16 @@ class Batcher(Generic[T, R]):
             return batch
 
     def _turn(self) -> int:
-        """What one peer may have in a batch."""
+        """Limit of one peer's weight in a batch."""
         return self._parts.most if self._parts and time.monotonic() < self._several_until else self._size
 
     def _take(self) -> list[_Part[T, R]]:
-        """Takes a batch from the queue, one item or part of each peer after the other; the caller holds the lock."""
+        """Takes a batch from the queue, one item or part of each peer in turn; the caller holds the lock."""
         batch: list[_Part[T, R]] = []
         room, most = self._size, self._turn()
         turns = collections.Counter[str]()
         while waiting := [peer for peer in self._queues if turns[peer] < most]:
-            peer = waiting[0]  # whose turn it is
+            peer = waiting[0]  # the peer whose turn it is
             queue = self._queues[peer]
             first = queue[0]
             weight = first.weight - first.taken
@@ -224,7 +225,7 @@ class Batcher(Generic[T, R]):
         return batch
 
     def _part(self, waiting: _Waiting[T, R], weight: int) -> _Part[T, R]:
-        """Takes so much of an item."""
+        """Takes a part of this weight from an item."""
         item, first = waiting.item, waiting.taken
         waiting.taken += weight
         if weight < waiting.weight and self._parts is not None:
@@ -232,7 +233,7 @@ class Batcher(Generic[T, R]):
         return _Part(waiting, item)
 
     def _fail(self, waiting: _Waiting[T, R], error: Exception) -> None:
-        """Gives an item an error, and runs no further part of it."""
+        """Resolves an item with an error, and drops its further parts."""
         with self._changed:
             for peer, queue in self._queues.items():
                 if waiting in queue:

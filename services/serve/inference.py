@@ -22,28 +22,28 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.serve.requests import PACKED, STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)
-"""Batches are padded to one of these, so that nothing compiles after the warm-up."""
+"""Batches are padded to one of these sizes, so that nothing compiles after the warm-up."""
 
 
 class Inference(NamedTuple):
-    """The policy's answer to one query of n states."""
+    """Reply of the policy to a query of n states."""
 
     vectors: np.ndarray
     """(n, A + F + 6): the policy's mean action in units of action, finger targets (rad), wrist targets (m and rad)."""
     active: list[list[str]]
-    """For each state which constraints are active and why, in sentences."""
+    """For each state, the active constraints and the reasons, in sentences."""
 
 
 class PolicyFunction:
     """The policy of one hand and task, for any weights.
 
     Attributes:
-      layout: how queries are laid out.
+      layout: layout of queries.
     """
 
     def __init__(self, hand: Hand, task: TaskConfig):
         self.layout = Layout(hand, task)
-        # Waking other threads costs a CPU more than they save here.
+        # Waking other threads costs more CPU time than they save here.
         alone = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
         self._compiled = jax.jit(self._infer, compiler_options=alone)
 
@@ -59,7 +59,7 @@ class PolicyFunction:
         return seconds
 
     def __call__(self, weights: InferenceParameters, queries: Sequence[Query]) -> list[Inference | Exception]:
-        """Answers queries of at most `BATCH_SIZES[-1]` states; one that cannot be answered gets its own error."""
+        """Answers queries of at most `BATCH_SIZES[-1]` states; an invalid query gets an error."""
         ends = list(itertools.accumulate(len(query.vectors) for query in queries))
         batch = np.zeros((next(size for size in BATCH_SIZES if size >= ends[-1]), self.layout.size), np.float32)
         np.concatenate([query.vectors for query in queries], out=batch[: ends[-1]])
@@ -68,12 +68,12 @@ class PolicyFunction:
         return [self._answer(query, found[a:b]) for query, a, b in zip(queries, starts, ends, strict=True)]
 
     def reply(self, request: Message, answer: Inference, meta: Mapping[str, Any]) -> Message:
-        """The reply to a query: targets in its own form, and the layout of packed ones where it asks for that.
+        """Returns the reply to a query: targets by name or packed, and the layout if requested.
 
         Args:
           request: the query.
-          answer: what was inferred for it.
-          meta: further entries: `version` and `total_ms`, at least.
+          answer: the inferred answer.
+          meta: further metadata, at least `version` and `total_ms`.
         """
         meta = {**meta, "active": answer.active}
         if PACKED in request.arrays:
@@ -85,11 +85,13 @@ class PolicyFunction:
         return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
 
     def _infer(self, weights: InferenceParameters, vectors: jax.Array) -> jax.Array:
-        """For states (B, S): answers (A + F + 6), the flags redirected and aligned, and checks (C), in one (B, ...)."""
+        """For states (B, S): answers (A + F + 6), flags redirected and aligned, and checks (C), concatenated to (B,
+        ...).
+        """
         hand, task = self.layout.hand, self.layout.task
         fields, checks = self.layout.complete(vectors)
         asked = {c.name: fields["asked"][:, i] > 0.5 for i, c in enumerate(self.layout.known) if c.optional}
-        surface = Surface(fields["surface_points"], fields["surface_minus"])
+        surface = Surface(fields["surface_points"], fields["surface_avoid"])
         resolution = resolve(hand, surface, self.layout.goal(fields), asked)
         state = SceneState(**{name: fields[name] for name in SceneState._fields})
         if (readings := self.layout.readings(fields)) is not None:
@@ -101,13 +103,13 @@ class PolicyFunction:
         return jnp.concatenate([mean, action.q_target, action.u_target, notes, checks], -1)
 
     def _answer(self, query: Query, found: np.ndarray) -> Inference | Exception:
-        """What was found for one query, or its own error."""
+        """Returns the answer to one query, or its error."""
         size = len(self.layout.hand.motors) + len(self.layout.hand.joints) + 12
         vectors, redirected, aligned, checks = found[:, :size], found[:, size], found[:, size + 1], found[:, size + 2 :]
         if error := self.layout.find_error(query, checks):
             return error
         if not np.isfinite(vectors).all():
-            return CongraspError("The policy's answer to this query is not finite.", "Check the state's magnitudes.")
+            return CongraspError("The policy's action for this query is not finite.", "Check the state's magnitudes.")
         if not aligned.all():
             return ContradictionError(
                 "The constraints contradict each other: the trajectory ends nearer to the avoid region than to the "

@@ -1,4 +1,4 @@
-"""A policy server in a process of its own, a plausible query for it, and a test of its latency."""
+"""A policy server in a separate process, a plausible query for it, and a latency test."""
 
 import concurrent.futures
 import contextlib
@@ -23,13 +23,13 @@ from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
 
 @contextlib.contextmanager
 def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]]:
-    """A server of a policy file on this machine while the block runs: its endpoint, and the number of its process.
+    """Context with a server of a policy file on this machine: yields its endpoint and process id.
 
-    It may still be compiling.
+    The server may still be compiling.
 
     Args:
       policy: the file.
-      log: takes what the server prints.
+      log: file for the server's output.
     """
     endpoint = local_url()
     command = [sys.executable, "-m", "congrasp", "serve", "--policy", str(policy), "--listen", endpoint]
@@ -55,13 +55,13 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]
 
 
 def processor_seconds(process: int) -> float:
-    """Processor time that a process has taken, in all its threads."""
+    """Processor time of a process in all its threads, s."""
     times = psutil.Process(process).cpu_times()
     return times.user + times.system
 
 
 def wait_until_ready(client: PolicyClient, seconds: float = 180.0) -> None:
-    """Returns once the server has compiled and answers; a CongraspError after `seconds`."""
+    """Waits until the server has compiled and responds; raises a CongraspError after `seconds`."""
     deadline = time.monotonic() + seconds
     while True:
         try:
@@ -74,20 +74,20 @@ def wait_until_ready(client: PolicyClient, seconds: float = 180.0) -> None:
 
 
 class Example(NamedTuple):
-    """The start of an episode."""
+    """Initial state of an episode."""
 
     hand: str
     """Name of the hand."""
     object: str
     """Name of the object."""
     request: GraspRequest
-    """For `reset`."""
+    """Request for `reset`."""
     state: dict[str, np.ndarray]
-    """For `act`."""
+    """State for `act`."""
 
 
 def example_episode(seed: int, hand: str = "human") -> Example:
-    """The start of an episode with a procedural object and one of its headings."""
+    """Returns the initial state of an episode with a procedural object and one of its headings."""
     import jax
 
     from congrasp.actors import initial
@@ -126,7 +126,7 @@ def measure(
 ) -> dict[str, float]:
     """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is not counted.
 
-    With more than one of `states` a query holds so many, and each of them counts as an answer.
+    With `states` > 1 each query holds that many, and each state counts as an answer.
     """
     share = max(1, repeat // concurrency)
 
@@ -160,7 +160,7 @@ def measure(
 
 
 def one_answer(policy: Policy, episode: Example) -> str:
-    """Asks for the first action of an episode; the answer as text."""
+    """Queries the first action of an episode; returns the answer as text."""
     policy.reset(episode.request)
     answer = policy.act(episode.state)
     with np.printoptions(precision=3, suppress=True):

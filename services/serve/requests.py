@@ -1,16 +1,16 @@
-"""Queries of the live policy: which arrays they carry, how they are checked, and how they become one flat vector.
+"""Queries of the live policy: their arrays, validation, and conversion to one flat vector.
 
 A query names its constraints in the metadata and carries, without batch axis, the fields of
-`common.task.types.SceneState`, the object's surface points and the goal fields of its constraints. The whole query
-travels to the device as one float32 vector, since one transfer costs as much as thirty times its size.
+`common.task.types.SceneState`, the object's surface points and the goal fields of its constraints. The whole query is
+transferred to the device as one float32 vector, since the overhead of a transfer equals that of thirty times its size.
 
-For a policy that looks back (`TaskConfig.observation` "tracked") it also carries `past_q`, `past_u`, `past_q_target`,
-`past_u_target`, `past_object_position` and `past_object_quaternion` of the control steps before, newest first; without
-them, those of the present one are repeated.
+For a policy with history (`TaskConfig.observation` "tracked") it also carries `past_q`, `past_u`, `past_q_target`,
+`past_u_target`, `past_object_position` and `past_object_quaternion` of earlier control steps, newest first; without
+them, those of the current one are repeated.
 
-A query may also be packed: the vector itself as its one array, and in the metadata the digest of the layout that it
-follows. Whoever asks a query of names for the `layout` gets it with the answer. Packed queries cost both ends a fourth.
-They may hold several states, a row each, all with the same constraints; the answer then has as many rows.
+A query may also be packed: the vector itself as its single array, with the digest of its layout in the metadata. A
+named query can request the `layout` with its reply. Packed queries cost both ends a quarter. They may hold several
+states, one per row, with the same constraints; the reply then has as many rows.
 """
 
 import hashlib
@@ -35,9 +35,9 @@ from congrasp.common.wire.codec import Message
 STATES_LIMIT = 64
 """Most states in one query."""
 SURFACE_LIMIT = 4096
-"""Most surface points in one query; the policy looks at `TaskConfig.surface_points` of them."""
+"""Most surface points in one query; the policy uses `TaskConfig.surface_points` of them."""
 PACKED = "packed"
-"""The one array of a packed query."""
+"""Name of the array of a packed query."""
 _UNIT_TOLERANCE = 0.02
 _OPTIONAL_STATE = (
     "q_velocity",
@@ -52,21 +52,21 @@ _OPTIONAL_STATE = (
 
 
 class Query(NamedTuple):
-    """A query whose fields are all there, of n states."""
+    """A complete query of n states."""
 
     vectors: np.ndarray
     """(n, S) float32, laid out by `Layout`; its values are checked by `Layout.complete`."""
     asked: tuple[str, ...]
-    """Names of the constraints that were asked for."""
+    """Names of the requested constraints."""
 
 
 class Layout:
-    """Names, shapes and places of a query's fields for one hand and task.
+    """Names, shapes and offsets of a query's fields for one hand and task.
 
     Attributes:
-      shapes: field name to shape; the fields of the state, of the control steps before it if the policy sees them, then
-        of the goal, then the surface and the asked bits.
-      size: S, length of the flat vector.
+      shapes: shapes by field name: state, earlier control steps if the policy observes them, goal, surface, and flags
+        of the requested constraints.
+      size: length S of the flat vector.
       digest: identifies the layout.
     """
 
@@ -92,7 +92,7 @@ class Layout:
         steps = (task.history - 1,)
         self.shapes |= {name: (*steps, *self.shapes[name.removeprefix("past_")]) for name in self._past}
         self.shapes |= {name: np.shape(value) for name, value in self._neutral.items()}
-        self.shapes |= {"surface_points": (points, 3), "surface_minus": (points,), "asked": (len(self.known),)}
+        self.shapes |= {"surface_points": (points, 3), "surface_avoid": (points,), "asked": (len(self.known),)}
         self.offsets = {}
         self.size = 0
         for name, shape in self.shapes.items():
@@ -105,24 +105,24 @@ class Layout:
         self.digest = hashlib.sha256(json.dumps(self.description()).encode()).hexdigest()[:16]
 
     def description(self) -> dict[str, Any]:
-        """For packers: the vector's size, and offset and shape of every field but those that the server fills in."""
+        """Layout for clients that pack queries: size of the vector, and offset and shape of every client field."""
         fields = {name: [self.offsets[name], *shape] for name, shape in self.shapes.items() if name != "asked"}
         return {"size": self.size, "fields": fields}
 
     def unpack(self, vectors: Any) -> dict[str, Any]:
-        """Fields (B, ...) of flat vectors (B, S); works on NumPy arrays and on traced ones."""
+        """Returns the fields (B, ...) of flat vectors (B, S), for NumPy and traced arrays."""
         return {name: self._field(vectors, name).reshape(-1, *shape) for name, shape in self.shapes.items()}
 
     def _field(self, vectors: Any, name: str) -> Any:
-        """A field's numbers (..., n) in flat vectors (..., S)."""
+        """Numbers (..., n) of a field in flat vectors (..., S)."""
         return vectors[..., self._places(name)]
 
     def _places(self, name: str) -> slice:
-        """Where a field's numbers stand in a vector."""
+        """Slice of a field in a vector."""
         return slice(self.offsets[name], self.offsets[name] + math.prod(self.shapes[name]))
 
     def parse(self, message: Message) -> Query:
-        """Lays a query out, unless it is packed already; a CongraspError names what is wrong with its form."""
+        """Converts a query to a vector, unless it is packed; raises a CongraspError for an invalid form."""
         meta = message.meta
         hand = meta.get("hand", self.hand.name)
         if hand != self.hand.name:
@@ -133,18 +133,18 @@ class Layout:
         return Query(vectors, asked)
 
     def _packed(self, message: Message) -> np.ndarray:
-        """The vectors (n, S) of a packed query, a copy."""
+        """Returns the vectors (n, S) of a packed query, a copy."""
         vectors, digest = message.arrays[PACKED], message.meta.get("layout")
         if digest != self.digest or len(message.arrays) > 1 or vectors.ndim != 2 or vectors.shape[1] != self.size:
             raise LayoutError(
-                "The packed query does not follow the policy's layout.", "Ask for the layout with a query of names."
+                "The packed query does not match the policy's layout.", "Request the layout with a named query."
             )
         if not 1 <= len(vectors) <= STATES_LIMIT:
             raise CongraspError(f"The query has {len(vectors)} states.", f"Send 1 to {STATES_LIMIT} at a time.")
         return np.array(vectors, np.float32)
 
     def _named(self, arrays: Mapping[str, Any], asked: tuple[str, ...]) -> np.ndarray:
-        """The vector (S,) of a query of names; a CongraspError names a field that is unknown, absent or misshapen."""
+        """Returns the vector (S,) of a named query; raises a CongraspError for an unknown, missing or invalid field."""
         unknown = sorted(arrays.keys() - self.shapes.keys() | arrays.keys() & {"asked"})
         if unknown:
             shown = ascii(unknown[0])[:60]
@@ -158,8 +158,8 @@ class Layout:
                 raise CongraspError(f"The query lacks the field '{name}'.")
         vector = np.zeros(self.size, np.float32)
         given = dict(arrays)
-        given["surface_points"], given["surface_minus"] = self._surface(given)
-        for name in self._past:  # who sends none has been where it is
+        given["surface_points"], given["surface_avoid"] = self._surface(given)
+        for name in self._past:  # without history, the current state is repeated
             given.setdefault(name, np.broadcast_to(given[name.removeprefix("past_")], self.shapes[name]))
         for name, value in given.items():
             shape = self.shapes[name]
@@ -169,19 +169,19 @@ class Layout:
         return vector
 
     def complete(self, vectors: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
-        """Makes quaternions and directions of queries unit, and fills in what nobody asked for; traced with the policy.
+        """Normalises quaternions and directions of queries, and fills in omitted fields; traced with the policy.
 
         Args:
-          vectors: (B, S).
+          vectors: (B, S) flat vectors.
 
         Returns:
-          The fields (B, ...) by name, zero where a query is not finite, and what `find_error` looks at (B, C): whether
-          it is finite and each of its constraints valid, as 1 or 0, and lengths that must be 1.
+          Fields (B, ...) by name, zero where a query is not finite, and checks (B, C) for `find_error`: finite and each
+          constraint valid, as 1 or 0, and norms that must be 1.
         """
         finite = jnp.isfinite(vectors).all(1)
         fields = self.unpack(jnp.where(finite[:, None], vectors, 0.0))
         asked = fields["asked"] > 0.5
-        for name in ("contact_found", "table", "surface_minus", *self._flags):
+        for name in ("contact_found", "table", "surface_avoid", *self._flags):
             fields[name] = fields[name] > 0.5
         lengths = []
         for name in self._directions:
@@ -191,16 +191,16 @@ class Layout:
             fields[name], length = _unit(fields[name], wanted, default)
             lengths.append(length)
         fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"])
-        surface, goal = Surface(fields["surface_points"], fields["surface_minus"]), self.goal(fields)
+        surface, goal = Surface(fields["surface_points"], fields["surface_avoid"]), self.goal(fields)
         fitting = [~asked[:, i] | c.valid(surface, goal[c.name]) for i, c in enumerate(self.known)]
         return fields, jnp.stack([finite, *fitting, *lengths], 1)
 
     def goal(self, fields: Mapping[str, Any]) -> Goal:
-        """The goal arrays of completed fields, before the priority rules."""
+        """Returns the goal arrays of completed fields, before the priority rules."""
         return Goal({c.name: c.goal(**{name: fields[f"{c.name}_{name}"] for name in c.arrays}) for c in self.known}, {})
 
     def readings(self, fields: Mapping[str, Any]) -> Readings | None:
-        """The last control steps of completed fields, if the policy sees them."""
+        """Returns the earlier control steps of completed fields, if the policy observes them."""
         if not self._past:
             return None
         return Readings(
@@ -208,7 +208,7 @@ class Layout:
         )
 
     def find_error(self, query: Query, checks: np.ndarray) -> CongraspError | None:
-        """The error of a query's first bad state, by what `complete` found (n, C): see there; None if all are good."""
+        """Returns the error of a query's first invalid state, by the checks (n, C) of `complete`; None without one."""
         wrong = ~(np.abs(checks - 1.0) <= _UNIT_TOLERANCE)
         if not wrong.any():
             return None
@@ -227,27 +227,27 @@ class Layout:
         return CongraspError(f"The field '{name}'{which} has length {length:.3f}, not 1.")
 
     def _asked(self, names: Any) -> tuple[str, ...]:
-        """Names of the constraints that a query asks for, weakest first."""
+        """Names of the requested constraints of a query, weakest first."""
         if not isinstance(names, list) or not all(isinstance(n, str) and len(n) <= LONGEST_NAME for n in names):
             raise CongraspError("The query's 'constraints' must be a list of names.")
         require_known(names, self.task)
         leading = [constraint.name for constraint in self.known if constraint.guides]
         if not set(leading) & set(names):
             raise CongraspError(
-                "The query asks for nothing that guides the wrist.", f"Add one of: {', '.join(leading)}."
+                "The query has no constraint that guides the wrist.", f"Add one of: {', '.join(leading)}."
             )
         return tuple(constraint.name for constraint in self.known if constraint.name in names)
 
     def _surface(self, arrays: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Points and labels, brought to the number that the policy looks at."""
+        """Points and labels, resampled to the number that the policy uses."""
         points = np.asarray(arrays["surface_points"])
         if points.ndim != 2 or points.shape[1] != 3 or not 1 <= len(points) <= SURFACE_LIMIT:
             raise CongraspError(
                 f"The field 'surface_points' has shape {points.shape}; it must be (N, 3), N at most {SURFACE_LIMIT}."
             )
-        avoid = np.asarray(arrays.get("surface_minus", np.zeros(len(points), bool)))
+        avoid = np.asarray(arrays.get("surface_avoid", np.zeros(len(points), bool)))
         if avoid.shape != (len(points),):
-            raise CongraspError(f"The field 'surface_minus' has shape {avoid.shape}; it must be ({len(points)},).")
+            raise CongraspError(f"The field 'surface_avoid' has shape {avoid.shape}; it must be ({len(points)},).")
         if len(points) == self.task.surface_points:
             return points, avoid
         index = np.arange(self.task.surface_points) * len(points) // self.task.surface_points
@@ -255,10 +255,10 @@ class Layout:
 
 
 def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """Vectors (B, ..., n) made unit where they are wanted (B,), the default elsewhere.
+    """Normalises vectors (B, ..., n) where wanted (B,) and replaces others by the default.
 
     Returns:
-      The vectors, and the length (B,) that is farthest from 1 of those that were wanted, else 1.
+      The vectors, and the norm (B,) farthest from 1 among the wanted ones, else 1.
     """
     lengths = jnp.linalg.norm(vectors, axis=-1, keepdims=True)
     usable = wanted.reshape(-1, *[1] * (vectors.ndim - 1)) & (lengths > 0.5)
@@ -268,10 +268,10 @@ def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[j
 
 
 def _orthogonal(cross: jax.Array, direction: jax.Array) -> jax.Array:
-    """(B, 3) unit cross-finger directions orthogonal to the heading; any such where one is absent or parallel to it."""
+    """Unit cross-finger directions (B, 3) orthogonal to the heading; arbitrary if absent or parallel to it."""
 
     def across(vector: jax.Array) -> jax.Array:
-        """Its part that is orthogonal to the heading."""
+        """Component orthogonal to the heading."""
         return vector - jnp.sum(vector * direction, -1, keepdims=True) * direction
 
     def unit(vector: jax.Array) -> jax.Array:
@@ -279,4 +279,4 @@ def _orthogonal(cross: jax.Array, direction: jax.Array) -> jax.Array:
 
     rest, other = across(cross), across(jnp.eye(3)[jnp.abs(direction).argmin(-1)])
     rest = jnp.where(jnp.linalg.norm(rest, axis=-1, keepdims=True) < 1e-3, other, rest)
-    return unit(across(unit(rest)))  # again: little is left of a nearly parallel one but rounding
+    return unit(across(unit(rest)))  # repeated, because a nearly parallel one leaves mostly rounding error

@@ -23,15 +23,15 @@ from congrasp.services.serve.inference import BATCH_SIZES, Inference, PolicyFunc
 from congrasp.services.serve.requests import Query
 
 Source = Callable[[int], PolicyBundle | None]
-"""(version that is held, -1 for none) -> a newer bundle, or None."""
+"""(current version, -1 for none) -> a newer bundle, or None."""
 WINDOW = 0.001
-"""Seconds that a query may wait for others to join its batch."""
+"""Longest time that a query waits for others to join its batch, s."""
 DEPTH = 64
-"""Queries that wait for the next batch; one more is refused at once."""
+"""Limit of queued queries; further ones are refused at once."""
 SHARE = 16
-"""Queries of one peer among them."""
+"""Limit of queued queries of one peer."""
 TURN = BATCH_SIZES[1] - 1
-"""States of one peer in a batch while there are several: with the one of a control loop the batch is still small."""
+"""Limit of one peer's states in a batch while there are several peers: small enough for the others' control loops."""
 _MAX_TIMEOUT = 60.0
 _FOLLOW_SECONDS = 0.5
 
@@ -45,7 +45,7 @@ class _Held(NamedTuple):
 
 
 _Answered = tuple[Inference, _Held, float, float]
-"""An answer, the policy it is of, and the seconds that it waited and was computed in."""
+"""An answer, its policy, and its queueing and inference times in seconds."""
 
 
 class PolicyServer:
@@ -61,23 +61,23 @@ class PolicyServer:
         on_answer: Callable[[str, float], None] = lambda outcome, seconds: None,
         on_batch: Callable[[int], None] = lambda size: None,
     ):
-        """Loads the first policy, compiles, and begins to serve.
+        """Loads the first policy, compiles, and starts serving.
 
         Args:
-          transport: the server's own endpoint.
-          run: name under which it serves.
-          source: where policies come from.
-          timeout: seconds that a query may wait when it names no deadline.
-          on_answer: given the outcome of every query (answered, refused, overloaded, late), and how long it took.
-          on_batch: given the number of states in every batch.
+          transport: endpoint of the server.
+          run: name of the served run.
+          source: source of policies.
+          timeout: default deadline of a query, s.
+          on_answer: called with the outcome of every query (answered, refused, overloaded, late), and its duration.
+          on_batch: called with the number of states of every batch.
 
         Raises:
-          CongraspError: there is no policy yet, or the name cannot be one.
+          CongraspError: there is no policy yet, or the name is not valid.
         """
         keys = Keys(run)
         first = source(-1)
         if first is None:
-            raise CongraspError("There is no policy to serve yet.", "Start the server when the run has published one.")
+            raise CongraspError("There is no policy to serve yet.", "Start the server after the run has published one.")
         self._source, self._timeout = source, timeout
         self._on_answer, self._on_batch = on_answer, on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
@@ -125,13 +125,13 @@ class PolicyServer:
         }
 
     def close(self) -> None:
-        """Refuses what waits, and stops following."""
+        """Refuses queued queries, and stops following."""
         self._closed.set()
         self._batcher.close()
         self._follower.join(2 * _FOLLOW_SECONDS)
 
     def _turn_away(self, key: str) -> None:
-        """Refuses a query that could not wait for its turn, before it costs anything more."""
+        """Refuses a query for which the queue has no room, before decoding it."""
         began = time.monotonic()
         try:
             self._batcher.check_room(account(key))
@@ -140,7 +140,7 @@ class PolicyServer:
             raise
 
     def _act(self, key: str, request: Message) -> "Future[Message]":
-        """Queues a query; the answer comes later."""
+        """Queues a query; returns a future of the reply."""
         began = time.monotonic()
         try:
             query = self._function.layout.parse(request)
@@ -154,7 +154,7 @@ class PolicyServer:
         return answer
 
     def _finish(self, request: Message, began: float, answer: "Future[Message]", done: "Future[_Answered]") -> None:
-        """Gives a query the outcome of its batch."""
+        """Resolves a query with the outcome of its batch."""
         error = done.exception()
         self._count(error, began)
         if error is None:
@@ -163,13 +163,13 @@ class PolicyServer:
             answer.set_exception(error)
 
     def _count(self, error: BaseException | None, began: float) -> None:
-        """Notes the outcome of a query."""
+        """Counts the outcome of a query."""
         lost = error.code if isinstance(error, OverloadedError | LateError) else "refused"
         self._answered += error is None
         self._on_answer("answered" if error is None else lost, time.monotonic() - began)
 
     def _message(self, request: Message, answered: "_Answered", seconds: float) -> Message:
-        """The reply: targets in the query's own form, version, times."""
+        """Returns the reply: targets in the query's form, version, times."""
         answer, held, queued, inferred = answered
         times = {"queue_ms": queued, "infer_ms": inferred, "total_ms": seconds}
         meta = {"version": held.bundle.version, "hash": held.hash}
@@ -178,7 +178,7 @@ class PolicyServer:
 
     @staticmethod
     def _deadline(seconds: Any) -> float:
-        """A query's own deadline in seconds, checked."""
+        """Validates the deadline of a query in seconds."""
         if not isinstance(seconds, int | float) or not 0.0 < seconds <= _MAX_TIMEOUT:
             raise CongraspError(
                 f"The query's 'timeout' is {ascii(seconds)[:40]}.", f"It must be seconds, at most {_MAX_TIMEOUT:g}."
@@ -197,7 +197,7 @@ class PolicyServer:
         ]
 
     def _join(self, query: Query, answers: list[_Answered]) -> _Answered | Exception:
-        """The answer to a query that was inferred in parts: by one policy, so anew if it was swapped meanwhile."""
+        """Joins the parts of a query; repeats it if the policy was swapped, so that one policy answers all."""
         inferences, held, queued, inferred = zip(*answers, strict=True)
         if any(one is not held[-1] for one in held):
             return self._infer([query], queued[:1])[0]
@@ -206,48 +206,50 @@ class PolicyServer:
         return Inference(vectors, active), held[-1], queued[0], sum(inferred)
 
     def _follow(self) -> None:
-        """Swaps in newer policies; one that does not fit is refused and the old one stays."""
+        """Swaps in newer policies; one that does not match is refused, and the current one stays."""
         while not self._closed.wait(_FOLLOW_SECONDS):
             try:
                 newer = self._source(self._held.bundle.version)
                 if newer is not None:
                     self._swap(newer)
             except TransportError:
-                continue  # the learner is disconnected; it may come back
+                continue  # the learner is disconnected and may return
             except CongraspError as error:
                 if str(error) != self._trouble:
                     log("warning", str(error))
                 self._trouble = str(error)
 
     def _swap(self, newer: PolicyBundle) -> None:
-        """Takes a newer policy into use; a CongraspError if it is of another kind."""
+        """Uses a newer policy; raises a CongraspError if it is of another kind."""
         old = self._held.bundle
         old.spec.require(newer.spec, "that the server was to change to")
         if newer.task != old.task:
-            raise CongraspError("The newer policy was trained on another task.", "Start the server anew to serve it.")
+            raise CongraspError("The newer policy was trained on another task.", "Restart the server to serve it.")
         self._held = _hold(newer)
         self._trouble = ""
 
 
 def _cut(query: Query, first: int, end: int) -> Query:
-    """Some states of a query."""
+    """Returns some states of a query."""
     return query._replace(vectors=query.vectors[first:end])
 
 
 def _hold(bundle: PolicyBundle) -> _Held:
-    """A policy ready for use."""
+    """Prepares a policy for use."""
     return _Held(bundle, content_hash(encode(bundle.to_message())), bundle.inference_parameters)
 
 
 def follow_file(path: pathlib.Path) -> Source:
-    """A source that reads a policy file again whenever it changes."""
+    """Returns a source that reads a policy file again whenever it changes."""
     seen: list[float] = []
 
     def read(version: int) -> PolicyBundle | None:
         try:
             changed = path.stat().st_mtime
         except OSError:
-            raise CongraspError(f"The policy {path} cannot be read.", "Name a file made by 'congrasp train'.") from None
+            raise CongraspError(
+                f"The policy {path} cannot be read.", "Pass a file created by 'congrasp train'."
+            ) from None
         if version >= 0 and seen and seen[-1] == changed:
             return None
         seen[:] = [changed]
@@ -257,7 +259,7 @@ def follow_file(path: pathlib.Path) -> Source:
 
 
 def follow_run(transport: Transport, run: str, name: str) -> Source:
-    """A source that pulls the newest policy from a learner, under the server's name on the wire."""
+    """Returns a source that pulls the newest policy from a learner, under the server's name on the wire."""
     key = Keys(run).weights_for("server", name)
 
     def pull(version: int) -> PolicyBundle | None:

@@ -1,4 +1,4 @@
-"""The flow of `congrasp train`: evaluate, train, evaluate again, show the result and what to look at next."""
+"""Flow of `congrasp train`: evaluates, trains, evaluates again, and shows results and next steps."""
 
 import contextlib
 import dataclasses
@@ -52,23 +52,23 @@ EPISODE, PRETRAINED = "episode.png", "pretrained.png"
 _EVALUATION_OBJECTS = 12
 _SEEDS = 3
 _LINE_SECONDS = 10.0
-_SPACE = 64 << 10  # bytes without which a disk is as good as full
+_SPACE = 64 << 10  # bytes below which a disk counts as full
 console = Console(highlight=False)
 
 
 class _Plan(NamedTuple):
-    """What the options come to on this machine."""
+    """Plan that the options give on this machine."""
 
     ranks: int
     actors: int
-    """Actor processes of each rank; with none, an actor lives in each learner's process."""
+    """Actor processes of each rank; 0 runs an actor in each learner's process."""
     physics: PhysicsName
     gpus: bool
-    """Whether each of several ranks has a GPU of its own."""
+    """True if each of several ranks has a separate GPU."""
 
     @property
     def in_process(self) -> bool:
-        """Whether learner and actor live in this process."""
+        """True if learner and actor run in this process."""
         return self.actors == 0 and self.ranks == 1
 
 
@@ -91,13 +91,13 @@ def run_training(
     """Evaluates, trains, evaluates again and shows the result; `services.cli.train` describes the other arguments.
 
     Args:
-      compared: whether the evaluation is made before training, too.
+      compared: also evaluates before training.
 
     Returns:
       The exit code.
 
     Raises:
-      CongraspError: the arguments contradict each other, the configuration cannot run, or a process failed for good.
+      CongraspError: the arguments contradict each other, the configuration cannot run, or a process failed permanently.
     """
     imported()
     _check_connections(actors, listen, certs, config.name, insecure=insecure)
@@ -140,7 +140,7 @@ def run_training(
                         notify=lambda text: console.print(f"  [yellow]{text}[/]", soft_wrap=True),
                     )
         if stop.is_set():
-            console.print(f"Stopped. Resume with: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
+            console.print(f"Stopped. To resume: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
             return stop.exit_code
         console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
         if evaluation:
@@ -152,24 +152,29 @@ def run_training(
 def _check_connections(
     actors: int | None, listen: str | None, certs: pathlib.Path | None, run: str, *, insecure: bool
 ) -> None:
-    """Raises `CongraspError` unless the learner may listen as asked, and all roles have certificates if any has."""
+    """Raises a `CongraspError` if the learner may not listen as requested, or if only some roles have certificates."""
     if listen is None and certs is None:
         return
     if certs is not None and (certs / CERTIFICATE_FILE).exists():
-        raise CongraspError(f"{certs} belongs to one role.", "Name the authority's folder, which holds all of them.")
+        raise CongraspError(
+            f"{certs} belongs to one role.", "Pass the authority's folder, which holds those of all roles."
+        )
     check_exposure(listen or LEARNER_URL, urls.find_credentials(certs, "learner", run), insecure=insecure)
     for role in ("actor", "observer"):
         urls.find_credentials(certs, role, run)
     if actors == 0:
-        raise CongraspError("With --actors 0 nothing listens.", "Leave out --listen and --certs, or --actors.")
+        raise CongraspError("With --actors 0 nothing listens.", "Remove --listen and --certs, or --actors.")
 
 
 def _plan(config: RunConfig, actors: int | None, ranks: int, *, listens: bool) -> _Plan:
-    """Engine and numbers of processes; on a GPU one process does everything unless others may connect."""
+    """Chooses engine and numbers of processes; on a GPU one process does everything unless others may connect."""
     if actors is not None and actors < 0:
-        raise CongraspError(f"--actors is {actors}.", "Name a number of actor processes, or 0 for none of their own.")
+        raise CongraspError(
+            f"--actors is {actors}.",
+            "Pass a number of actor processes, or 0 to run the actor in the learner's process.",
+        )
     if ranks < 1:
-        raise CongraspError(f"--ranks is {ranks}.", "Name a number of learners from 1 on.")
+        raise CongraspError(f"--ranks is {ranks}.", "Pass a number of learners from 1 on.")
     gpus = ranks > 1 and leave_gpus_to(ranks)
     physics = engine_of(config.physics, gpus)
     if actors is None:
@@ -178,28 +183,28 @@ def _plan(config: RunConfig, actors: int | None, ranks: int, *, listens: bool) -
 
 
 def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None, *, resume: bool) -> None:
-    """Makes the run's directory, or takes up the one that is there."""
+    """Creates the run's directory, or opens the existing one."""
     if resume:
         continue_run(run_dir, config)
         if not has_checkpoints(run_dir):
-            raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start it anew in another --run-dir.")
+            raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start again in another --run-dir.")
         Checkpoints(run_dir / CHECKPOINTS).find(lambda level, text: console.print(text, markup=False, soft_wrap=True))
         return
     if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / CONFIG_FILE).exists():
-        raise CongraspError(f"{run_dir} is not empty and is no run.", "Choose another --run-dir.")
+        raise CongraspError(f"{run_dir} is not empty and is not a run.", "Choose another --run-dir.")
     _check(config)
     policy = None if initial is None else bundles.load(initial)
     create_run(run_dir, config, policy)
     if policy is not None and policy.spec.privileged != policy_spec(config.task, config.network).privileged:
         console.print(
-            f"The critic of {initial} has other privileged inputs than this run's, which start at zero weight.",
+            f"The critic of {initial} has other privileged inputs than this run; the new ones start at zero weight.",
             markup=False,
             soft_wrap=True,
         )
 
 
 def _announce(config: RunConfig, run_dir: pathlib.Path, plan: _Plan) -> bool:
-    """Prints what is about to run; returns whether it is easier than the full task."""
+    """Prints a summary of the run; returns True if it is easier than the full task."""
     console.print(
         f"[bold]{config.name}[/]: {config.updates} updates of {plan.ranks * _steps_per_update(config)} steps, "
         f"{plan.ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on '{plan.physics}' in "
@@ -216,7 +221,7 @@ def _announce(config: RunConfig, run_dir: pathlib.Path, plan: _Plan) -> bool:
 
 
 def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int, before: list[Row], *, pretrained: bool) -> None:
-    """What the training achieved: the comparison, a live query, pictures; of the pretrained policy, too, if wanted."""
+    """Shows the results of the training: comparison, a live query, pictures, optionally of the pretrained policy."""
     policy = bundles.load(run_dir / POLICY_FILE)
     _compare(before, _evaluate(policy, config, episodes, "after training"))
     _live_query(run_dir, config.task.hand)
@@ -226,7 +231,7 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int, before: list[
 
 
 def _check(config: RunConfig) -> None:
-    """Raises `CongraspError` for what would end the run's processes as soon as they have started."""
+    """Raises a `CongraspError` for settings with which the run's processes would end at once."""
     make_algorithm(policy_spec(config.task, config.network), config)
     load_pool(dataclasses.replace(config.objects, count=min(1, config.objects.count)))
     if config.environments < 1 or config.rollout_steps < 1:
@@ -235,20 +240,20 @@ def _check(config: RunConfig) -> None:
 
 @contextlib.contextmanager
 def _full_disk_named(run_dir: pathlib.Path) -> Iterator[None]:
-    """A process that dies of a full disk cannot write its error into its log: this names it."""
+    """Context that reports a full disk, since a process that dies of it cannot write its error to its log."""
     try:
         yield
     except CongraspError:
         if shutil.disk_usage(run_dir).free >= _SPACE:
             raise
         raise CongraspError(
-            f"The disk of {run_dir} is full, and the run ended.",
-            f"What was written before is whole: free space and add --resume --run-dir {run_dir}.",
+            f"The disk of {run_dir} is full, and the run has ended.",
+            f"Files written before are intact. Free space and pass --resume --run-dir {run_dir}.",
         ) from None
 
 
 def untrained(config: RunConfig) -> PolicyBundle:
-    """The policy that the run starts from."""
+    """Returns the initial policy of the run."""
     spec = policy_spec(config.task, config.network)
     algorithm = make_algorithm(spec, config)
     policy = algorithm.policy(algorithm.init(config.seed))
@@ -256,7 +261,7 @@ def untrained(config: RunConfig) -> PolicyBundle:
 
 
 class _Progress:
-    """One line that is rewritten on a terminal; elsewhere a line about every ten seconds."""
+    """One line that is updated on a terminal; elsewhere a line about every ten seconds."""
 
     def __init__(self, config: RunConfig, ranks: int = 1):
         self._config, self._steps = config, ranks * _steps_per_update(config)
@@ -277,13 +282,13 @@ class _Progress:
         self._print()
 
     def update(self, values: dict[str, float]) -> None:
-        """Shows the metrics of an update of this process's own learner, and after the first what the start took."""
+        """Shows the metrics of an update of this process's learner, and the duration of the start after the first."""
         if self._first is None:
             console.print(f"  [dim]{first_update()}[/]", soft_wrap=True)
         self.show({"values": values, "actors": 1, "version": int(values["version"])})
 
     def show(self, status: dict[str, Any]) -> None:
-        """Shows the learner's newest metrics, if there are any yet, and the number of actors."""
+        """Shows the learner's newest metrics, if there are any, and the number of actors."""
         now = time.monotonic()
         if "transitions" in status.get("values", {}):
             self._line = self._progress(status, now)
@@ -304,7 +309,7 @@ class _Progress:
             self._printed = self._line
 
     def _progress(self, status: dict[str, Any], now: float) -> str:
-        """One line of numbers; the time left counts from the first update, so that compiling is not part of it."""
+        """Formats the metrics as one line; the time left is estimated from the first update on, without compilation."""
         values, updates = status["values"], self._config.updates
         update = values["transitions"] / self._steps
         self._first = self._first or (now, update)
@@ -321,23 +326,23 @@ class _Progress:
 
 
 def first_update() -> str:
-    """What the time until the first update of this process's learner consisted of."""
+    """Stages of the time until the first update of this process's learner."""
     parts = ", ".join(f"{one.name} {one.ended - one.began:.1f}" for one in stages())
-    return f"first update {since_start():.1f} s after the start; of this, side by side in part: {parts}"
+    return f"first update {since_start():.1f} s after the start, including (partly in parallel): {parts}"
 
 
 def _steps_per_update(config: RunConfig) -> int:
-    """Environment steps of one update of one rank."""
+    """Number of environment steps of one update of one rank."""
     return config.rollout_steps * config.environments * config.ppo.rollouts_per_update
 
 
 def _minutes(seconds: float) -> str:
-    """A duration as minutes and seconds; `?` if it is not known."""
+    """Formats a duration as minutes and seconds; `?` if it is not known."""
     return "?" if not np.isfinite(seconds) else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
 def _evaluator(policy: PolicyBundle, config: RunConfig, seed: int, batch: int) -> Evaluator:
-    """An evaluator on objects that training never sees."""
+    """Returns an evaluator on held-out objects."""
     objects = load_pool(
         ObjectsConfig(families=config.objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
         if not config.objects.folder
@@ -347,13 +352,13 @@ def _evaluator(policy: PolicyBundle, config: RunConfig, seed: int, batch: int) -
 
 
 def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, when: str) -> list[Row]:
-    """Rows of the heading constraint for three draws of episodes, on objects that training never sees."""
+    """Evaluates the heading constraint for three draws of episodes, on held-out objects."""
     console.print(f"Evaluating {when}: {_SEEDS} x {episodes} episodes on {_EVALUATION_OBJECTS} held-out objects …")
     return _evaluator(policy, config, 0, episodes).draws("heading", episodes, _SEEDS)
 
 
 def _compare(before: list[Row], after: list[Row]) -> None:
-    """Prints metrics before, if they were measured, and after, and whether their difference exceeds the noise."""
+    """Prints metrics before (if measured) and after training, and whether their difference exceeds the noise."""
     when = "Before and after" if before else "After"
     console.print(f"{when}, mean ± standard deviation over {_SEEDS} draws of episodes:")
     for name, label, factor in (
@@ -374,8 +379,8 @@ def _compare(before: list[Row], after: list[Row]) -> None:
 
 
 def _live_query(run_dir: pathlib.Path, hand: str) -> None:
-    """Serves the policy from a process of its own, and asks it for one action."""
-    console.print("\n[bold]One live query[/] of a policy server in a process of its own:")
+    """Starts a policy server in a separate process, and queries one action."""
+    console.print("\n[bold]One live query[/] of a policy server in a separate process:")
     with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
         episode = example_episode(HELD_OUT_SEED, hand)
         with PolicyClient(endpoint, hand=episode.hand, wait=60.0, timeout=5.0) as client:
@@ -384,42 +389,42 @@ def _live_query(run_dir: pathlib.Path, hand: str) -> None:
 
 
 def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> None:
-    """A successful episode if a few attempts find one."""
+    """Draws a successful episode if a few attempts find one."""
     evaluator = _evaluator(policy, config, 0, 1)
     save_png(run_dir / EPISODE, episode_sheet(evaluator.episode("heading", attempts=12)))
 
 
 def _pretrained_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
-    """What the same kind of policy does after training on the full task."""
-    with console.status("The policy that comes with congrasp …") as status:
+    """Shows the result of training the same kind of policy on the full task."""
+    with console.status("The pretrained policy …") as status:
         grasps = showcase(bundles.load(policy), run_dir / PRETRAINED, lambda text: status.update(f"{text} …"))
     console.print(
-        f"The policy that comes with congrasp, trained on the full task: {sum(grasps.values())} of {len(grasps)} "
-        f"grasps, one under each constraint ({', '.join(grasps)}).",
+        f"The pretrained policy of the full task: {sum(grasps.values())} of {len(grasps)} grasps, one under each "
+        f"constraint ({', '.join(grasps)}).",
         soft_wrap=True,
     )
 
 
 def _next_steps(run_dir: pathlib.Path) -> None:
-    """Prints where the results are and which commands show more."""
+    """Prints the location of the results and commands to inspect them."""
     congrasp = _command()
     pictures = (
         (EPISODE, "an episode of the trained policy"),
-        (PRETRAINED, "a grasp under each of the four constraints, by the policy that comes with congrasp"),
+        (PRETRAINED, "a grasp under each of the four constraints, by the pretrained policy"),
     )
     rows = [(str(run_dir / name), why) for name, why in pictures if (run_dir / name).exists()]
     rows += [
         (f"{congrasp} plot {run_dir}", "learning curves and reward terms"),
         (f"{run_dir / LOGS}/*.mcap", "open in Foxglove or Rerun: plots, hand and object in 3-D"),
         (f"{congrasp} evaluate --policy {run_dir / POLICY_FILE}", "the paper's protocol"),
-        (f"{congrasp} train --resume --run-dir {run_dir}", "go on training"),
+        (f"{congrasp} train --resume --run-dir {run_dir}", "continue training"),
     ]
-    console.print("\n[bold]What to look at next[/]")
+    console.print("\n[bold]Next[/]")
     for what, why in rows:
         console.print(f"  {what}\n      {why}", soft_wrap=True)
 
 
 def _command() -> str:
-    """How to call the command line from here."""
+    """Command line of this installation."""
     script = pathlib.Path(sys.executable).with_name("congrasp")
     return "congrasp" if shutil.which("congrasp") or not script.exists() else os.path.relpath(script)

@@ -1,4 +1,4 @@
-"""A learner with its metrics and recordings, and where rollouts are to stay on the device an actor beside it."""
+"""Runs a learner with its metrics and recordings and, if rollouts stay on the device, an actor in the same process."""
 
 import contextlib
 import dataclasses
@@ -23,7 +23,7 @@ from congrasp.services.ops.status import ask
 from congrasp.services.train.metric_writers import recorded
 
 _START_SECONDS = 0.5
-"""By which the learner, which must listen first, is ahead of the actor."""
+"""Head start of the learner, which must listen first, over the actor, s."""
 
 
 def learn(
@@ -42,21 +42,20 @@ def learn(
     metrics_host: str = "127.0.0.1",
     grace: float = GRACE,
 ) -> None:
-    """Runs a learner until it is finished or told to stop.
+    """Runs a learner until it is finished or stopped.
 
-    With an actor inside the two share their processors: to act under old weights while the learner updates would gain
-    nothing. So updates are on-policy then, whatever `max_staleness` is.
+    An actor in the same process shares the processors: acting with old weights during an update would gain nothing.
+    Updates are then on-policy, regardless of `max_staleness`.
 
     Args:
-      run_dir: see `run_learner`, as `config`, `resume`, `ranks`, `on_update` and `on_event`.
-      wire: a transport that listens, by which others send rollouts and ask how things stand; None only with an actor
-        inside.
-      inside: engine of an actor in this process, over the in-memory transport; None for no such actor.
+      run_dir: see `run_learner`, also for `config`, `resume`, `ranks`, `on_update` and `on_event`.
+      wire: a listening transport for rollouts and status queries of others; None only with an actor inside.
+      inside: engine of an actor in this process, over the in-memory transport; None for no actor.
       stop: ends training.
-      writers: which metric writers get the metrics of rank 0.
+      writers: metric writers of rank 0.
       metrics_port: port of a Prometheus endpoint; 0 for none.
-      metrics_host: its interface.
-      grace: seconds that the actor inside may take to end.
+      metrics_host: interface of the endpoint.
+      grace: deadline for the end of the actor inside, s.
     """
     rank, transport = 0 if ranks is None else ranks.rank, wire
     with contextlib.ExitStack() as stack:
@@ -65,7 +64,7 @@ def learn(
             config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, max_staleness=0))
             memory = stack.enter_context(urls.listen(url := f"memory/{run_dir}", "learner"))
             transport = memory if wire is None else PairTransport(memory, wire)
-        assert transport is not None, "somebody must be able to reach the learner"
+        assert transport is not None, "the learner must be reachable"
         metrics = LearnerMetrics(functools.partial(ask, transport, config.name))
 
         def updated(values: dict[str, float]) -> None:
@@ -100,7 +99,7 @@ def _actor_thread(
     stop: threading.Event,
     grace: float,
 ) -> Iterator[None]:
-    """An actor in a thread of its own while the block runs; should it fail, it sets `stop`, and its error is raised."""
+    """Context with an actor in a separate thread; a failure sets `stop`, and its error is raised."""
     failures: list[BaseException] = []
     ended = threading.Event()
 

@@ -1,4 +1,4 @@
-"""A learner's metrics on TensorBoard and Weights & Biases: written beside the recording, which they never delay."""
+"""Writes a learner's metrics to TensorBoard and Weights & Biases, in addition to the recording, without delaying it."""
 
 import contextlib
 import dataclasses
@@ -19,24 +19,24 @@ _TOPIC = "/metrics/learner/"
 
 
 class _Writer(Protocol):
-    """Where scalars are written."""
+    """Destination of scalars."""
 
     def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """Takes the scalars of an update."""
+        """Writes the scalars of an update."""
 
     def close(self) -> None:
         """Finishes."""
 
 
 class MetricWriters:
-    """A sink of `services.record.recorder.Recorder` for learners' metrics; one that fails is left out from then on."""
+    """A sink of `services.record.recorder.Recorder` for learners' metrics; a failed writer is not used again."""
 
     def __init__(self, writers: Mapping[str, _Writer]):
-        """Writers by name."""
+        """Creates a sink with writers by name."""
         self._writers = dict(writers)
 
     def write(self, entry: Entry) -> None:
-        """Takes an entry; those that are not metrics of a learner are passed over."""
+        """Accepts an entry; entries that are not metrics of a learner are ignored."""
         if not entry.channel.topic.startswith(_TOPIC):
             return
         message = json.loads(entry.data)
@@ -53,14 +53,16 @@ class MetricWriters:
         for name, writer in list(self._writers.items()):
             try:
                 action(writer)
-            except Exception as error:  # training does not end because its metrics cannot be shown
+            except Exception as error:  # a failed writer must not end the training
                 del self._writers[name]
-                text = f"congrasp: {name} gets no more metrics ({type(error).__name__}: {error}); the run goes on."
+                text = (
+                    f"congrasp: {name} receives no more metrics ({type(error).__name__}: {error}); the run continues."
+                )
                 print(text, file=sys.stderr, flush=True)
 
 
 class _TensorBoard:
-    """Event files, one folder a learner; written at once, so that there is no thread to wait for."""
+    """Event files, one folder per learner; written synchronously, so that there is no thread to wait for."""
 
     def __init__(self, folder: pathlib.Path):
         self._folder = folder
@@ -74,7 +76,7 @@ class _TensorBoard:
         file = self._files.get(learner)
         if file is None:
             file = self._files[learner] = self._begin(learner)
-            # A resumed run repeats steps: TensorBoard forgets what an earlier file has from here on.
+            # A resumed run repeats steps: TensorBoard purges those of an earlier file from here on.
             file.write_event(Event(wall_time=seconds, step=step, session_log=SessionLog(status=SessionLog.START)))
         summary = Summary(value=[Summary.Value(tag=name, simple_value=value) for name, value in values.items()])
         file.write_event(Event(wall_time=seconds, step=step, summary=summary))
@@ -94,7 +96,7 @@ class _TensorBoard:
 
 
 class _WeightsAndBiases:
-    """A run of Weights & Biases; offline it lies in the run's folder and goes up with `wandb sync`."""
+    """A run of Weights & Biases; offline it is stored in the run's folder and uploaded with `wandb sync`."""
 
     def __init__(self, folder: pathlib.Path, run: str, config: Mapping[str, Any], *, offline: bool):
         import wandb
@@ -128,13 +130,13 @@ class _WeightsAndBiases:
 def recorded(
     transport: Transport, config: RunConfig, run_dir: pathlib.Path, names: Sequence[MetricWriter]
 ) -> Iterator[Recorder]:
-    """Records a run in its folder, and writes its metrics elsewhere, too, while the block lasts.
+    """Context that records a run in its folder, and passes its metrics to writers.
 
     Args:
       transport: an endpoint of the run.
       config: the run's configuration.
       run_dir: the run's folder; TensorBoard's files go to `tensorboard` in it, those of Weights & Biases to `wandb`.
-      names: which writers.
+      names: names of the writers.
 
     Raises:
       ModuleNotFoundError: a writer's package is not installed.

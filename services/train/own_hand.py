@@ -1,7 +1,7 @@
 """The flow of `congrasp hands train`: self-check, training, evaluation, and one report about a hand.
 
-Each stage is a command of its own in a process of its own, so that it has a GPU's memory for itself, and leaves its
-result in one folder: the same command goes on with what is missing.
+Each stage is a separate command in a separate process, so that it has the whole GPU memory. Results are in one folder,
+and repeating the command runs only the missing stages.
 """
 
 import dataclasses
@@ -25,34 +25,34 @@ from congrasp.services.train.unattended import run_child, seconds, train_in_back
 
 HAND, CHECK, REPORT = "hand.json", "check.json", "report.html"
 _ROWS = "report.json"
-_LARGEST = 1 << 24  # bytes of a file of rows
-_PATIENCE = 1800.0  # seconds of a check or a report
+_LARGEST = 1 << 24  # limit of a file of rows in bytes
+_PATIENCE = 1800.0  # deadline of a check or a report, s
 _LINE_SECONDS = 10.0
-_UPDATES = 560  # of the full task: with check and report, some 15 minutes of one H200
-_RATE = 350_000  # trained steps a second of one H200
+_UPDATES = 560  # updates of the full task: with check and report, some 15 minutes of one H200
+_RATE = 350_000  # trained steps per second of one H200
 
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What is wanted."""
+    """Request to train a hand."""
 
     hand: Hand
     reference: str
-    """What commands call it by: its name or the path of its file."""
+    """Name of the hand in commands, or the path of its file."""
     out: pathlib.Path
     full: bool
-    """The full task; otherwise the short training of a machine without a GPU."""
+    """Trains the full task; otherwise the short training of a machine without a GPU."""
     anyway: bool
-    """Train it although its self-check failed."""
+    """Trains the hand although its self-check failed."""
     physics: PhysicsName
     episodes: int
-    """Of each row of the report."""
+    """Episodes of each row of the report."""
     pool: int
     """Objects of the report."""
     options: Sequence[str]
     """Further options of `congrasp train`."""
     patience: float
-    """Seconds of the training."""
+    """Limit of the training, s."""
 
     @property
     def run_dir(self) -> pathlib.Path:
@@ -61,14 +61,14 @@ class Request:
 
 
 def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
-    """Makes what is missing of a hand's self-check, training and report.
+    """Runs the missing stages of a hand's self-check, training and report.
 
     Args:
-      request: what is wanted.
-      note: is given what is worth a line.
+      request: the request.
+      note: called with messages for the user.
 
     Returns:
-      The trained policy's file in the run's folder.
+      File of the trained policy in the run's folder.
 
     Raises:
       CongraspError: the self-check failed, a stage failed, or the folder holds the training of another hand.
@@ -86,22 +86,22 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
 
 
 def _begin(request: Request) -> None:
-    """Makes the folder for this hand; a CongraspError if it holds the training of another."""
+    """Creates the folder for this hand; raises a CongraspError if it holds the training of another."""
     file, text = request.out / HAND, hand_text(request.hand).encode()
     request.out.mkdir(parents=True, exist_ok=True)
     if file.exists() and file.read_bytes() == text:
         return
     if any(request.out.glob(f"*/{CONFIG_FILE}")):
         raise CongraspError(
-            f"{request.out} holds the training of another hand, or of this one before it was changed.",
-            "Name another --out, or remove the folder.",
+            f"{request.out} holds the training of another hand, or of an earlier version of this one.",
+            "Pass another --out, or remove the folder.",
         )
     (request.out / CHECK).unlink(missing_ok=True)
     write_atomically(file, text)
 
 
 def _check(request: Request, note: Callable[[str], None]) -> None:
-    """The self-check, unless it was made."""
+    """Runs the self-check, unless it exists."""
     file = request.out / CHECK
     if not file.exists():
         arguments = ["hands", "check", request.reference, "--json", str(file)]
@@ -113,19 +113,19 @@ def _check(request: Request, note: Callable[[str], None]) -> None:
     if any(finding.verdict == "failed" for finding in findings) and not request.anyway:
         raise CongraspError(
             f"The hand '{request.hand.name}' failed its self-check ({file.with_suffix('.png')}).",
-            "Mend its file as the lines say, or train it all the same with --anyway.",
+            "Repair its file as the lines say, or pass --anyway to train it regardless.",
         )
 
 
 def _train(request: Request, note: Callable[[str], None]) -> pathlib.Path:
-    """The training, from where it was."""
+    """Runs the training, or resumes it."""
     chosen = ["--preset", FULL if request.full else "quickstart", "--hand", request.reference]
     log = request.run_dir.with_name(f"{request.run_dir.name}.log")
     note(f"Training {request.hand.name} in {request.run_dir} (log: {log})")
     said, told = time.monotonic(), ""
 
     def progress(line: str) -> None:
-        """A line now and then."""
+        """Notes a line periodically."""
         nonlocal said, told
         if line != told and time.monotonic() - said > _LINE_SECONDS:
             said, told = time.monotonic(), line
@@ -138,15 +138,15 @@ def _train(request: Request, note: Callable[[str], None]) -> pathlib.Path:
 
 
 def _install(request: Request, policy: pathlib.Path, note: Callable[[str], None]) -> None:
-    """Puts the policy where `--hand` finds it, unless one with more experience of this hand is there."""
+    """Installs the policy for `--hand`, unless there is one of this hand with more experience."""
     hand, own = request.hand, own_policy_file(request.hand.name)
     if not hand.text and hand.name in pretrained_hands():
-        note(f"--hand {hand.name} stays the policy that comes with congrasp; this one is --policy {policy}.")
+        note(f"--hand {hand.name} remains the package's policy; this one is --policy {policy}.")
         return
     if own.exists():
         there, fresh = bundles.load(own), bundles.load(policy)
         if there.spec.hand == hand.reference and there.transitions > fresh.transitions:
-            note(f"{own} has seen more ({there.transitions:,} steps) and stays; this one is --policy {policy}.")
+            note(f"{own} has more training ({there.transitions:,} steps) and remains; this one is --policy {policy}.")
             return
     own.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(own, policy.read_bytes())
@@ -154,7 +154,7 @@ def _install(request: Request, policy: pathlib.Path, note: Callable[[str], None]
 
 
 def _report(request: Request, policy: pathlib.Path, note: Callable[[str], None]) -> None:
-    """The evaluation and the report, unless they were made of this policy."""
+    """Runs evaluation and report, unless they exist for this policy."""
     rows, page = request.out / _ROWS, request.out / REPORT
     about = {"content": bundles.content_hash(policy.read_bytes()), "episodes": request.episodes, "pool": request.pool}
     if not (page.exists() and rows.exists() and about.items() <= read_json(rows, _LARGEST).items()):
@@ -170,7 +170,7 @@ def _report(request: Request, policy: pathlib.Path, note: Callable[[str], None])
 
 
 def _run(request: Request, name: str, arguments: list[str], fine: tuple[int, ...], environment: dict[str, str]) -> None:
-    """Runs a stage; a CongraspError unless it ends with one of the exit codes."""
+    """Runs a stage; raises a CongraspError unless it ends with one of the exit codes."""
     child = Child(name, arguments, request.out / f"{name}.log", environment)
     code = run_child(child, _PATIENCE)
     if code not in fine:
@@ -179,11 +179,11 @@ def _run(request: Request, name: str, arguments: list[str], fine: tuple[int, ...
 
 
 def _what_a_gpu_would_take(request: Request) -> str:
-    """What the short training leaves out."""
+    """Describes what the short training omits."""
     full = get_preset(FULL, request.reference)
     steps = _UPDATES * full.environments * full.rollout_steps * full.ppo.rollouts_per_update
     return (
-        "This machine has no GPU: a short training of an easier task follows, whose policy grasps from above at best. "
-        f"On a GPU the same command trains the full task: {steps / 1e6:.0f} million steps, some "
-        f"{steps / _RATE / 60:.0f} minutes of one H200 and some five for start and report."
+        "This machine has no GPU: a short training of an easier task follows, whose policy grasps from above at "
+        f"best. On a GPU the same command trains the full task: {steps / 1e6:.0f} million steps, about "
+        f"{steps / _RATE / 60:.0f} minutes of one H200 and five minutes for start and report."
     )

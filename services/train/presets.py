@@ -1,4 +1,4 @@
-"""Named configurations to start from; every field can be overridden on the command line."""
+"""Named initial configurations; every field can be overridden on the command line."""
 
 import dataclasses
 
@@ -8,9 +8,9 @@ from congrasp.common.hands import get_hand
 from congrasp.services.train.recipe import recipe
 
 FULL = "full"
-"""The preset of the full task for the hand that the command line names, the human hand by default."""
+"""Preset of the full task for the hand of the command line, the human hand by default."""
 FULL_FOR = ("human", "allegro", "sharpa")
-"""Hands whose names are presets: the same as `FULL` for them."""
+"""Hands whose names are presets equal to `FULL`."""
 QUICKSTART = RunConfig(
     name="quickstart",
     environments=64,
@@ -28,13 +28,13 @@ QUICKSTART = RunConfig(
     network=NetworkConfig(hidden=(256, 128)),
     ppo=PPOConfig(minibatches=8),
 )
-"""Minutes on two CPU cores; `easier` lists what that takes."""
+"""Takes minutes on two CPU cores; `easier` lists the simplifications."""
 PRESETS = ("quickstart", FULL, *FULL_FOR)
 """Names of the presets."""
 
 
 def easier(config: RunConfig) -> list[str]:
-    """What makes a run easier than the full task, as phrases; empty if nothing does."""
+    """Phrases for the simplifications of a run relative to the full task; empty if there are none."""
     task, full = config.task, get_preset(FULL)
     words = []
     if task.headings == "above" and full.task.headings != "above":
@@ -58,15 +58,15 @@ def easier(config: RunConfig) -> list[str]:
 
 
 def get_preset(name: str, hand: str | None = None) -> RunConfig:
-    """The preset of this name for a hand, or for its own.
+    """Returns the preset of this name for a hand, or for its default hand.
 
     Args:
       name: one of `PRESETS`.
-      hand: the name, file or text of a hand. A full task is that of the hand (`services.train.recipe`); of the others
-        the hand alone changes.
+      hand: the name, file or text of a hand. A full task depends on the hand (`services.train.recipe`); in the others
+        only the hand changes.
 
     Raises:
-      CongraspError: there is no such preset or hand; those that exist are listed.
+      CongraspError: there is no such preset or hand; the message lists the available ones.
     """
     if name not in PRESETS:
         raise CongraspError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(PRESETS)}.")
@@ -76,6 +76,6 @@ def get_preset(name: str, hand: str | None = None) -> RunConfig:
 
 
 def with_hand(config: RunConfig, hand: str | None) -> RunConfig:
-    """The configuration with another hand, or its own; a hand's file becomes part of it, for actors elsewhere."""
+    """Returns the configuration with another hand, or unchanged; a hand's file is included, for remote actors."""
     found = get_hand(hand or config.task.hand)
     return dataclasses.replace(config, task=dataclasses.replace(config.task, hand=found.reference))

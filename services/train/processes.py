@@ -1,4 +1,4 @@
-"""A learner and its actors as processes of this machine: starts them, restarts those that die, and ends all."""
+"""A learner and its actors as processes of this machine: starts, restarts and ends them."""
 
 import contextlib
 import dataclasses
@@ -28,11 +28,11 @@ from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
 
 MAX_RESTARTS = 5
 CHILD_GRACE = 2.0
-"""Seconds in which a child may drain; then this process has time to end it before it must end itself (`GRACE`)."""
+"""Seconds for a child to drain; the rest of `GRACE` remains to kill it before this process must end."""
 _BAD_INPUT = 2
 _START_SECONDS, _POLL = 120.0, 0.25
 Report = Callable[[dict[str, Any]], None]
-"""Given the learner's newest metrics, where there are any, and the number of actors alive, some times a second."""
+"""Called several times a second with the learner's newest metrics, if any, and the number of live actors."""
 
 
 @dataclasses.dataclass
@@ -48,7 +48,7 @@ class Child:
     again_at: float = 0.0
 
     def start(self) -> None:
-        """Starts it in a session of its own, so that Ctrl-C reaches the orchestrator alone; it dies with its parent."""
+        """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies with its parent."""
         environment = {**os.environ, **self.environment, PARENT_VARIABLE: str(os.getpid())}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
@@ -86,30 +86,30 @@ def train(
 ) -> None:
     """Runs a prepared run directory to its end with one learner and `actors` actor processes, or several of both.
 
-    A process that dies is started again (the learner from its last checkpoint), up to `MAX_RESTARTS` times each. When
-    one of several ranks dies, the others end, too, and all are started again.
+    A process that dies is restarted (the learner from its last checkpoint), up to `MAX_RESTARTS` times each. If one of
+    several ranks dies, the others end as well, and all are restarted.
 
     Args:
-      run_dir: made by `learner.run_directory.create_run`; with checkpoints, the run resumes from the latest.
+      run_dir: created by `learner.run_directory.create_run`; with checkpoints, the run resumes from the latest.
       config: the run's configuration.
-      actors: number of actor processes of each rank; with none, an actor lives in each rank's process.
+      actors: number of actor processes of each rank; 0 runs an actor in each rank's process.
       physics: engine of the actors.
       stop: drains everything within a few seconds when set.
       ranks: learner processes that train together.
       gpus: each rank sees one GPU, the others hidden from it.
-      endpoint: where the learner listens (rank r on the ports after those of rank r - 1); free ports of the loopback
+      endpoint: address of the learner (rank r on the ports after those of rank r - 1); free ports of the loopback
         interface by default.
       certs: an authority's folder, for mutual TLS.
       insecure: listen beyond loopback without certificates.
-      report: shows progress.
-      notify: given a message when something is restarted.
-      writers: which metric writers get rank 0's metrics.
+      report: called with progress.
+      notify: called with a message when a process is restarted.
+      writers: metric writers of rank 0.
       metrics_port: port of rank 0's Prometheus endpoint on the loopback interface; 0 for none.
 
     Raises:
-      CongraspError: a process failed for good; the last line of its log is in the message.
+      CongraspError: a process failed permanently; the message has the last line of its log.
     """
-    # One more for the ports by which the ranks find each other.
+    # One more for the ports through which the ranks join.
     endpoint = endpoint or local_url(ranks + 1)
     certificates = [] if certs is None else ["--certs", str(certs)]
     listen = [endpoint, *certificates, *(["--insecure"] if insecure else [])]
@@ -134,7 +134,7 @@ def train(
 def _learners(
     run_dir: pathlib.Path, listen: Sequence[str], connect: str, *, ranks: int, inside: bool, gpus: bool
 ) -> list[Child]:
-    """The learner processes; `listen` is --listen and what goes with it, `connect` the URL by which rank 0 is found."""
+    """Returns the learner processes; `listen` is --listen with its options, `connect` the URL of rank 0."""
     coordinator = rank_url(connect, ranks).partition("/")[2]
     found = []
     for rank in range(ranks):
@@ -151,7 +151,7 @@ def _learners(
 def _actors(
     run_dir: pathlib.Path, run: str, connect: Sequence[str], *, ranks: int, actors: int, physics: PhysicsName
 ) -> list[Child]:
-    """The actor processes of all ranks; `connect` is rank 0's URL and the options that go with it."""
+    """Returns the actor processes of all ranks; `connect` is rank 0's URL with its options."""
     threads = max(1, cores() // max(1, ranks * actors))
     found = []
     for number in range(ranks * actors):
@@ -165,24 +165,24 @@ def _actors(
 
 
 def leave_gpus_to(ranks: int) -> bool:
-    """Whether each rank has a GPU of its own; this process then does without, so that the memory of all is theirs.
+    """Returns True if each rank has a GPU; this process then uses none, so that the ranks have all memory.
 
     Raises:
-      CongraspError: there are GPUs, but not one for each rank.
+      CongraspError: there are fewer GPUs than ranks, but not none.
     """
     backend, count = accelerators()
     if backend == "cpu":
         return False
     if count < ranks:
-        raise CongraspError(f"{ranks} ranks need {ranks} GPUs, and JAX sees {count}.", "Name fewer with --ranks.")
+        raise CongraspError(f"{ranks} ranks need {ranks} GPUs, but JAX finds {count}.", "Pass a smaller --ranks.")
     jax.config.update("jax_platforms", "cpu")
     return True
 
 
 def accelerators() -> tuple[str, int]:
-    """JAX's name of this machine's hardware, and how many devices there are.
+    """Returns JAX's name of this machine's hardware, and its number of devices.
 
-    A process of its own looks, since one that has seen a GPU holds memory of it.
+    A separate process checks this, since a process that initialises a GPU holds memory of it.
 
     Raises:
       CongraspError: JAX does not start.
@@ -195,23 +195,23 @@ def accelerators() -> tuple[str, int]:
         )
         backend, count = seen.stdout.split()
     except (subprocess.TimeoutExpired, ValueError):
-        raise CongraspError("JAX does not start here.", "Look at 'congrasp doctor'.") from None
+        raise CongraspError("JAX does not start here.", "Check 'congrasp doctor'.") from None
     return backend, int(count)
 
 
 def engine_of(name: PhysicsName, gpus: bool) -> PhysicsName:
-    """What `auto` is for the ranks, where this process may see no GPU although they do."""
+    """Resolves `auto` for the ranks, even if this process sees no GPU but they do."""
     return resolve_physics(name, "cuda" if gpus else "")
 
 
 def _gpu(rank: int) -> str:
-    """What names a rank's GPU to CUDA, among those that this process may use."""
+    """Identifier of a rank's GPU for CUDA, among those available to this process."""
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     return visible[rank] if visible else str(rank)
 
 
 def _connect(url: str, learner: Child, stop: threading.Event, certs: pathlib.Path | None) -> Transport | None:
-    """A connection to the learner once it listens; None if the run is stopped before."""
+    """Connects to the learner once it listens; returns None if the run is stopped before."""
     deadline = time.monotonic() + _START_SECONDS
     while time.monotonic() < deadline and not stop.is_set():
         try:
@@ -234,7 +234,7 @@ def _supervise(
     report: Report,
     notify: Callable[[str], None],
 ) -> None:
-    """Restarts what dies and reports, until rank 0 has finished or the run is stopped."""
+    """Restarts processes that die and reports progress, until rank 0 has finished or the run is stopped."""
     metrics = transport.subscribe(Keys(run).learner_metrics, depth=16)
     while not stop.is_set():
         codes = {child.name: child.process.poll() for child in learners if child.process}
@@ -247,7 +247,7 @@ def _supervise(
             if code := child.process.poll():
                 _check_can_restart(child, code)
                 if child.again_at == 0.0:
-                    notify(f"The {child.name} died (exit code {code}); starting it again.")
+                    notify(f"The {child.name} died (exit code {code}); restarting it.")
                     child.again_at = time.monotonic() + min(2.0**child.restarts, 15.0) - 1.0
                 if time.monotonic() >= child.again_at:
                     child.restarts += 1
@@ -259,7 +259,7 @@ def _supervise(
 
 
 def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: Callable[[str], None]) -> None:
-    """Starts all ranks again after one died: the others notice it and end, or are made to."""
+    """Restarts all ranks after one died; the others notice and end, or are terminated."""
     dead = next(child for child in learners if child.process and child.process.poll())
     assert dead.process is not None
     died = f"The {dead.name} died (exit code {dead.process.poll()})"
@@ -268,7 +268,7 @@ def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: 
     for child in learners:
         assert child.process is not None
         _check_can_restart(child, child.process.poll() or 0)
-    notify(f"{died}; starting it again." if len(learners) == 1 else f"{died}; starting all ranks again.")
+    notify(f"{died}; restarting it." if len(learners) == 1 else f"{died}; restarting all ranks.")
     stop.wait(min(2.0 ** learners[0].restarts, 15.0) - 1.0)
     for child in learners:
         child.restarts += 1
@@ -277,13 +277,13 @@ def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: 
 
 
 def _check_can_restart(child: Child, code: int) -> None:
-    """Raises `CongraspError` if another start would end in the same way."""
+    """Raises a `CongraspError` if a restart would end in the same way."""
     if code == _BAD_INPUT or child.restarts >= MAX_RESTARTS:
         raise CongraspError(f"The {child.name} failed: {child.last_line()}", f"Its log is {child.log}.")
 
 
 def _wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
-    """Until all have ended, or the time is over."""
+    """Waits until all have ended, or the time is over."""
     deadline = time.monotonic() + seconds
     for process in processes:
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -291,7 +291,7 @@ def _wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> N
 
 
 def end_all(children: Sequence[Child]) -> None:
-    """SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE` seconds."""
+    """Sends SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE` seconds."""
     running = [child.process for child in children if child.process is not None and child.process.poll() is None]
     for process in running:
         process.terminate()

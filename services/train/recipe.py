@@ -1,21 +1,21 @@
-"""The recipe: how the full task is trained for any hand. What differs between hands follows from the hand.
+"""Training recipe of the full task for any hand; differences between hands are computed from the hand.
 
-A hand's size shows in the factor s on its objects (`Hand.object_scale`; the paper's for its hands,
-`common.hands.measures.fitting_scale` for others), its strength in the force F with which its fingertips can press
-(the mean of `common.hands.measures.tip_forces`: torque limits over lengths); G is the number of its fingers. Its mass
-enters nowhere: the virtual wrist is made for it (`common.hands.spec.wrist_gains`).
+The size of a hand determines the factor s on its objects (`Hand.object_scale`; the paper's for its hands,
+`common.hands.measures.fitting_scale` for others), its strength is the force F with which its fingertips can press (the
+mean of `common.hands.measures.tip_forces`: torque limits over lengths); G is the number of its fingers. Its mass has no
+effect, because the virtual wrist is scaled to it (`common.hands.spec.wrist_gains`).
 
 * **Squeeze** k = s^2 5 / G. All fingers together may press so that the pressure on the object is that of the human
   hand's five: their force grows with the object's surface, s^2, and fewer fingers press more each.
 * `force_max` = 5 N k, to half a newton: 5 N, 12 N (Allegro), 6 N (Sharpa).
-* `heading_position` = 12 k: 12, 29, 15. The hand's centre is the middle of its fingertips; that its place needs more
-  weight in larger hands of fewer fingers was found, not derived.
-* **Weakness** h = (force_max / F - 0.3) / 0.7, between 0 and 1: none for fingertips that can press three times what is
-  wanted of them, as human ones can; 1 where they cannot press that much (Allegro). Weak hands lose what they may hold
+* `heading_position` = 12 k: 12, 29, 15. The hand's centre is the middle of its fingertips; that its position needs more
+  weight in larger hands of fewer fingers is empirical.
+* **Weakness** h = (force_max / F - 0.3) / 0.7, between 0 and 1: 0 for fingertips that can press three times what is
+  required, as human ones can; 1 for those that cannot press that much (Allegro). Weak hands lose what they may hold
   at a part only, so that they train it more: `p_affordance` = 0.6 + 0.2 h, and against what they then touch
   `affordance_distance` = 0.15 + 0.05 h, `affordance_force` = 0.30 + 0.10 h.
 
-docs/training.md compares this with what had been found by hand. All else is the same for all hands.
+docs/training.md compares this with manual tuning. Everything else is the same for all hands.
 """
 
 import dataclasses
@@ -32,19 +32,19 @@ from congrasp.common.hands.measures import tip_forces
 from congrasp.common.hands.spec import Hand
 
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
-"""Families that are hardest to hold by a part; twice as many of them are trained on."""
+"""Families that are hardest to hold by a part, included twice in training."""
 _FORCE, _HEADING, _AFFORDANCE = 5.0, 12.0, 0.6  # of the human hand: N, weight, share of the episodes
-_STRONG = 0.3  # share of its fingertips' strength that a strong hand needs
+_STRONG = 0.3  # share of its fingertips' strength required of a strong hand
 
 
 @dataclasses.dataclass(frozen=True)
 class Rules:
-    """What of the recipe is the hand's own."""
+    """Settings of the recipe that depend on the hand."""
 
     force_max: float
-    """N, f_max of a link."""
+    """f_max of a link, N."""
     heading_position: float
-    """The weight at the end of the ramp, as the following two."""
+    """Weight at the end of the ramp, like the following two."""
     affordance_distance: float
     affordance_force: float
     p_affordance: float
@@ -52,7 +52,7 @@ class Rules:
 
 
 def rules(hand: Hand) -> Rules:
-    """What the recipe's rules (this module's text) give for a hand."""
+    """Computes the recipe's rules (see the module) for a hand."""
     squeeze = hand.object_scale**2 * 5 / len(hand.tip_links)
     force_max = max(round(2 * _FORCE * squeeze), 1) / 2
     weakness = min(max((force_max / float(tip_forces(hand).mean()) - _STRONG) / (1 - _STRONG), 0.0), 1.0)
@@ -66,7 +66,7 @@ def rules(hand: Hand) -> Rules:
 
 
 def recipe(hand: Hand) -> RunConfig:
-    """The full task of the paper for a hand, sized for a GPU."""
+    """Returns the paper's full task for a hand, sized for a GPU."""
     own = rules(hand)
     return RunConfig(
         name=hand.name,
@@ -87,8 +87,8 @@ def recipe(hand: Hand) -> RunConfig:
             friction_range=(0.6, 1.2),
             reward=RewardWeights(force_max=own.force_max),
         ),
-        # Grasps first, then the precision with which constraints are met: with the second weights from the beginning
-        # trajectories are not learnt.
+        # Grasps first, then the precision of constraints: with the second weights from the beginning, trajectories are
+        # not learnt.
         curriculum=CurriculumConfig(
             ramp=(80, 160),
             reward=RewardWeights(

@@ -1,4 +1,4 @@
-"""Runs that distil a policy into one that sees what a robot has: joints, wrist, and a tracker's object poses."""
+"""Runs that distil a policy into one with a robot's sensors: joints, wrist, and a tracker's object poses."""
 
 import dataclasses
 import pathlib
@@ -15,11 +15,11 @@ TRACKERS = SensingConfig(
     rotation_noise=(0.0, 0.105),
     dropout=(0.0, 0.3),
 )
-"""From a perfect tracker to one of 10 Hz that is 0.1 s late, off by 1 cm and 6°, and loses 30 % of its samples."""
+"""From a perfect tracker to one with 10 Hz, 0.1 s latency, errors of 1 cm and 6°, and 30 % lost samples."""
 
 
 def student_of(config: RunConfig, teacher: str) -> RunConfig:
-    """The run that distils a teacher: its task as a robot sees it, with tracker, mass, friction and gains at random.
+    """Returns the run that distils a teacher, with a robot's sensors and random tracker, mass, friction and gains.
 
     Args:
       config: numbers, objects and networks.

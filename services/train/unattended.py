@@ -1,4 +1,4 @@
-"""Commands in processes of their own, which nobody watches; a training resumes from its last checkpoint."""
+"""Unattended commands in separate processes; a training resumes from its last checkpoint."""
 
 import json
 import pathlib
@@ -18,13 +18,13 @@ _LARGEST = 1 << 16
 
 
 def trained(run_dir: pathlib.Path) -> pathlib.Path | None:
-    """The policy file of a run that came to its end; None if it did not."""
+    """Policy file of a finished run; None if it is not finished."""
     policy = run_dir / POLICY_FILE
     return policy if (run_dir / _TRAINED).exists() and policy.exists() else None
 
 
 def seconds(run_dir: pathlib.Path) -> float | None:
-    """How long its training took; of a resumed one the last session."""
+    """Duration of its training in seconds; for a resumed one, that of the last session."""
     try:
         return float(read_json(run_dir / _TRAINED, _LARGEST)["seconds"])
     except (OSError, LookupError, TypeError, ValueError, CongraspError):
@@ -32,15 +32,15 @@ def seconds(run_dir: pathlib.Path) -> float | None:
 
 
 def run_child(child: Child, patience: float, progress: Callable[[str], None] = lambda line: None) -> int | None:
-    """Runs a command in a process of its own; whatever happens, it is over then.
+    """Runs a command in a separate process, which has ended on return in any case.
 
     Args:
-      child: not started yet.
-      patience: seconds after which it is ended.
-      progress: is given the last line that it printed, some times a second.
+      child: the command, not started yet.
+      patience: seconds after which it is terminated.
+      progress: called several times a second with its last line of output.
 
     Returns:
-      Its exit code; None if it was ended.
+      Its exit code; None if it was terminated.
     """
     began = time.monotonic()
     try:
@@ -62,14 +62,14 @@ def train_in_background(
     patience: float,
     progress: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Trains until the run's end; what it prints is in a log beside the run's folder.
+    """Trains until the run's end; the output goes to a log next to the run's folder.
 
     Args:
-      run_dir: the run, which may have begun; one without a checkpoint begins anew.
-      chosen: options of `congrasp train` that make a new run, as `--preset`.
-      options: further options, also of one that goes on.
-      patience: seconds after which the training is ended, to be resumed another time.
-      progress: is given the last line that it printed.
+      run_dir: the run, which is resumed; one without a checkpoint is restarted.
+      chosen: options of `congrasp train` for a new run, such as `--preset`.
+      options: further options, also for a resumed run.
+      patience: seconds after which the training is stopped, to be resumed later.
+      progress: called with its last line of output.
 
     Raises:
       CongraspError: it failed, or took too long.
@@ -86,8 +86,8 @@ def train_in_background(
     code = run_child(child, patience, progress)
     if code is None:
         raise CongraspError(
-            f"The training of {name} was ended after {patience / 60:.0f} min.",
-            "The same command goes on with it; --patience gives it more time.",
+            f"The training of {name} was stopped after {patience / 60:.0f} min.",
+            "Repeat the command to resume it; --patience gives it more time.",
         )
     if code or not (run_dir / POLICY_FILE).exists():
         raise CongraspError(f"The training of {name} failed: {child.last_line()}", f"Its log is {child.log}.")

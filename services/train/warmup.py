@@ -1,4 +1,4 @@
-"""A training that ends with its first update: afterwards everything that one compiles or builds is in the caches."""
+"""A training that ends with its first update, to fill the caches of compiled programs and built data."""
 
 import dataclasses
 import pathlib
@@ -13,19 +13,19 @@ from congrasp.services.train.learn import learn
 from congrasp.services.train.processes import engine_of
 
 _GRACE = 60.0
-"""Seconds for an actor that is in the middle of a rollout: a process that ended meanwhile would abort."""
+"""Seconds for an actor within a rollout: a process that exits meanwhile would abort."""
 
 
 def until_first_update(
     config: RunConfig, physics: PhysicsName, stop: threading.Event, report: Callable[[], None]
 ) -> None:
-    """Starts a training in this process, in a folder that is then removed, and ends it after its first update.
+    """Runs a training in this process, in a temporary folder, and ends it after its first update.
 
     Args:
-      config: of the run.
-      physics: engine; `auto` takes this machine's.
+      config: configuration of the run.
+      physics: engine; `auto` uses the machine's default.
       stop: ends it earlier.
-      report: called after the first update, before anything is taken down.
+      report: called after the first update, before shutdown.
     """
 
     def updated(values: dict[str, float]) -> None:

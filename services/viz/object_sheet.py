@@ -35,7 +35,7 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
     """
     pose = np.asarray(obj.rest_poses[0], float)
     place, turn = pose[:3], Rotation.from_quat(pose[3:], scalar_first=True)
-    (cleared,), (reachable,) = within_reach(headings, obj.points, pose[None], outline(HUMAN))
+    (cleared,), (reachable,) = within_reach(headings, obj, pose[None], outline(HUMAN))
     chosen = np.flatnonzero(reachable)[:_ARROWS]
     tips, ways = turn.apply(cleared.position[chosen]) + place, turn.apply(cleared.direction[chosen])
 

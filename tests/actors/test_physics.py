@@ -335,7 +335,7 @@ def test_environments_that_do_not_fit_into_the_memory_are_one_clear_line(env, mo
     free = psutil.virtual_memory()._replace(available=1_500_000)
     monkeypatch.setattr("congrasp.actors.physics.native.psutil.virtual_memory", lambda: free)
     native = NativePhysics(HAND, TASK, OBJECTS, 1)
-    with pytest.raises(CongraspError, match=r"environments of MuJoCo C need .* GB are free.*fewer --environments"):
+    with pytest.raises(CongraspError, match=r"environments of MuJoCo C need .* GB are free.*smaller --environments"):
         native.start(env.reset_state)
     native.close()
 

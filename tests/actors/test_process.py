@@ -146,7 +146,7 @@ def heard(monkeypatch):
 
 
 def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
-    with pytest.raises(CongraspError, match=r"do not record: torque\. Start the actor with the version"):
+    with pytest.raises(CongraspError, match=r"do not record: torque\. Start the actor with the learner's version"):
         process._Actor(CONFIG, ("reward", "torque"), None, None, "native", 1, lambda values: None, None)
 
 

@@ -13,6 +13,7 @@ from congrasp.actors.training_set import training_set
 from congrasp.common.config import ObjectsConfig, RunConfig, Split, TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.outline import outline
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
 from congrasp.common.task.sampling.bank import rows_of, stacked
@@ -82,7 +83,7 @@ def test_an_object_without_a_heading_of_the_split_is_left_out(tmp_path):
 
 @pytest.mark.parametrize("family", procedural.HOUSEHOLD_FAMILIES)
 def test_household_objects_can_be_approached_and_grasped_by_a_part(family):
-    row = headings_of(TaskConfig(), procedural.generate(1, family), (0, 1))
+    row = headings_of(TaskConfig(), procedural.generate(1, family), (0, 1), None, 1.0, outline(HAND))
     assert row["has_affordance"].any()
 
 
@@ -100,6 +101,14 @@ def test_sets_of_another_hand_are_refused(folders):
     config = dataclasses.replace(_run(folder=folders[0], constraints=folders[1]), task=TaskConfig(hand="allegro"))
     with pytest.raises(CongraspError, match="for the hand 'human'"):
         training_set(get_hand("allegro"), config, 0)
+
+
+def test_an_object_that_lies_too_flat_is_in_no_episode():
+    """A board of 20 x 15 cm, 9 mm thick: fingers find opposite surfaces only above and beneath it."""
+    board = procedural.generate(1_000_045, "board")
+    assert np.ptp(board.points, axis=0).min() < 0.011 and len(board.rest_poses) == 1
+    row = headings_of(TaskConfig(), board, (0, 1), None, 1.0, outline(HAND))
+    assert row["weight"] == 0 and np.isfinite(row["heading_position"]).all()
 
 
 def test_objects_of_different_sizes_stack_and_come_apart_again(folders):

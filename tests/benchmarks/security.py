@@ -34,7 +34,7 @@ def bench_security(repeats: int) -> None:
         f"a request of 100 bytes: {found['secure_query_ms']:.2f} ms secured, {found['plain_query_ms']:.2f} ms plain\n"
         f"a rollout of 8 MB:      {secure:.0f} MB/s secured, {plain:.0f} MB/s plain (ratio {secure / plain:.2f})\n"
         f"the same in a flood:    {flooded:.0f} MB/s (ratio {flooded / secure:.2f}), while "
-        f"{found['flood_turned_away']:.0f} requests were turned away\n"
+        f"{found['flood_turned_away']:.0f} requests were rejected\n"
         f"opening the learner:    {found['secure_open_ms']:.0f} ms secured, {found['plain_open_ms']:.0f} ms plain"
     )
 

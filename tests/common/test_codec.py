@@ -30,10 +30,12 @@ json_values = st.recursive(
 metas = st.dictionaries(st.text(), json_values, max_size=4)
 
 
-def packed(header, section=b"", *, crc=None, meta="{}", key="crc32"):
-    """Bytes with any header, as older versions wrote them; the checksum of the section is right unless given."""
-    header = {"__metadata__": {key: f"{zlib.crc32(section):08x}" if crc is None else crc, "meta": meta}, **header}
-    text = json.dumps(header, separators=(",", ":")).encode()
+def packed(header, section=b"", *, crc=None, **metadata):
+    """Bytes with any header; the checksum of section and header is right unless given."""
+    metadata = {"checksum": "00000000", "meta": "{}", **metadata}
+    text = json.dumps({"__metadata__": metadata, **header}, separators=(",", ":")).encode()
+    crc = f"{zlib.crc32(text, zlib.crc32(section)):08x}" if crc is None else crc
+    text = text.replace(b"00000000", crc.encode(), 1)
     return len(text).to_bytes(8, "little") + text + section
 
 
@@ -68,10 +70,9 @@ def test_decode_reads_what_safetensors_writes():
     written = {name: np.asarray(array) for name, array in written.items()}
     plain = safetensors.numpy.save(written)
     length = int.from_bytes(plain[:8], "little")
-    crc = zlib.crc32(plain[8 + length :])
-    data = safetensors.numpy.save(written, {"meta": '{"a": 1}', "crc32": f"{crc:08x}"})
-    assert_equal(Message(written, {"a": 1}), decode(data))
-    with pytest.raises(CongraspError, match="lacks its meta data or its checksum"):
+    header = json.loads(plain[8 : 8 + length])
+    assert_equal(Message(written, {"a": 1}), decode(packed(header, plain[8 + length :], meta='{"a": 1}')))
+    with pytest.raises(CongraspError, match="does not begin with its checksum"):
         decode(plain)
 
 
@@ -124,6 +125,13 @@ def test_what_cannot_be_written_is_named(message, match):
 TWO = np.array([1, 2], np.float32).tobytes()
 
 
+def signed(rest):
+    """A message without arrays whose header ends with `rest` instead of a brace; the checksum is right."""
+    text = b'{"__metadata__":{"checksum":"00000000","meta":"{}"}' + rest
+    text = text.replace(b"00000000", b"%08x" % zlib.crc32(text), 1)
+    return len(text).to_bytes(8, "little") + text
+
+
 @pytest.mark.parametrize(
     ("data", "match"),
     [
@@ -132,16 +140,15 @@ TWO = np.array([1, 2], np.float32).tobytes()
         ((MAX_HEADER + 1).to_bytes(8, "little") + b"{}", "claims 1048577 bytes"),
         (b"\xff" * 8, "claims 18446744073709551615 bytes"),
         ((100).to_bytes(8, "little") + b"{}", "cut inside its header"),
-        ((2).to_bytes(8, "little") + b"[]", "not a JSON object"),
-        ((2).to_bytes(8, "little") + b"{]", "not JSON"),
-        ((2).to_bytes(8, "little") + b"\xff\xff", "not JSON"),
-        ((1 << 18).to_bytes(8, "little") + b"[" * (1 << 18), "not JSON"),
-        ((2).to_bytes(8, "little") + b"{}", "lacks its meta data"),
-        ((13).to_bytes(8, "little") + b'{"a":1,"a":2}', "key twice"),
-        (packed({"x": entry()}, TWO, crc="00000000"), "do not match their checksum"),
-        (packed({"x": entry()}, TWO, crc="zz"), "do not match their checksum"),
-        (packed({"x": entry()}, TWO, crc=None, key="crc33"), "lacks its meta data or its checksum"),
-        (packed({"x": entry()}, TWO, key="checksum"), "does not match its checksum"),
+        ((2).to_bytes(8, "little") + b"[]", "does not begin with its checksum"),
+        (packed({"x": entry()}, TWO, crc="00000001"), "does not match its checksum"),
+        (packed({"x": entry()}, TWO, crc="zz"), "does not match its checksum"),
+        (packed({"x": entry()}, TWO, more="x"), "lacks its metadata"),
+        (packed({}, meta=3), "lacks its metadata"),
+        (signed(b"]"), "not JSON"),
+        (signed(b',"a":\xff}'), "not JSON"),
+        (signed(b',"a":' + b"[" * (1 << 18)), "not JSON"),
+        (signed(b',"a":1,"a":2}'), "key twice"),
         (packed({}, meta="[1]"), "not a JSON object"),
         (packed({}, meta='{"a": NaN}'), "NaN"),
         (packed({"x": entry()}, TWO[:-1]), "cut: the array 'x' ends at 8 of 7"),
@@ -176,7 +183,7 @@ def test_damage_is_named(data, match):
 
 def test_length_is_limited():
     data = encode(Message({"x": np.zeros(100)}))
-    with pytest.raises(CongraspError, match=f"has {len(data)} bytes, more than the 100"):
+    with pytest.raises(CongraspError, match=f"has {len(data)} bytes; the limit is 100"):
         decode(data, max_bytes=100)
     assert decode(data, max_bytes=len(data)).arrays["x"].shape == (100,)
 

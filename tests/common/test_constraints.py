@@ -189,7 +189,7 @@ def test_what_is_not_known_is_named():
     with pytest.raises(CongraspError, match="heading is always active"):
         known(TaskConfig(constraints=("pose",)))
     with pytest.raises(
-        CongraspError, match=r"The policy does not know the constraint 'fingers'.*constraints … fingers"
+        CongraspError, match=r"The policy does not support the constraint 'fingers'.*constraints … fingers"
     ):
         require_known(["heading", "fingers"], TaskConfig(constraints=PAPER))
 

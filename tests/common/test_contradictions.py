@@ -56,17 +56,14 @@ def test_a_trajectory_that_ends_at_what_must_not_be_touched_is_refused():
     found = only(AVOID, trajectory={"position": path, "quaternion": np.tile(NOT_TURNED, (15, 1))})
     assert found.refused and (found.weaker, found.stronger) == ("affordance", "trajectory")
     graspable = np.hypot(0.08 - POINTS[~AVOID][:, 0].max(), 0.03)
-    assert (
-        "3.0 cm from what must not be touched" in found.message
-        and f"{100 * graspable:.1f} cm from what may" in found.message
-    )
+    assert "3.0 cm from the avoid region" in found.message and f"{100 * graspable:.1f} cm from the" in found.message
 
 
 def test_a_pose_away_from_the_trajectorys_end_keeps_its_fingers_alone():
     pose, path = at((-0.06, 0.0, 0.0)), path_to((-0.06, 0.0, 0.0))
     found = only(pose={**pose, "position": pose["position"] + np.array([0, 0, 0.05])}, trajectory=path)
     assert (found.weaker, found.stronger, found.refused) == ("pose", "trajectory", False)
-    assert "5.0 cm and 0 degrees" in found.message and "only the fingers count" in found.message
+    assert "5.0 cm and 0 degrees" in found.message and "only the fingers of the pose count" in found.message
     turned = np.array([np.cos(0.5), np.sin(0.5), 0.0, 0.0])
     assert "0.0 cm and 57 degrees" in only(pose={**pose, "quaternion": turned}, trajectory=path).message
 
@@ -92,4 +89,4 @@ def test_a_heading_from_elsewhere_follows_the_reference(stronger):
 def test_a_heading_towards_what_must_not_be_touched_is_turned():
     found = only(AVOID, heading={"direction": np.array([0.0, -1.0, 0.0]), "position": np.array([0.08, 0.0, 0.0])})
     assert (found.weaker, found.stronger, found.refused) == ("heading", "affordance", False)
-    assert "0.0 cm from what must not be touched" in found.message and "redirects the heading" in found.message
+    assert "0.0 cm from the avoid region" in found.message and "redirects the heading" in found.message

@@ -223,7 +223,7 @@ def test_words():
     with pytest.raises(CongraspError, match=r"^--fingers lacks the thumb, which every grasp needs\. Add thumb\.$"):
         FINGERS.parse({"fingers": ("index", "middle")}, HAND, BOX)
     for one in (("thumb",), ("thumb", "thumb")):
-        with pytest.raises(CongraspError, match="names one finger"):
+        with pytest.raises(CongraspError, match="names only one finger"):
             FINGERS.parse({"fingers": one}, HAND, BOX)
 
 

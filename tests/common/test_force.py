@@ -132,7 +132,7 @@ def test_words():
     assert read_request(dataclasses.replace(mug, mass=0.05), HAND, 15, gentle=True).given("force", "limit") == 1.0
     assert set(read_request(mug, HAND, 15, gentle=False).constraints) == {"heading"}
     for text in ("soft", "0", "-1", "1000", "nan"):
-        with pytest.raises(CongraspError, match=rf"--force is '{text}', not a number of newtons between 0\.5 and 50"):
+        with pytest.raises(CongraspError, match=rf"--force is '{text}', not a number between 0\.5 and 50"):
             read_request(mug, HAND, 15, force=text)
     with pytest.raises(CongraspError, match="--force and --gentle both set the force limit"):
         read_request(mug, HAND, 15, force="3", gentle=True)

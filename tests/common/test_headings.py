@@ -1,6 +1,7 @@
 """Heading sets against the paper's rules, checked from their definitions, and table geometry worked out by hand."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -48,6 +49,16 @@ def defined_width(points, position, direction, cross):
     return np.ptp(offset[slab] @ cross)
 
 
+def defined_opposition(obj, touchable, position, direction, cross, rounding):
+    """The definition, one heading at a time: on both sides a normal within 45 degrees of the cross-finger axis."""
+    offset = (obj.points - position)[:256]
+    breadth, depth = np.abs(offset @ np.cross(direction, cross)), offset @ direction
+    slab = (breadth < 0.03 + rounding) & (depth < 0.01 + rounding) & touchable[:256]
+    along, facing = (offset @ cross)[slab], (obj.normals[:256] @ cross)[slab]
+    sides = facing[along < along.min() + 0.015 + 1e-6], facing[along > along.max() - 0.015 - 1e-6]
+    return sides[0].min() < -np.cos(np.pi / 4) + 1e-6 and sides[1].max() > np.cos(np.pi / 4) - 1e-6
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from(FAMILIES), st.booleans(), st.integers(0, 99))
 def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
@@ -70,6 +81,9 @@ def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
     np.testing.assert_allclose(local_width(headings, obj.points), widths, atol=1e-5)
     assert max(widths) <= MAX_WIDTH + 1e-5
     avoid = obj.non_graspable_points
+    touchable = ~avoid | (not affordance)
+    for heading in zip(position, direction, cross, strict=True):
+        assert any(defined_opposition(obj, touchable, *heading, rounding) for rounding in (0, 1e-6, -1e-6))
     if affordance:
         assert not avoid[source].any()
         # No point of the avoid region within 1 cm of the approach, and the end nearer to the graspable one.
@@ -275,12 +289,12 @@ def test_the_width_is_that_of_the_slab_where_fingers_close():
 def test_a_heading_moves_back_no_further_than_its_grasp_can_bear():
     """At heights of 0 and -10 mm a centre that needs 1 cm moves 1 and 2 cm: the latter only where there is no other."""
     both = made(([0, 0, -0.05], DOWN), ([0, 0, -0.06], DOWN))
-    point = np.zeros((1, 3))
-    (cleared,), (reachable,) = within_reach(both, point, FLAT[None], CENTER)
+    point = SimpleNamespace(points=np.zeros((1, 3)))
+    (cleared,), (reachable,) = within_reach(both, point, FLAT[None], CENTER, opposed=False)
     np.testing.assert_array_equal(reachable, [True, False])
     np.testing.assert_allclose(cleared.position[:, 2], [-0.04, -0.06], atol=2e-6)
     deep = Headings(*(part[1:] for part in both))
-    (cleared,), (reachable,) = within_reach(deep, point, FLAT[None], CENTER)
+    (cleared,), (reachable,) = within_reach(deep, point, FLAT[None], CENTER, opposed=False)
     assert reachable[0]
     np.testing.assert_allclose(cleared.position[0, 2], -0.04, atol=2e-6)
 
@@ -306,9 +320,41 @@ def test_a_card_is_approached_as_well_as_it_goes():
     card = made(([0, 0, -0.05], DOWN), ([0, 0, -0.05], UP))
     tall = Outline(np.array([[[0.05, 0, 0]]]), np.array([0.01]), ANY)  # fingers reach 6 cm beyond the centre
     assert not feasible(clear_table(card, FLAT, tall), FLAT, tall).any()
-    (cleared,), (reachable,) = within_reach(card, np.zeros((1, 3)), FLAT[None], tall)
+    point = SimpleNamespace(points=np.zeros((1, 3)))
+    (cleared,), (reachable,) = within_reach(card, point, FLAT[None], tall, opposed=False)
     np.testing.assert_array_equal(reachable, [True, False])
     np.testing.assert_allclose(cleared.position[0], [0, 0, -0.04], atol=2e-6)
+
+
+def test_a_corner_has_no_surfaces_to_press_on_and_a_strip_has():
+    """Two edges from the origin along x and y, and a strip 4 cm wide a metre away; along the diagonal, turned by 5
+    degrees, one edge's normal is at 50 degrees to the cross-finger axis."""
+    t = np.linspace(0.002, 0.06, 30)[:, None]
+    x, y = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    points = np.concatenate([t * x, t * y, 0.98 * y + t * x, 1.02 * y + t * x])
+    part = SimpleNamespace(points=points, normals=np.repeat([-y, -x, -y, y], 30, axis=0))
+    angle = np.radians([50.0, 0.0])
+    direction = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    cross = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], -1)
+    both = Headings(0.02 * direction + [[0, 0, 0], [0, 1, 0]], direction, cross)
+    for opposed, expected in ((True, [False, True]), (False, [True, True])):
+        np.testing.assert_array_equal(within_reach(both, part, FLAT[None], CENTER, opposed=opposed)[1], [expected])
+
+
+@pytest.mark.parametrize(("thick", "over"), [(0.03, True), (0.05, False)])
+def test_where_a_hand_has_no_room_its_fingers_still_close_over_the_table(thick, over):
+    """3 cm over the table: fingers 12 mm thick that close vertically on 3 cm reach 27 mm down, on 5 cm 37 mm.
+
+    A second heading, half a metre aside, closes level on a plate 1 cm thick.
+    """
+    reaching = Outline(0.05 * np.array([[[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]]), np.array([0.01]), ANY)
+    position = np.array([[0, 0, -0.02], [-0.5, 0.5, -0.02]])
+    headings = Headings(position, np.array([LEVEL] * 2), np.array([UP, [0, 1, 0]], float))
+    half = np.array([0, 0, thick / 2]), np.array([0, 0.005, 0])
+    points = np.concatenate([[p + h, p - h] for p, h in zip(position, half, strict=True)])
+    part = SimpleNamespace(points=points, normals=np.array([UP, DOWN, [0, 1, 0], [0, -1, 0]]))
+    assert not feasible(headings, FLAT, reaching).any()
+    np.testing.assert_array_equal(within_reach(headings, part, FLAT[None], reaching)[1], [[over, True]])
 
 
 def bar_headings(*depths):
@@ -337,7 +383,7 @@ def covered(obj, hand):
     found = sample_headings(obj, np.random.default_rng(0), use_affordance=True, max_width=widest)
     if found is None:
         return [], np.zeros((len(obj.rest_poses), 0), bool)
-    return within_reach(found, obj.points, obj.rest_poses, hand, obj.non_graspable_points)
+    return within_reach(found, obj, obj.rest_poses, hand, obj.non_graspable_points)
 
 
 @pytest.mark.parametrize("families", ["all", "scans"])

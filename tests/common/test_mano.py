@@ -99,7 +99,7 @@ def test_the_hand_opens_towards_its_palm(hand):
 def test_it_is_found_by_name_only_where_the_users_file_is(file, monkeypatch):
     get_hand.cache_clear()
     monkeypatch.delenv(VARIABLE, raising=False)
-    with pytest.raises(CongraspError, match=rf"your own MANO_RIGHT.pkl.*{VARIABLE}="):
+    with pytest.raises(CongraspError, match=rf"your copy of MANO_RIGHT.pkl.*{VARIABLE}="):
         get_hand("mano")
     monkeypatch.setenv(VARIABLE, str(file))
     assert get_hand("mano") is get_hand("mano")

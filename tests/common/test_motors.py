@@ -94,11 +94,11 @@ def test_wrong_couplings_are_one_line(hand):
     refused("'index_3' cannot follow 'elbow'", couplings=[{**follow, "leader": "elbow"}])
     refused("cannot follow 'index_2'", couplings=[follow, {**follow, "joint": "index_2", "leader": "index_3"}])
     refused("ratio zero", couplings=[{**follow, "ratio": 0.0}])
-    refused("leave it no way", couplings=[{**follow, "offset": 5.0}])
-    refused("'index_3' is outside of its limits in the closed pose", couplings=[{**follow, "ratio": 1.5}])
+    refused("leave it no range", couplings=[{**follow, "offset": 5.0}])
+    refused("'index_3' is outside its limits in the closed pose", couplings=[{**follow, "ratio": 1.5}])
     tendon = fields["tendons"][0]
     refused("pulls 'index_3', which", tendons=[{**tendon, "joints": {"index_3": 1.0, "middle_3": 1.0}}])
-    refused("two joints at least", tendons=[{**tendon, "joints": {"middle_3": 1.0}}])
+    refused("at least two joints", tendons=[{**tendon, "joints": {"middle_3": 1.0}}])
     refused("'thumb_0' of a tendon is taken", tendons=[{**tendon, "name": "thumb_0"}])
     refused("torque limit of 'middle_tendon' must be above zero", tendons=[{**tendon, "torque_limit": 0.0}])
 

@@ -43,7 +43,7 @@ def test_damaged_and_foreign_files_are_named(tmp_path):
     with pytest.raises(CongraspError, match="not an object of this version"):
         load(path)
     path.write_bytes(encode(Message({}, {"kind": "object", "format": 1})))
-    with pytest.raises(CongraspError, match="lacks a part of an object"):
+    with pytest.raises(CongraspError, match="lacks an array or a field"):
         load(path)
 
 

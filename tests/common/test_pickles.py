@@ -111,8 +111,8 @@ def test_hostile_pickles_are_refused_in_one_line_and_nothing_runs(tmp_path):
         "itself": (b"}q\x00U\x01ah\x00s.", "contains itself"),
         "deep": (b"\x80\x02" + b"}U\x01a" * 100_000 + b"N" + b"s" * 100_000 + b".", "too deeply"),
         "cut off": (mano_pickle()[:-1000], "damaged"),
-        "text": (b"not a pickle", "no pickle"),
-        "empty": (b"", "no pickle"),
+        "text": (b"not a pickle", "not a pickle"),
+        "empty": (b"", "not a pickle"),
         "huge number": (b"I" + b"9" * 10_000 + b"\n.", "damaged"),
         "huge string": (b"\x80\x04\x8d" + b"\xff" * 8 + b".", "damaged"),
         "shape": (

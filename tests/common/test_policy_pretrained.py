@@ -30,7 +30,7 @@ def test_a_command_takes_what_it_is_given_before_what_is_shipped(tmp_path, monke
     monkeypatch.setattr(module, "_FOLDER", tmp_path)
     given = tmp_path / "mine.safetensors"
     assert policy_file(given) == given
-    with pytest.raises(CongraspError, match=r"none comes with this installation for the hand 'human'.*--policy"):
+    with pytest.raises(CongraspError, match=r"this installation has none for the hand 'human'.*--policy"):
         policy_file(None)
     with pytest.raises(CongraspError, match="no hand 'paw'"):
         policy_file(None, "paw")
@@ -59,7 +59,7 @@ def test_a_hand_of_ones_own_has_a_policy_of_ones_own(tmp_path, monkeypatch):
     # Nor has a hand that was changed since the policy of the hand as it was before.
     (tmp_path / "mine.json").write_text(hand_text(dataclasses.replace(mine, object_scale=0.9)))
     get_hand.cache_clear()
-    with pytest.raises(CongraspError, match=r"before the hand's file was changed.*--policy"):
+    with pytest.raises(CongraspError, match=r"for an earlier version of the hand's file.*--policy"):
         policy_file(None, "mine")
     get_hand.cache_clear()
 

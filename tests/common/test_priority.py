@@ -200,5 +200,7 @@ def test_trajectory_and_affordance_must_agree(end_x, aligned):
 
 def test_explanations_name_what_is_overridden():
     words = " ".join(explain(["affordance", "pose", "trajectory"]))
-    assert "fingers count" in words and "overridden by the reference pose" in words
+    assert (
+        "only the fingers of the reference pose count" in words.lower() and "overridden by the reference pose" in words
+    )
     assert explain([]) == ["The heading guides the wrist."]

@@ -189,3 +189,29 @@ def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
         given = load(arguments[0])(arguments[1:]).keywords
         assert (given["rank"], given["ranks"], given["coordinator"]) == (rank, 2, "node-7:7440")
         assert given["run_dir"] == tmp_path / "a run" and given["config"].updates == 9 and given["inside"]
+
+
+@pytest.mark.parametrize(
+    ("rank", "learner", "words"),
+    [(0, "", ["learner", "--inside"]), (1, "", ["actor", "--patience"]), (0, "10.0.0.5", ["actor", "--patience"])],
+)
+def test_nodes_of_a_cloud_are_a_learner_and_its_actors(tmp_path, rank, learner, words):
+    """With a stand-in for the package, each node runs a command that this version understands."""
+    task = yaml.safe_load((DEPLOY / "skypilot.yaml").read_text())
+    stubs = tmp_path / "congrasp" / "bin"
+    stubs.mkdir(parents=True)
+    for name, body in {"congrasp": 'printf "%s\\n" "$@" > "$OUT"', "sudo": "cat > /dev/null"}.items():
+        (stubs / name).write_text(f"#!/usr/bin/env bash\n{body}\n")
+        (stubs / name).chmod(0o755)
+    nodes = {"SKYPILOT_NODE_IPS": "10.0.0.5\n10.0.0.6", "SKYPILOT_NODE_RANK": str(rank)}
+    environment = {**nodes, **task["envs"], "LEARNER": learner, "HOME": str(tmp_path), "OUT": str(tmp_path / "said")}
+    path = f"{stubs}:/usr/bin:/bin"
+    subprocess.run(["bash", "-c", task["run"]], env={**environment, "PATH": path}, check=True, timeout=60)
+    command, *rest = (tmp_path / "said").read_text().splitlines()
+    assert command == words[0] and words[1] in rest
+    load(command)(rest)
+    check = [str(pathlib.Path(sys.executable).with_name("shellcheck")), "--shell=bash", "-"]
+    for part in ("setup", "run"):
+        done = subprocess.run(check, input=task[part], capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stdout
+    assert {path.partition("/")[0] for path in task["file_mounts"].values()} == {"certs"}

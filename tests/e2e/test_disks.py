@@ -79,8 +79,8 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
     errors = [text for level, text in said if level == "error"]
     (error,) = (text for text in errors if "checkpoint_" in text)  # although every update tries again
     assert "checkpoint_000000004.safetensors could not be written" in error
-    assert "a kill costs the 2 update(s) since that of update 2, and those to come" in error
-    assert ("info", "Checkpoints can be written again: there is one of update 8.") in said
+    assert "a kill loses the 2 update(s) since update 2 and all later ones" in error
+    assert ("info", "Checkpoints can be written again; the newest is of update 8.") in said
     assert not any("\n" in text for text in errors)
     assert complaints == [recorder.error] and "No space left" in recorder.error
     assert (run_dir / "checkpoints" / "latest").resolve().name == "checkpoint_000000012.safetensors"

@@ -13,7 +13,7 @@ from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.normalizer import Statistics
 from congrasp.common.wire.schema import RECORDED
 from congrasp.learner.algorithms import gae
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState, random_policy
+from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
 from congrasp.learner.batch import partition_specs
 from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
@@ -33,7 +33,7 @@ class A2C:
         return TrainState(initial.params, optimizer, jax.random.PRNGKey(seed), initial.observation, initial.value, 0, 0)
 
     def policy(self, state):
-        return Policy(state.params, state.observation, state.value)
+        return LearnedPolicy(state.params, state.observation, state.value)
 
     def update(self, state, batch, mesh=None):
         arrays = shard({name: batch[name] for name in SCHEMA}, mesh, partition_specs(SCHEMA))

@@ -99,7 +99,7 @@ def test_a_batch_that_is_not_finite_changes_nothing(teacher):
     student, rows = algorithm(run), batch(run, 0)
     state = student.init(0)
     rows["teacher_observation"][3, 2] = np.nan
-    with pytest.raises(NonFiniteUpdate, match="Not finite in the rollouts of update 1: imitation_kl") as caught:
+    with pytest.raises(NonFiniteUpdate, match="Diverged in the rollouts of update 1: imitation_kl") as caught:
         student.update(state, rows)
     assert caught.value.state is state
     with pytest.raises(CongraspError, match=r"8 transitions does not make 16 minibatches\. Use fewer --distill"):

@@ -12,7 +12,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network, normalizer
 from congrasp.learner.algorithms import ppo
 from congrasp.learner.algorithms.ppo import PPO
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate, Policy, TrainState
+from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
 from tests.benchmarks import toy
 
 ALGORITHM = PPO(toy.SPEC, toy.SETTINGS)
@@ -318,7 +318,7 @@ def test_a_policy_without_privileged_inputs_begins_with_the_same_values():
     state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 0))
     wide = bundles.with_critic_of(WIDE, toy.bundle_of(state))
     algorithm = PPO(WIDE, toy.SETTINGS)
-    begun = algorithm.init(0, Policy(wide.params, wide.observation, wide.value, wide.privileged))
+    begun = algorithm.init(0, LearnedPolicy(wide.params, wide.observation, wide.value, wide.privileged))
     assert begun.privileged.count == 0
     batch = with_future(rollout(wide, 1))
     _, wider = algorithm.update(begun, batch)

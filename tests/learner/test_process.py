@@ -186,7 +186,7 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     (kept / "checkpoint_000000005.safetensors").write_bytes(damaged := b"damaged")
     (tmp_path / "version").write_bytes(bytes(21))
     policy = (tmp_path / "policy.safetensors").read_bytes()
-    with pytest.raises(CongraspError, match=r"holds checkpoints of a run\. Continue with --resume"):
+    with pytest.raises(CongraspError, match=r"has checkpoints of a run\. Pass --resume"):
         learn(tmp_path, hub)
     seen, said = [], []
     learn(
@@ -208,7 +208,7 @@ def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a
     create_run(tmp_path, config)
     monkeypatch.setattr(Admission, "check", lambda self, message: None)  # what is within the ranges breaks nothing
     actor = MadeUpActor(MemoryTransport(hub), reward=1e37)
-    with pytest.raises(PhysicsError, match=r"update 5: .* 5th batch in a row.*failure") as caught:
+    with pytest.raises(PhysicsError, match=r"update 5: .* 5th such batch in a row.*failure") as caught:
         learn(tmp_path, hub, config)
     actor.stop.set()
     actor.join(10.0)
@@ -293,7 +293,7 @@ def test_directories_that_are_no_runs_or_runs_already(tmp_path, hub):
     with pytest.raises(CongraspError, match="not a run directory"):
         learn(tmp_path, hub)
     create_run(tmp_path, CONFIG)
-    with pytest.raises(CongraspError, match="holds a run already"):
+    with pytest.raises(CongraspError, match="already has a run"):
         create_run(tmp_path, CONFIG)
     with pytest.raises(CongraspError, match="no checkpoint"):
         learn(tmp_path, hub, resume=True)
@@ -304,5 +304,5 @@ def test_resuming_with_other_networks_is_refused(tmp_path, hub):
     stopped = threading.Event()
     stopped.set()
     learn(tmp_path, hub, CONFIG, stopped)
-    with pytest.raises(CongraspError, match="does not fit this run: 'params/actor"):
+    with pytest.raises(CongraspError, match="does not match this run: 'params/actor"):
         learn(tmp_path, hub, dataclasses.replace(CONFIG, network=NetworkConfig(hidden=(9,), encoder=2)), resume=True)

@@ -38,7 +38,7 @@ CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
 MUG = procedural.generate(1, "mug")
 PINCH = np.array([True, True, False, False, False])
 REFUSED = (
-    r"does not know the constraint 'fingers'\. It knows heading, affordance, pose, trajectory; train one with "
+    r"does not support the constraint 'fingers'\. It supports heading, affordance, pose, trajectory; train one with "
     r"--task\.constraints … fingers\.$"
 )
 
@@ -117,7 +117,7 @@ def test_fingers_are_read_by_their_names() -> None:
     assert read_request(MUG, HAND, 15).given("fingers", "allowed") is None
     with pytest.raises(CongraspError, match=r"no finger 'toe'\. Known: thumb, index, middle, ring, "):
         read_request(MUG, HAND, 15, fingers=("thumb", "toe"))
-    with pytest.raises(CongraspError, match=r"--fingers names one finger.*Name two or more"):
+    with pytest.raises(CongraspError, match=r"--fingers names only one finger.*Name two or more"):
         read_request(MUG, HAND, 15, fingers=("thumb",))
 
 
@@ -161,7 +161,7 @@ def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: di
     )
     with pytest.raises(CongraspError, match="lacks the field 'fingers_allowed'"):
         ask(["heading", "fingers"])
-    with pytest.raises(CongraspError, match="nothing that guides the wrist"):
+    with pytest.raises(CongraspError, match="no constraint that guides the wrist"):
         ask(["fingers"], fingers_allowed=PINCH)
 
 

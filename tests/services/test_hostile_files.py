@@ -80,11 +80,11 @@ def _with(values, index, value):
         (lambda o: {"points": _with(o.points, (3, 1), NAN)}, "points holds numbers that are not finite"),
         (lambda o: {"points": _with(o.points, 3, 1e9)}, r"points goes up to 1e\+09"),
         (lambda o: {"points": o.points[:7]}, "points has the shape"),
-        (lambda o: {"normals": 0 * o.normals}, "normals are not of length one"),
+        (lambda o: {"normals": 0 * o.normals}, "normals are not normalised"),
         (lambda o: {"labels": o.labels + 99}, "labels name parts"),
         (lambda o: {"labels": o.labels - 99}, "labels name parts"),
         (lambda o: {"inertia": -o.inertia}, "principal moments"),
-        (lambda o: {"inertia": np.diag([1.0, 1.0, 9.0])}, "which no body has"),
+        (lambda o: {"inertia": np.diag([1.0, 1.0, 9.0])}, "which no rigid body has"),
         (lambda o: {"inertia": _with(o.inertia, (0, 1), 1.0)}, "not symmetric"),
         (lambda o: {"rest_poses": o.rest_poses[:0]}, "0 resting poses"),
         (lambda o: {"rest_poses": 2 * o.rest_poses}, "quaternions"),
@@ -215,13 +215,11 @@ def _recomputed(data: bytes) -> bytes:
     """The message with the checksum of its damaged data, as one who means harm would write it."""
     try:
         length = int.from_bytes(data[:8], "little")
-        header = json.loads(data[8 : 8 + length])
-        header["__metadata__"] = {
-            "meta": header["__metadata__"]["meta"],
-            "crc32": f"{zlib.crc32(data[8 + length :]):08x}",
-        }
-        text = json.dumps(header).encode()
-        return len(text).to_bytes(8, "little") + text + data[8 + length :]
+        header, section = json.loads(data[8 : 8 + length]), data[8 + length :]
+        header = {"__metadata__": {"checksum": "00000000", "meta": header.pop("__metadata__")["meta"]}, **header}
+        text = json.dumps(header, separators=(",", ":")).encode()
+        text = text.replace(b"00000000", b"%08x" % zlib.crc32(text, zlib.crc32(section)), 1)
+        return len(text).to_bytes(8, "little") + text + section
     except (ValueError, KeyError, TypeError):
         return data
 

@@ -107,13 +107,13 @@ def test_recordings_of_others_are_one_line(tmp_path):
     for number, data in enumerate((b"{", b"[" * 10**5, b"[]", b"{}", b'{"values": 7}', b'{"values": {"x": "y"}}',
                                    b'{"values": {}, "update": "z"}')):  # fmt: skip
         path = _recording(tmp_path / str(number), Entry(channel, 1, data))
-        refused(read_metrics, path, "is not JSON|holds no metrics")
+        refused(read_metrics, path, "is not JSON|has no metrics")
         (record,) = read_records(path)
         refused(lambda path, record=record: metrics_of(record), path, "A record of '/metrics/learner/0'")
     raw = opaque_channel("/episode/a/raw", EPISODE_SCHEMA)
     whole = episode()
     for number, (change, why) in enumerate((
-        ({"hand": "/etc/hosts.json"}, "no hand that a message can name"),
+        ({"hand": "/etc/hosts.json"}, "not a hand that a message can name"),
         ({"success": None}, "'success' is None"),
         ({"metrics": []}, r"'metrics' is \[\]"),
     )):  # fmt: skip

@@ -1,18 +1,19 @@
-"""The families of the procedural generator: what pieces a mug, a knife or a ring is made of.
+"""Families of the procedural generator: the pieces of a mug, a knife or a ring.
 
-A family is a function of a random generator that returns a `Draft`, in the table of its module. The generator
-(`common.objects.procedural`) weighs, recentres and checks what it gets, and asks again where it does not like it.
+A family is a function of a random generator that returns a `Draft`, listed in the table of its module. The generator
+(`common.objects.procedural`) computes mass and inertia, recentres and checks each draft, and draws again if it is
+rejected.
 """
 
 from congrasp.common.objects.families import basic, flat, scans, solids, tools, vessels
 from congrasp.common.objects.families.draft import Builder, Draft
 
 BASIC: dict[str, Builder] = basic.BUILDERS
-"""Simple objects, those of a run that names no families."""
+"""Simple objects; the default of a run that names no families."""
 HOUSEHOLD: dict[str, Builder] = {**vessels.BUILDERS, **tools.BUILDERS, **flat.BUILDERS, **solids.BUILDERS}
-"""Real things' shapes and sizes, most of them of convex mesh pieces."""
+"""Objects with realistic shapes and sizes, most of them of convex mesh pieces."""
 SCANS: dict[str, Builder] = scans.BUILDERS
-"""Kinds of shape that scans have and the others lack."""
+"""Shapes found in scans that other families lack."""
 BUILDERS = {**BASIC, **HOUSEHOLD, **SCANS}
 
 __all__ = ["BASIC", "BUILDERS", "HOUSEHOLD", "SCANS", "Draft"]

@@ -1,6 +1,6 @@
 """Simple objects: shapes, tools and vessels in outline.
 
-Their draws stay as they are, because evaluation's held-out objects come from them.
+Do not change their draws: evaluation's held-out objects come from them.
 """
 
 import functools
@@ -25,7 +25,7 @@ def box(rng: Rng) -> Draft:
 
 @_family
 def cylinder(rng: Rng) -> Draft:
-    """From a flat tin to a long rod."""
+    """A cylinder, from a flat tin to a long rod."""
     half = rng.uniform(0.015, 0.11)
     return Draft((draft.cylinder((0, 0, -half), (0, 0, half), rng.uniform(0.012, 0.042)),))
 
@@ -39,14 +39,14 @@ def capsule(rng: Rng) -> Draft:
 
 @_family
 def ellipsoid(rng: Rng) -> Draft:
-    """From a pebble to a rugby ball."""
+    """An ellipsoid, from a pebble to a rugby ball."""
     radii = [rng.uniform(0.015, 0.04), rng.uniform(0.02, 0.045), rng.uniform(0.025, 0.1)]
     return Draft((draft.ellipsoid(tuple(rng.permutation(radii))),))
 
 
 @_family
 def ball(rng: Rng) -> Draft:
-    """Nearly a sphere, as fruit is."""
+    """A near-sphere, such as a fruit."""
     return Draft((draft.ellipsoid(tuple(rng.uniform(0.02, 0.043) * rng.uniform(0.95, 1.05, 3))),))
 
 
@@ -247,7 +247,7 @@ def cross(rng: Rng) -> Draft:
 
 @_family
 def compound(rng: Rng) -> Draft:
-    """Two or three random pieces, each grown out of the first."""
+    """Two or three random pieces, the others attached to the first."""
     kinds = rng.choice(["box", "box", "cylinder", "capsule", "capsule", "ellipsoid"], rng.integers(2, 4), replace=False)
     pieces: list[Piece] = []
     for i, kind in enumerate(kinds):

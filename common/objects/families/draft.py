@@ -1,4 +1,4 @@
-"""What a family of the procedural generator returns, and the pieces that all of them are made of."""
+"""Draft of an object, returned by families of the procedural generator, and its primitive pieces."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,26 +12,26 @@ Vector = tuple[float, float, float]
 
 
 class Draft(NamedTuple):
-    """What a family proposes; lengths in metres."""
+    """An object proposed by a family; lengths in metres."""
 
     pieces: tuple[Piece, ...]
     part_names: tuple[str, ...] = ()
     """Empty: the object is labelled by its two halves."""
     graspable: tuple[bool, ...] = ()
-    """Which parts form the graspable region."""
+    """For each part, true if it belongs to the graspable region."""
     weight: tuple[float, ...] = ()
     """Relative density of each part; empty means equal."""
     density: tuple[float, float] = (300.0, 1000.0)
     """Range of the density, kg/m^3."""
     heavier: float = 1.0
-    """Factor on the mass. It leaves the shape unchanged bit for bit, which another density would not."""
+    """Factor on the mass. It leaves the shape bitwise unchanged, which another density would not."""
 
 
 Builder = Callable[[Rng], Draft]
 
 
 def enter(table: dict[str, Builder], builder: Builder) -> Builder:
-    """Enters a family into its module's table, by the function's name without underscores at its end."""
+    """Registers a family in its module's table under the function's name without trailing underscores."""
     table[builder.__name__.rstrip("_")] = builder
     return builder
 
@@ -70,13 +70,13 @@ def polar(radius: float, turn: float, z: float) -> Vector:
 
 
 def either(rng: Rng) -> tuple[bool, bool]:
-    """One of two parts, at random."""
+    """Selects one of two parts at random."""
     first = bool(rng.random() < 0.5)
     return first, not first
 
 
 def _between(start: Vector, end: Vector) -> tuple[Vector, tuple[float, float, float, float], float]:
-    """Centre, quaternion (the z axis along the segment) and half length of a segment."""
+    """Centre, quaternion (z axis along the segment) and half length of a segment."""
     a, b = np.array(start, float), np.array(end, float)
     x, y, z = (b - a) / np.linalg.norm(b - a)
     q = np.array([1 + z, -y, x, 0.0]) if z > -1 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""Household things that are flat or thin, and frames."""
+"""Household objects that are flat or thin, and frames."""
 
 import functools
 
@@ -21,7 +21,7 @@ def carton(rng: Rng) -> Draft:
 
 @_family
 def book(rng: Rng) -> Draft:
-    """A thick one or a thin one."""
+    """A book, thick or thin."""
     half = rng.uniform(0.045, 0.08), rng.uniform(0.07, 0.12), rng.uniform(0.007, 0.022)
     return Draft((draft.box(half),), density=(300.0, 900.0))
 
@@ -35,7 +35,7 @@ def card(rng: Rng) -> Draft:
 
 @_family
 def phone(rng: Rng) -> Draft:
-    """A telephone in its case, with the block of its cameras."""
+    """A telephone in its case, with a camera block."""
     half = rng.uniform(0.032, 0.041), rng.uniform(0.065, 0.085), rng.uniform(0.0055, 0.0075)
     block = rng.uniform(0.01, 0.02), rng.uniform(0.01, 0.02), rng.uniform(0.001, 0.002)
     place = half[0] - block[0] - 0.005, half[1] - block[1] - 0.005, half[2] + block[2]
@@ -68,7 +68,7 @@ def eyeglasses(rng: Rng) -> Draft:
     temple, thick = rng.uniform(0.1, 0.14), rng.uniform(0.0025, 0.004)
     middle, open_ = gap + wide, rng.uniform(0.05, 1.0) * np.pi / 2
     solid, rim = bool(rng.random() < 0.5), rng.uniform(0.003, 0.005)
-    # A corner is on the bridge's side, and one where the temple is.
+    # One corner is on the bridge's side, one at the temple.
     turns = np.pi + np.linspace(0, 2 * np.pi, 10 if solid else 5, endpoint=False)
     outside, above = wide * np.cos(0.2 * np.pi), high * np.sin(0.2 * np.pi)
     pieces = []
@@ -89,7 +89,7 @@ def eyeglasses(rng: Rng) -> Draft:
 
 @_family
 def picture_frame(rng: Rng) -> Draft:
-    """Four bars around a picture, with a strut behind on some."""
+    """Four bars around a picture, some with a strut behind it."""
     x, z = rng.uniform(0.035, 0.065), rng.uniform(0.045, 0.1)
     bar, thick = rng.uniform(0.012, 0.022), rng.uniform(0.01, 0.018)
     loop = np.array([(-x, 0, -z), (x, 0, -z), (x, 0, z), (-x, 0, z)])

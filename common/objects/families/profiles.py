@@ -14,7 +14,7 @@ from congrasp.common.objects.families.draft import mesh
 from congrasp.common.objects.spec import MAX_MESH_VERTICES, Piece
 
 _SIDES = 16
-_FLAT = 3e-4  # m by which a profile may lie below the chord that replaces it
+_FLAT = 3e-4  # tolerance of a profile below the chord that replaces it, m
 _STATIONS = 3  # outer corners of a wall's segment around the axis
 
 
@@ -31,9 +31,9 @@ def lathe(
 
     Args:
       profile: (height, radius) in ascending order of heights, m; straight between.
-      part: of the pieces.
+      part: part of the pieces.
       squash: factor on y: below 1 the cross-section is an ellipse.
-      sides: corners of a cross-section.
+      sides: number of corners of a cross-section.
     """
     most = MAX_MESH_VERTICES // sides
     pieces, first = [], 0
@@ -55,7 +55,7 @@ def shell(
     Args:
       profile: (height, outer radius, inner radius) in ascending order of heights, m; straight between.
       sides: pieces around the axis; the outside of each has two facets, the inside one.
-      part: of the pieces.
+      part: part of the pieces.
       squash: factor on y.
     """
     turns = 2 * np.pi / sides * np.arange(sides + 1)
@@ -78,7 +78,7 @@ def vessel(
       profile: (height, outer radius) in ascending order of heights from 0, m; the first step holds the floor.
       wall: thickness, m.
       sides: pieces around the axis.
-      part: of the pieces.
+      part: part of the pieces.
       squash: factor on y.
     """
     heights, radii = np.array(profile).T
@@ -93,18 +93,18 @@ def extrude(outline: np.ndarray, low: float, high: float, *, taper: float = 1.0,
     """A prism over a star-shaped outline, with one piece for each convex sector.
 
     Args:
-      outline: (V, 2) corners, counterclockwise around the origin, from which all of its border is seen, m.
+      outline: (V, 2) corners, counterclockwise around the origin, which sees the whole border, m.
       low: height of the bottom, m.
       high: height of the top, m.
       taper: factor on the outline at the top.
-      part: of the pieces.
+      part: part of the pieces.
     """
     most = MAX_MESH_VERTICES // 2 - 1
     count = len(outline)
     convex = _turns_left(np.roll(outline, 1, 0), outline, np.roll(outline, -1, 0))
     if convex.all() and count <= most:
         return [_prism(outline, low, high, taper, part)]
-    # Sectors begin at a reflex corner, where there is one.
+    # Sectors begin at a reflex corner if there is one.
     outline, convex = (np.roll(values, -int(convex.argmin()), 0) for values in (outline, convex))
     closed, first, pieces = np.concatenate([outline, outline[:1]]), 0, []
     while first < count:
@@ -133,9 +133,9 @@ def sweep(
       normal: (3,) unit normal of the plane.
       width: across the path in its plane, m; one, or (n,).
       thickness: along the normal, m; one, or (n,).
-      rounded: the cross-section is an octagon, not a rectangle.
-      closed: the last centre is joined to the first.
-      part: of the pieces.
+      rounded: True for octagonal cross-sections, False for rectangular ones.
+      closed: joins the last centre to the first.
+      part: part of the pieces.
     """
     count, up = len(path), np.array(normal, float)
     ways = np.roll(path, -1, 0) - path
@@ -147,7 +147,7 @@ def sweep(
         before = np.concatenate([ways[:1], ways[:-1]])
     side = np.cross(up, before + ways)
     side /= np.linalg.norm(side, axis=-1, keepdims=True)
-    side /= (side * np.cross(up, ways)).sum(-1, keepdims=True)  # a mitre is longer than the bar is wide
+    side /= (side * np.cross(up, ways)).sum(-1, keepdims=True)  # a mitre is longer than the bar's width
     turns = np.pi / 4 * np.arange(8) + np.pi / 8 if rounded else np.pi / 2 * np.arange(4) + np.pi / 4
     corners = np.stack([np.cos(turns), np.sin(turns)], -1) / np.cos(turns[0])
     across = np.broadcast_to(width, count)[:, None] / 2 * side
@@ -169,24 +169,24 @@ def slab(half: Sequence[float], corner: float, center: Sequence[float] = (0, 0, 
 
 
 def moved(piece: Piece, shift: Sequence[float]) -> Piece:
-    """The piece, moved by (3,) metres."""
+    """Returns the piece translated by (3,) metres."""
     x, y, z = np.add(piece.pos, shift)
     return dataclasses.replace(piece, pos=(x, y, z))
 
 
 def ring(radius: float, z: float, sides: int = _SIDES, squash: float = 1.0) -> np.ndarray:
-    """(sides, 3) corners of a polygon around z."""
+    """Corners (sides, 3) of a polygon around z."""
     return np.array([_around(radius, turn, z, squash) for turn in 2 * np.pi / sides * np.arange(sides)])
 
 
 def arc(start: float, end: float, count: int, radii: tuple[float, float], center: Sequence[float]) -> np.ndarray:
-    """(count, 3) points on an ellipse in the x-z plane between two angles, rad, with radii along x and z."""
+    """Points (count, 3) on an ellipse in the x-z plane between two angles, rad, with radii along x and z."""
     turns = np.linspace(start, end, count)
     return np.array(center) + np.stack([radii[0] * np.cos(turns), 0 * turns, radii[1] * np.sin(turns)], -1)
 
 
 def smooth(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
-    """(count,) values of a random smooth curve, which reaches both of its bounds."""
+    """Values (count,) of a random smooth curve that reaches both bounds."""
     at = np.linspace(0, 1, count)[:, None]
     waves = rng.normal(size=3) / np.array([1.0, 1.5, 2.5])
     values = (waves * np.cos(np.pi * np.array([1, 2, 3]) * at + rng.uniform(0, 2 * np.pi, 3))).sum(-1)
@@ -199,7 +199,7 @@ def _around(radius: float, turn: float, z: float, squash: float) -> tuple[float,
 
 
 def _bulges(profile: Sequence[tuple[float, float]]) -> bool:
-    """Whether a profile of (height, radius) is convex: nowhere below the chords between its points."""
+    """True if a profile of (height, radius) is convex: nowhere below the chords between its points."""
     z, radius = np.array(profile).T
     return all(
         radius[j] > np.interp(z[j], z[[i, k]], radius[[i, k]]) - _FLAT
@@ -208,13 +208,13 @@ def _bulges(profile: Sequence[tuple[float, float]]) -> bool:
 
 
 def _turns_left(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """(...,) bool: the way over points (..., 2) bends to the left, or not at all."""
+    """(...,) bool: True where the path over points (..., 2) turns left or is straight."""
     first, second = b - a, c - b
     return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0] > -1e-12
 
 
 def _sector(corners: np.ndarray) -> bool:
-    """Whether the origin and corners (n, 2) around it make a convex polygon."""
+    """True if the origin and corners (n, 2) around it make a convex polygon."""
     loop = np.concatenate([np.zeros((1, 2)), corners])
     return bool(_turns_left(np.roll(loop, 1, 0), loop, np.roll(loop, -1, 0)).all())
 

@@ -1,4 +1,4 @@
-"""Kinds of shape that scans have and other families lack: wire frames, large hollow bodies, wide boxes, thin boards."""
+"""Shapes found in scans that other families lack: wire frames, large hollow bodies, wide boxes, thin boards."""
 
 import functools
 
@@ -42,7 +42,7 @@ def bucket(rng: Rng) -> Draft:
 
 @_family
 def crate(rng: Rng) -> Draft:
-    """A box of which two sides are nearly as long as a hand opens wide."""
+    """A box with two sides nearly as long as a hand's opening."""
     half = rng.uniform(0.042, 0.058), rng.uniform(0.042, 0.058), rng.uniform(0.03, 0.1)
     return Draft((draft.box(tuple(rng.permutation(half))),), density=(80.0, 400.0))
 

@@ -26,7 +26,7 @@ def lathed(rng: Rng) -> Draft:
 
 @_family
 def extruded(rng: Rng) -> Draft:
-    """A random outline, convex or not, with a height, and a taper on some."""
+    """An extruded random outline, convex or not, some with a taper."""
     count = rng.integers(5, 13)
     turns = 2 * np.pi / count * (np.arange(count) + rng.uniform(-0.3, 0.3, count))
     radii = rng.uniform(0.02, 0.045) * (1 + rng.uniform(0, 0.8) * rng.uniform(-0.7, 1, count))
@@ -75,7 +75,7 @@ def banana(rng: Rng) -> Draft:
 
 @_family
 def blob(rng: Rng) -> Draft:
-    """A potato, a stone, or two of them grown together."""
+    """A potato, a stone, or two of them merged."""
     radii = rng.uniform(0.02, 0.04), rng.uniform(0.025, 0.045), rng.uniform(0.028, 0.06)
     pieces = [_blob(rng, radii, (0, 0, 0))]
     if rng.random() < 0.4:
@@ -188,7 +188,7 @@ def figure(rng: Rng) -> Draft:
 
 @_family
 def cluster(rng: Rng) -> Draft:
-    """Four to eight random pieces, each grown out of an earlier one."""
+    """Four to eight random pieces, each attached to an earlier one."""
     centers, radii, pieces = (
         [np.zeros(3)],
         [rng.uniform(0.02, 0.034)],
@@ -205,7 +205,7 @@ def cluster(rng: Rng) -> Draft:
 
 
 def _chunk(rng: Rng, radius: float, center: np.ndarray, part: int = 0) -> Piece:
-    """A random convex piece of about this radius: a block, a prism or a stone, turned at random."""
+    """A random convex piece of about this radius: a block, a prism or a stone, with a random orientation."""
     stretch = rng.uniform(0.7, 1.5, 3)
     if rng.random() < 0.4:
         return _blob(rng, tuple(radius * stretch), tuple(center), part)

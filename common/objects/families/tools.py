@@ -1,4 +1,4 @@
-"""Household tools: things with a handle, with which something is done."""
+"""Household tools with handles."""
 
 import functools
 
@@ -15,7 +15,7 @@ _family = functools.partial(draft.enter, BUILDERS)
 
 @_family
 def drill(rng: Rng) -> Draft:
-    """A pistol grip under a motor with a chuck, and a battery on some: drills, glue guns, hair dryers."""
+    """A pistol grip under a motor with a chuck, some with a battery: drills, glue guns, hair dryers."""
     radius, length = rng.uniform(0.018, 0.032), rng.uniform(0.07, 0.12)
     grip, lean = rng.uniform(0.075, 0.11), rng.uniform(0.05, 0.35)
     w, d = rng.uniform(0.012, 0.017), rng.uniform(0.015, 0.022)
@@ -61,7 +61,7 @@ def cutlery(rng: Rng) -> Draft:
     handle = sweep(path, (0, 1, 0), thick, rng.uniform(0.012, 0.02) * np.array([1.0, 0.9, 0.75, 0.6, 0.5]))
     kind, head = rng.integers(3), rng.uniform(0.05, 0.07)
     wide = rng.uniform(0.02, 0.028)
-    if kind == 0:  # a knife's blade stands on its edge
+    if kind == 0:  # a knife's blade is upright
         end = [(length + head, 0, z) for z in (-0.1 * wide, 0.3 * wide)]
         top = [
             hull(
@@ -127,7 +127,7 @@ def wrench(rng: Rng) -> Draft:
 
 @_family
 def clothes_iron(rng: Rng) -> Draft:
-    """A wedge with a bow of a handle on it."""
+    """A wedge with a bow-shaped handle on top."""
     length, wide, high = rng.uniform(0.11, 0.18), rng.uniform(0.035, 0.05), rng.uniform(0.025, 0.045)
     sole = (
         [(-length / 2, y * wide, 0) for y in (-1, 1)]
@@ -153,7 +153,7 @@ def headset(rng: Rng) -> Draft:
 
 @_family
 def pen(rng: Rng) -> Draft:
-    """A marker, a candle or a stick: a thin rod, with a cap on some."""
+    """A marker, a candle or a stick: a thin rod, some with a cap."""
     radius, half = rng.uniform(0.0055, 0.012), rng.uniform(0.05, 0.1)
     rod = draft.cylinder((-half, 0, 0), (half, 0, 0), radius)
     if rng.random() < 0.5:
@@ -165,7 +165,7 @@ def pen(rng: Rng) -> Draft:
 
 
 def _along_x(piece: Piece, shift: float) -> Piece:
-    """A mesh piece around z, turned around x and moved along it."""
+    """Returns a mesh piece along z, rotated to x and moved along it."""
     assert piece.vertices is not None
     turn = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], float)
     return hull((piece.vertices + piece.pos) @ turn.T + [shift, 0, 0], part=piece.part)

@@ -1,4 +1,4 @@
-"""Household vessels: hollow ones of a floor and a wall of segments, closed ones of solid pieces."""
+"""Household vessels: hollow ones with a floor and wall segments, closed ones of solid pieces."""
 
 import functools
 import itertools
@@ -13,14 +13,14 @@ from congrasp.common.objects.spec import Piece
 BUILDERS: dict[str, Builder] = {}
 _family = functools.partial(draft.enter, BUILDERS)
 _CERAMIC, _METAL, _PLASTIC = (900.0, 1800.0), (800.0, 2200.0), (300.0, 900.0)
-"""Densities of walls, which are thicker here than those of real vessels."""
+"""Densities of walls, which are thicker than those of real vessels."""
 _FILLED = (250.0, 1000.0)
-_FLAT_SIDE = np.cos(np.pi / 16)  # of a polygon of 16 corners
+_FLAT_SIDE = np.cos(np.pi / 16)  # side of a polygon of 16 corners
 
 
 @_family
 def dish(rng: Rng) -> Draft:
-    """A bowl with a curved wall, of up to 17 cm."""
+    """A bowl with a curved wall, up to 17 cm wide."""
     top, height, wall = rng.uniform(0.05, 0.085), rng.uniform(0.035, 0.08), rng.uniform(0.004, 0.007)
     bottom, bend = top * rng.uniform(0.4, 0.65), rng.uniform(0.45, 0.9)
     middle = bottom + (top - bottom) * 0.45**bend
@@ -38,7 +38,7 @@ def plate(rng: Rng) -> Draft:
 
 @_family
 def hollow_mug(rng: Rng) -> Draft:
-    """A mug that can be drunk from, with a handle of three rods or a bow of four pieces."""
+    """A hollow mug with a handle of three rods or a bow of four pieces."""
     radius, height, wall = rng.uniform(0.032, 0.048), rng.uniform(0.07, 0.115), rng.uniform(0.004, 0.006)
     body = vessel([(0, radius * rng.uniform(0.75, 1.0)), (height, radius)], wall, 7)
     return Draft(
@@ -52,7 +52,7 @@ def hollow_mug(rng: Rng) -> Draft:
 
 @_family
 def pitcher(rng: Rng) -> Draft:
-    """A tall jug with a handle, and a spout on some."""
+    """A tall jug with a handle, some with a spout."""
     radius, height, wall = rng.uniform(0.04, 0.06), rng.uniform(0.13, 0.235), rng.uniform(0.004, 0.006)
     top = radius * rng.uniform(0.8, 1.1)
     body = vessel([(0, radius), (height, top)], wall, 7)
@@ -81,7 +81,7 @@ def skillet(rng: Rng) -> Draft:
 
 @_family
 def pot(rng: Rng) -> Draft:
-    """A saucepan with two ears or one long handle, and a lid with a knob on some."""
+    """A saucepan with two ears or one long handle, some with a lid and a knob."""
     radius, height, wall = rng.uniform(0.045, 0.085), rng.uniform(0.05, 0.11), rng.uniform(0.004, 0.006)
     pieces = vessel([(0, radius), (height, radius)], wall, 9)
     if rng.random() < 0.5:
@@ -130,7 +130,7 @@ def tray(rng: Rng) -> Draft:
     levels = ((0.0, 0.0), (height, lean))
 
     def corners(inset: float, levels: tuple[tuple[float, float], ...] = levels) -> np.ndarray:
-        """(2, 4, 3) corners of the walls' outside, or of their inside."""
+        """Corners (2, 4, 3) of the outside of the walls, or of their inside."""
         signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
         return np.array([[(s * (x + o - inset), t * (y + o - inset), z) for s, t in signs] for z, o in levels])
 
@@ -144,7 +144,7 @@ def tray(rng: Rng) -> Draft:
 
 @_family
 def roll(rng: Rng) -> Draft:
-    """A thick ring, as of tape or paper."""
+    """A thick ring, like a roll of tape or paper."""
     inner = rng.uniform(0.012, 0.035)
     outer, half = inner + rng.uniform(0.008, 0.03), rng.uniform(0.01, 0.055)
     return Draft(tuple(shell([(-half, outer, inner), (half, outer, inner)], 8)), density=(150.0, 900.0))
@@ -200,7 +200,7 @@ def spray_bottle(rng: Rng) -> Draft:
 
 
 def _bow(rng: Rng, radius: float, middle: float, half: float, thick: float) -> list[Piece]:
-    """A handle beside a wall of this radius, from half a length below the middle to half above, as part 1."""
+    """A handle next to a wall of this radius, from a half length below the middle to one above, as part 1."""
     reach = rng.uniform(0.025, 0.035) + 1.5 * thick
     root = radius * rng.uniform(0.9, 0.94)
     if rng.random() < 0.5:

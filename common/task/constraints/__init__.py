@@ -1,4 +1,4 @@
-"""The constraints, weakest first: an order on which layouts, masks, tables and the priority rules rest."""
+"""The constraints, weakest first; layouts, masks, tables and the priority rules use this order."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -24,14 +24,14 @@ CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajecto
 PAPER = ("heading", "affordance", "pose", "trajectory")
 """Names of the paper's constraints."""
 OURS = (*PAPER, "fingers", "force")
-"""Names of those that a policy knows unless its task says otherwise."""
+"""Names of the constraints that a policy supports by default."""
 
 
 def get_constraint(name: str) -> Constraint:
-    """A constraint by its name.
+    """Returns a constraint by its name.
 
     Raises:
-      UnknownConstraintError: there is none.
+      UnknownConstraintError: there is no such constraint.
     """
     for constraint in CONSTRAINTS:
         if constraint.name == name:
@@ -40,20 +40,20 @@ def get_constraint(name: str) -> Constraint:
 
 
 def known(task: "TaskConfig") -> tuple[Constraint, ...]:
-    """The constraints that the task's policy knows, weakest first.
+    """Returns the constraints supported by the task's policy, weakest first.
 
     Raises:
-      CongraspError: the task names one that is not there, or leaves out the heading.
+      CongraspError: the task names an unknown one, or omits the heading.
     """
     for name in task.constraints:
         get_constraint(name)
     if "heading" not in task.constraints:
-        raise CongraspError("The heading is always active.", "Name it among the task's constraints.")
+        raise CongraspError("The heading is always active.", "Add it to the task's constraints.")
     return tuple(constraint for constraint in CONSTRAINTS if constraint.name in task.constraints)
 
 
 def optional(task: "TaskConfig") -> tuple[Constraint, ...]:
-    """Those of them that an episode can be without."""
+    """Supported constraints that may be inactive in an episode."""
     return tuple(constraint for constraint in known(task) if constraint.optional)
 
 
@@ -68,7 +68,7 @@ def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
 
 
 def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
-    """The goal arrays of a request, without batch axis, before the priority rules; neutral where it names none."""
+    """Goal arrays of a request, without batch axis, before the priority rules; neutral where the request has none."""
     values = {}
     for constraint in known(task):
         given = request.constraints.get(constraint.name, {})
@@ -80,13 +80,13 @@ def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
 
 
 def require_known(names: Iterable[str], task: "TaskConfig") -> None:
-    """Raises `UnknownConstraintError` if somebody asks for a constraint that the task's policy does not know."""
+    """Raises an `UnknownConstraintError` if a requested constraint is not supported by the task's policy."""
     for name in names:
         get_constraint(name)
         if name not in task.constraints:
             raise UnknownConstraintError(
-                f"The policy does not know the constraint '{name}'.",
-                f"It knows {', '.join(task.constraints)}; train one with --task.constraints … {name}.",
+                f"The policy does not support the constraint '{name}'.",
+                f"It supports {', '.join(task.constraints)}; train one with --task.constraints … {name}.",
             )
 
 

@@ -1,4 +1,4 @@
-"""Affordance: which region of the object may be grasped (O+ in the paper), and which must be avoided (O-)."""
+"""Affordance: the region of the object that may be grasped (O+ in the paper), and the one to avoid (O-)."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -32,36 +32,36 @@ if TYPE_CHECKING:
     from congrasp.common.task.sampling.bank import Draw
 
 REACH = 0.15
-"""Metres of approach before the heading position that are searched for the avoid region."""
+"""Length of the approach before the heading position that is checked against the avoid region, m."""
 MARGIN = 0.01
-"""m, metres the fingers should keep from the avoid region."""
+"""Distance m that the fingers should keep from the avoid region, m."""
 SHARPNESS = 0.002
-"""tau, metres."""
+"""tau, m."""
 _NEAR = 0.004
-"""Metres from a part within which a surface point belongs to it."""
+"""Distance from a part within which a surface point belongs to it, m."""
 _CANDIDATES = 24
 """Graspable surface points to which a heading may be redirected."""
 _AS_A_RADIAN = 0.1
-"""Metres between two heading positions that count as much as a turn by 1 rad."""
+"""Distance between two heading positions that counts as much as a rotation by 1 rad, m."""
 _WORST = 100.0
-"""More than any change of a heading counts."""
+"""Greater than the cost of any change of a heading."""
 _TUBE, _BREADTH, _BEYOND = 0.01, 0.03, 0.01
-"""Metres, those of `common.task.sampling.headings`: of the approach, and of the slab in which the width is measured."""
+"""Lengths of `common.task.sampling.headings` in m: of the approach, and of the slab in which the width is measured."""
 
 
 class AffordanceGoal(NamedTuple):
-    """Nothing of its own: the regions are the labels of the surface points (`common.task.types.Surface`)."""
+    """Empty: the regions are the labels of the surface points (`common.task.types.Surface`)."""
 
 
 class AffordanceFeatures(NamedTuple):
     """Geometry between the hand and the avoid region, in the wrist frame."""
 
     nearest: Array
-    """(B, P, 3) d-: from each keypoint to the nearest point of the avoid region; zero where the object has none."""
+    """(B, P, 3) d-: from each keypoint to the nearest point of the avoid region; zero if the object has none."""
     distance: Array
-    """(B,) least distance from the fingers' skin to it, m; `FAR` where the object has none."""
+    """(B,) least distance from the fingers' skin to the avoid region, m; `FAR` if the object has none."""
     touching: Array
-    """(B, L) bool: the link touches it."""
+    """(B, L) bool: the link touches the avoid region."""
     touching_graspable: Array
     """(B, L) bool: the link touches the graspable region."""
     force: Array
@@ -75,58 +75,56 @@ class Affordance(Constraint):
     blocks = ("affordance",)
     region = 1
     weights = (
-        Weight(
-            "affordance_distance", 0.05, "w_d: for each unit of softplus((m - d)/tau) near the non-grasping region."
-        ),
+        Weight("affordance_distance", 0.05, "w_d: for each unit of softplus((m - d)/tau) near the avoid region."),
         Weight(
             "affordance_force",
             0.1,
-            "w_f of the affordance term: per newton on the non-grasping region (clipped at 10 N per link).",
+            "w_f of the affordance term: per newton on the avoid region (clipped at 10 N per link).",
         ),
     )
     errors = (ErrorSpec("affordance_ratio", "", "hold", 0.0, 0.05, "share of touching links on the avoid region"),)
     options = (
         Option(
             "affordance",
-            "What to grasp: a mesh of that part in the coordinates of the object's file, or names of its parts.",
+            "Part to grasp: a mesh of it in the coordinates of the object's file, or names of its parts.",
             "part",
         ),
-        Option("avoid", "What not to touch, likewise.", "part"),
+        Option("avoid", "Part not to touch: a mesh or names of parts, likewise.", "part"),
     )
 
-    needs = ("surface_minus",)
-    invalid = ("An affordance needs surface points on both sides.", "Set some of 'surface_minus'.")
+    needs = ("surface_avoid",)
+    invalid = ("An affordance needs surface points on both sides.", "Set some of 'surface_avoid'.")
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
         """Nearest-point vectors and forces."""
         vectors, forces = 3 * len(hand.keypoints), 3 * len(hand.links)
         block = (
             ObservationField(
-                "nearest_minus", vectors, "m, from each keypoint to the nearest point that must not be touched"
+                "nearest_minus", vectors, "m, from each keypoint to the nearest point of the avoid region"
             ),
-            ObservationField("force_minus", forces, "as force, of contacts that must not be", privileged=True),
+            ObservationField("force_minus", forces, "as force, of contacts on the avoid region", privileged=True),
         )
         return (block,)
 
     def available(self, draw: "Draw") -> Array:
-        """Where the object has both regions, and its graspable one can be approached in the resting pose."""
+        """True where the object has both regions, and its graspable one can be approached in the resting pose."""
         return draw.bank.has_affordance[draw.objects, draw.rests]
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> AffordanceGoal:
-        """The object's own regions."""
+        """Regions of the object."""
         return AffordanceGoal()
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
-        """Redirects a heading that comes nearer to the avoid region than to the graspable one.
+        """Redirects a heading that passes nearer to the avoid region than to the graspable one.
 
-        It goes to a graspable surface point instead, by the least change that keeps the rules of heading sets, see
-        `redirected`. The hand turns with it by the least rotation.
+        The new heading ends at a graspable surface point and is the smallest change that satisfies the rules of heading
+        sets, see `redirected`. The cross-finger direction follows by the smallest rotation.
         """
         turned = asked["affordance"] & _contradicts_heading(_apart_from_heading(hand, surface, goal))
         return goal.where(turned, "heading", **redirected(hand, surface, goal["heading"])._asdict())
 
     def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> AffordanceFeatures:
-        """Distances, contacts and forces by region: each contact has the label of the nearest surface point."""
+        """Distances, contacts and forces by region; the label of a contact is that of the nearest surface point."""
         surface = contacts.surface
         index = nearest_index(jnp.where(surface.avoid[..., None], contacts.squared, jnp.inf))
         avoided = jnp.take_along_axis(surface.avoid, flat(contacts.nearest), -1).reshape(contacts.nearest.shape)
@@ -143,12 +141,12 @@ class Affordance(Constraint):
         )
 
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
-        """Nearest-point vectors to the avoid region, and squashed forces from it."""
+        """Nearest-point vectors to the avoid region, and squashed forces on it."""
         own = scene.features.of["affordance"]
         return ([flat(own.nearest), flat(squash(own.force))],)
 
     def earning(self, scene: Scene, touching: Array, force: Array) -> tuple[Array, Array]:
-        """Only contacts on the graspable region: a link that presses on the other must not be paid for it."""
+        """Contacts on the graspable region only: a link that presses on the avoid region earns nothing."""
         active, own = scene.goal.active["affordance"][:, None], scene.features.of["affordance"]
         return (
             jnp.where(active, touching & own.touching_graspable, touching),
@@ -156,7 +154,7 @@ class Affordance(Constraint):
         )
 
     def reward(self, scene: Scene) -> dict[str, Array]:
-        """r^aff."""
+        """Reward term r^aff."""
         own, active = scene.features.of["affordance"], scene.gate("affordance")
         pressed = jnp.sum(jnp.minimum(jnp.linalg.norm(own.force, axis=-1), 10.0), -1)
         return {
@@ -165,68 +163,74 @@ class Affordance(Constraint):
         }
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
-        """Links that touch the avoid region, among all that touch (a link on both counts once)."""
+        """Links that touch the avoid region, as a share of all touching links (a link on both counts once)."""
         return {"affordance_ratio": share(scene.features.of["affordance"].touching, scene.features.touching)}
 
     def valid(self, surface: Surface, own: AffordanceGoal) -> Array:
-        """Both regions have points."""
+        """True if both regions have points."""
         return jnp.any(surface.avoid, -1) & ~jnp.all(surface.avoid, -1)
 
     def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
-        """No arrays: what it asks for is the avoid region."""
+        """Returns no arrays: an affordance consists of its avoid region."""
         return {} if given["affordance"] or given["avoid"] else None
 
     def avoid_region(self, given: Mapping[str, Any], obj: GraspObject) -> np.ndarray | None:
-        """What is avoided, or is not to be grasped; what is named on both sides belongs to the nearer one."""
+        """Region of --avoid, or the complement of that of --affordance; points of both belong to the nearer part."""
         grasped, avoided = given["affordance"], given["avoid"]
         if grasped and avoided:
             region = avoided.distance < grasped.distance
+            if not (grasped.distance < avoided.distance).any():
+                raise CongraspError(
+                    f"--affordance '{grasped.text}' and --avoid '{avoided.text}' contradict each other: all that "
+                    f"may be grasped of '{obj.name}' must not be touched.",
+                    "Leave one of them out, or name different parts.",
+                )
         elif avoided:
             region = avoided.distance < _NEAR
         else:
             region = grasped.distance >= _NEAR
         if region.all() and not grasped:
             raise CongraspError(
-                f"'{avoided.text}' is all of '{obj.name}', so that nothing may be touched.", "Avoid a part of it."
+                f"'{avoided.text}' covers all of '{obj.name}', so nothing may be touched.", "Avoid a part of it."
             )
         if region.all():
             raise CongraspError(
                 f"Nothing of '{grasped.text}' lies on the surface of '{obj.name}'.",
-                "The part must be in the coordinates of the object's file; name it with --affordance.",
+                "The part must be in the coordinates of the object's file. Pass it with --affordance.",
             )
         if not region.any():
             named = (grasped or avoided).text
-            raise CongraspError(f"'{named}' leaves no difference: all of '{obj.name}' may be touched.")
+            raise CongraspError(f"'{named}' excludes nothing: all of '{obj.name}' may be touched.")
         return np.asarray(region)
 
     def markers(self, own: AffordanceGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
-        """The avoid region."""
+        """Marker of the avoid region."""
         return (Paint(),)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """It keeps the fingers off its region unless a reference pose names its own contacts."""
+        """Effect of the affordance: it protects its avoid region unless a reference pose defines the contacts."""
         if overridden:
-            return ["The affordance is overridden by the reference pose, which names its own contacts."]
-        turned = "The heading came nearer to the avoid region and was redirected to the graspable region."
+            return ["The affordance is overridden by the reference pose, which defines the contacts."]
+        turned = "The heading passed nearer to the avoid region and was redirected to the graspable region."
         return ["The affordance keeps the fingers off the avoid region.", *([turned] if redirected else [])]
 
 
 def redirected(hand: Hand, surface: Surface, heading: HeadingGoal) -> HeadingGoal:
-    """Headings (B, ...) that lead to graspable surface points.
+    """Redirects headings (B, ...) to graspable surface points.
 
-    The candidates are surface points of the graspable region, each approached along the heading's own direction and
-    along that from the heading's start. The heading's position is 2 cm behind the point, times the hand's factor on
-    objects. The candidate that breaks the fewest rules of `common.task.sampling.headings` is taken, of several the one
-    that changes the heading least: a turn by 1 rad counts as much as 10 cm between the positions. Rules:
+    The candidates are surface points of the graspable region, each approached along the heading's direction and along
+    the direction from the heading's start. The heading's position is 2 cm behind the point, times the hand's factor on
+    objects. The result is the candidate that violates the fewest rules of `common.task.sampling.headings`, and among
+    equals the one with the smallest change: a rotation by 1 rad counts as much as 10 cm between the positions. Rules:
 
-    * Nothing stands before the point, within 1 cm of the approach.
+    * No obstacle is in front of the point within 1 cm of the approach.
     * The approach stays 1 cm away from the avoid region, and ends nearer to the graspable one.
     * The object is no wider than 12 cm, times the same factor, along the cross-finger direction where fingers close.
 
     Args:
       hand: the hand.
       surface: labelled surface points.
-      heading: to change.
+      heading: headings to redirect.
     """
     chosen = _spread(~surface.avoid)
     targets = jnp.take_along_axis(surface.points, chosen[..., None], 1)
@@ -246,14 +250,14 @@ def redirected(hand: Hand, surface: Surface, heading: HeadingGoal) -> HeadingGoa
 
 
 def _spread(which: Array) -> Array:
-    """(B, n) indices of up to `_CANDIDATES` true flags (B, N), evenly spread over them."""
+    """Indices (B, n) of up to `_CANDIDATES` true flags (B, N), evenly spread over them."""
     count = jnp.cumsum(which, -1)
     rank = jnp.arange(_CANDIDATES) * count[:, -1:] // _CANDIDATES
     return jnp.argmax(count[:, None] > rank[..., None], -1)
 
 
 def _broken(hand: Hand, surface: Surface, headings: HeadingGoal) -> Array:
-    """(B, n) number of rules that headings (B, n, 3) break, see `redirected`."""
+    """Number (B, n) of rules that headings (B, n, 3) violate, see `redirected`."""
     offset = surface.points[:, None] - headings.position[:, :, None]
     depth = jnp.sum(offset * headings.direction[:, :, None], -1)
     along = jnp.sum(offset * headings.cross[:, :, None], -1)
@@ -272,7 +276,7 @@ def _broken(hand: Hand, surface: Surface, headings: HeadingGoal) -> Array:
 
 
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
-    """Metres from the approach to either region."""
+    """Distances in m from the approach to either region."""
     heading = goal["heading"]
     start = heading.position - REACH * heading.direction
     return {
@@ -282,15 +286,15 @@ def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, A
 
 
 def _contradicts_heading(apart: Mapping[str, Array]) -> Array:
-    """(B,) bool: the approach comes nearer to the avoid region."""
+    """(B,) bool: the approach passes nearer to the avoid region."""
     return apart["avoid"] < apart["graspable"]
 
 
 def _heading_message(hand: Hand, apart: Mapping[str, Any]) -> str:
     return (
-        f"The approach passes {100 * apart['avoid']:.1f} cm from what must not be touched, and "
-        f"{100 * apart['graspable']:.1f} cm from what may be grasped. The affordance redirects the heading to the "
-        "graspable part."
+        f"The approach passes {100 * apart['avoid']:.1f} cm from the avoid region, and "
+        f"{100 * apart['graspable']:.1f} cm from the graspable region. The affordance redirects the heading to "
+        "the graspable region."
     )
 
 

@@ -1,4 +1,4 @@
-"""Fingers: which of them may touch the object (ours). Thumb and index make a pinch, with the middle one a tripod."""
+"""Fingers that may touch the object (ours). Thumb and index finger form a pinch, adding the middle finger a tripod."""
 
 import functools
 from collections.abc import Collection, Mapping, Sequence
@@ -28,24 +28,24 @@ if TYPE_CHECKING:
     from congrasp.common.task.sampling.bank import Draw
 
 MARGIN, SHARPNESS = 0.01, 0.003
-"""Metres that the skin of the other fingers should keep from the object, and how sharply that is felt."""
+"""Distance that the skin of the other fingers should keep from the object, and sharpness of the barrier, m."""
 
 
 _FAVOURED = 0.5
-"""Probability that an episode draws pinch, tripod or all fingers; else every set is as likely as another."""
+"""Probability that an episode draws pinch, tripod or all fingers; otherwise all sets are equally likely."""
 _NEEDED = "The constraint 'fingers' needs the thumb and another finger."
 
 
 class FingersGoal(NamedTuple):
-    """Fingers by the order of `Hand.fingers`, thumb first."""
+    """Fingers in the order of `Hand.fingers`, thumb first."""
 
     allowed: Annotated[Array, GoalArray(("G",), "fingers that may touch the object", "flag")]
 
 
 class Fingers(Constraint):
-    """The thumb and one or more of the other fingers; the palm belongs to all sets.
+    """The thumb and one or more of the other fingers; the palm belongs to every set.
 
-    The hand centre and the keypoints that are drawn to the object are those of the set alone.
+    The hand centre and the keypoints of the distance reward are those of the set only.
     """
 
     name, title, goal = "fingers", "fingers", FingersGoal
@@ -63,7 +63,7 @@ class Fingers(Constraint):
     invalid = (_NEEDED, "Allow both.")
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
-        """The set, the room of each other finger, and the forces of their links."""
+        """Fields for the set, the clearance of each other finger, and the forces on their links."""
         fingers, links = len(hand.fingers), len(hand.links)
         block = (
             ObservationField("fingers_allowed", fingers, "1 for each finger that may touch the object, thumb first"),
@@ -73,7 +73,7 @@ class Fingers(Constraint):
         return (block,)
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> FingersGoal:
-        """Any set with the thumb; pinch, tripod and all fingers more often than others."""
+        """Samples any set with the thumb; pinch, tripod and all fingers are more likely than others."""
         sets, shares = finger_sets(hand)
         return FingersGoal(jnp.array(sets)[jax.random.choice(key, len(sets), draw.objects.shape, p=jnp.array(shares))])
 
@@ -82,18 +82,18 @@ class Fingers(Constraint):
         return {"allowed": np.arange(len(hand.fingers)) < 2}
 
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
-        """The set, the clipped distance of each finger that is not in it, and squashed forces on their links."""
+        """The set, the clipped distance of each finger outside it, and squashed forces on those fingers' links."""
         allowed, other = scene.goal["fingers"].allowed, self.forbidden(scene)
         room = jnp.where(allowed, 0.0, jnp.minimum(_room(scene), 0.1))
         return ([allowed.astype(jnp.float32), room, flat(squash(scene.features.force * other[..., None]))],)
 
     def forbidden(self, scene: Scene) -> Array:
-        """Links of fingers that are not in the set; their contacts earn nothing."""
+        """Links of fingers outside the set; their contacts earn nothing."""
         owner = scene.hand.link_fingers
         return ~scene.goal["fingers"].allowed[:, owner] & (owner >= 0)
 
     def reward(self, scene: Scene) -> dict[str, Array]:
-        """A barrier around the object for the other fingers, and a price for their contacts."""
+        """Terms for a barrier around the object for the other fingers, and for their contacts."""
         active = scene.gate("fingers")
         near = jnp.where(scene.goal["fingers"].allowed, 0.0, jax.nn.softplus((MARGIN - _room(scene)) / SHARPNESS))
         return {
@@ -102,27 +102,27 @@ class Fingers(Constraint):
         }
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
-        """Touching links that belong to other fingers, among all that touch."""
+        """Touching links of other fingers, as a share of all touching links."""
         touching = scene.features.touching
         return {"fingers_ratio": share(touching & self.forbidden(scene), touching)}
 
     def valid(self, surface: Surface, own: FingersGoal) -> Array:
-        """The thumb and another finger."""
+        """True for the thumb with another finger."""
         return own.allowed[:, 0] & jnp.any(own.allowed[:, 1:], -1)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """It keeps the others away, unless a reference pose names its own contacts."""
+        """Effect of the choice: it keeps the other fingers away, unless a reference pose defines the contacts."""
         if overridden:
-            return ["The choice of fingers is overridden by the reference pose, which names its own contacts."]
+            return ["The choice of fingers is overridden by the reference pose, which defines the contacts."]
         return ["Only the named fingers may touch the object."]
 
     def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
-        """Names of fingers."""
+        """Parses names of fingers."""
         if not given["fingers"]:
             return None
         allowed = self.named_flags("fingers", given["fingers"], hand.fingers, f"the hand '{hand.name}' has no finger")
         if allowed.sum() < 2:
-            raise CongraspError("--fingers names one finger, which cannot hold an object.", "Name two or more.")
+            raise CongraspError("--fingers names only one finger, which cannot hold an object.", "Name two or more.")
         if not allowed[0]:
             thumb = hand.fingers[0]
             raise CongraspError(f"--fingers lacks the {thumb}, which every grasp needs.", f"Add {thumb}.")
@@ -131,7 +131,7 @@ class Fingers(Constraint):
 
 @functools.cache
 def finger_sets(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
-    """All sets (S, G) bool of the thumb with one or more of the other fingers, and the probability (S,) of each."""
+    """All sets (S, G) bool of the thumb with one or more of the other fingers, and their probabilities (S,)."""
     count = len(hand.fingers) - 1
     others = (np.arange(1, 2**count)[:, None] >> np.arange(count)) & 1 == 1
     favoured = np.isin(np.arange(1, 2**count), (0b1, 0b11 & (2**count - 1), 2**count - 1))
@@ -140,11 +140,11 @@ def finger_sets(hand: Hand) -> tuple[np.ndarray, np.ndarray]:
 
 
 def chosen_fingers(known: Collection[str], goal: Goal) -> Array | None:
-    """(B, G) bool: fingers that count for the hand centre, all of them where no set is active; None for all always.
+    """(B, G) bool: fingers that define the hand centre, all where no set is active; None without the constraint.
 
     Args:
-      known: names of the constraints that the task knows or a request may have.
-      goal: after the priority rules.
+      known: names of the constraints supported by the task or the request.
+      goal: goal after the priority rules.
     """
     if "fingers" not in known:
         return None
@@ -154,7 +154,7 @@ def chosen_fingers(known: Collection[str], goal: Goal) -> Array | None:
 def keypoint_weights(hand: Hand, chosen: Array | None) -> Array:
     """Weights (P,) or (B, P) of the keypoints in the distance reward, for fingers of `chosen_fingers`.
 
-    Keypoints of other fingers do not count; those of the set and the palm share the whole weight.
+    Keypoints of other fingers get no weight; those of the set and the palm share it.
     """
     weights = jnp.array(hand.keypoint_weights)
     if chosen is None:
@@ -165,7 +165,7 @@ def keypoint_weights(hand: Hand, chosen: Array | None) -> Array:
 
 
 def _room(scene: Scene) -> Array:
-    """(B, G) m between the object and the skin of each finger at its keypoints."""
+    """Distances (B, G) in m between the object and the skin of each finger at its keypoints."""
     hand = scene.hand
     skin = jnp.linalg.norm(scene.features.nearest, axis=-1) - jnp.array(hand.keypoint_radii)
     owner = hand.link_fingers[hand.keypoint_links]

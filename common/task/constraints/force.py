@@ -1,4 +1,4 @@
-"""Force: the most with which a link may press on the object (ours)."""
+"""Upper limit of the force with which a link may press on the object (ours)."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from congrasp.common.task.sampling.bank import Draw
 
 LEAST, MOST = 1.0, 20.0
-"""N: limits that training draws, as far as the object's weight allows."""
+"""Limits drawn in training, N, as far as the object's weight allows."""
 _GRAVITY = 9.81
-_LOWEST, _HIGHEST = 0.5, 50.0  # N that a request may name
-_FAR = 10.0  # N beyond the limit from which on more costs no more
+_LOWEST, _HIGHEST = 0.5, 50.0  # range of a request's limit, N
+_FAR = 10.0  # N beyond the limit at which the cost saturates
 _SUGGESTED = 5.0
 
 
 class ForceGoal(NamedTuple):
     """The same limit for all links."""
 
-    limit: Annotated[Array, GoalArray((), "N, the most with which a link may press")]
+    limit: Annotated[Array, GoalArray((), "N, upper limit of the force of each link")]
 
 
 class Force(Constraint):
@@ -48,28 +48,28 @@ class Force(Constraint):
     weights = (Weight("force_over", 0.05, "Per newton beyond the limit, per link (at most 10 N each)."),)
     errors = (ErrorSpec("force_ratio", "", "hold", 0.0, 0.1, "share of steps in which a link presses too hard"),)
     options = (
-        Option("force", "The most with which a link may press, in newtons, such as: 3. Free by default."),
-        Option("gentle", "The lowest force limit that suits the object's weight.", switch=True),
+        Option("force", "Upper limit of each link's force in newtons, such as: 3. No limit by default."),
+        Option("gentle", "Uses the lowest force limit that suits the object's weight.", switch=True),
     )
     invalid = (f"The constraint 'force' takes a limit between {_LOWEST:g} and {_HIGHEST:g} N.", "Set 'force_limit'.")
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
-        """The limit, and each link's excess."""
+        """Fields for the limit and each link's excess."""
         return (
             (
-                ObservationField("force_limit", 1, f"the limit over {MOST:g} N"),
-                ObservationField("force_over", len(hand.links), "e / (e + 5 N) of each link's e N too much", True),
+                ObservationField("force_limit", 1, f"the limit divided by {MOST:g} N"),
+                ObservationField("force_over", len(hand.links), "e / (e + 5 N) for each link's excess e in N", True),
             ),
         )
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> ForceGoal:
-        """Log-uniform between the least limit for the episode's object and 20 N."""
+        """Samples log-uniformly between the least limit for the episode's object and 20 N."""
         low = jnp.log(jnp.minimum(draw.least_force, MOST))
         drawn = jax.random.uniform(key, draw.objects.shape)
         return ForceGoal(jnp.exp(low + drawn * (jnp.log(MOST) - low)))
 
     def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
-        """5 N."""
+        """A limit of 5 N."""
         return {"limit": np.array(_SUGGESTED, np.float32)}
 
     def force_max(self, scene: Scene, most: Array) -> Array:
@@ -83,24 +83,24 @@ class Force(Constraint):
         return ([_limit(scene) / MOST, over / (over + FORCE_SCALE)],)
 
     def reward(self, scene: Scene) -> dict[str, Array]:
-        """A price for each newton beyond the limit."""
+        """Cost of each newton beyond the limit."""
         return {"force_over": -scene.gate("force_limit") * jnp.sum(jnp.minimum(_excess(scene), _FAR), -1)}
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
-        """Steps in which at least one link presses harder than the limit, among all steps."""
+        """Steps in which at least one link presses harder than the limit, as a share of all steps."""
         beyond = jnp.any(_excess(scene) > 0.0, -1).astype(jnp.float32)
         return {"force_ratio": (beyond, jnp.ones_like(beyond))}
 
     def valid(self, surface: Surface, own: ForceGoal) -> Array:
-        """A limit that a hand can keep to."""
+        """True for a limit within the range that a hand can satisfy."""
         return (own.limit >= _LOWEST) & (own.limit <= _HIGHEST)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """It holds with every other constraint."""
+        """The limit is compatible with every other constraint."""
         return ["No link may press harder than the force limit."]
 
     def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
-        """A number, or the least limit for the object's weight."""
+        """Parses a number, or computes the least limit for the object's weight."""
         text = given["force"]
         if text and given["gentle"]:
             raise CongraspError("--force and --gentle both set the force limit.", "Leave one out.")
@@ -114,24 +114,24 @@ class Force(Constraint):
             limit = np.nan
         if not _LOWEST <= limit <= _HIGHEST:
             span = f"{_LOWEST:g} and {_HIGHEST:g}"
-            raise CongraspError(f"--force is '{text}', not a number of newtons between {span}.", "Write --force 3.")
+            raise CongraspError(f"--force is '{text}', not a number between {span}.", "Write --force 3.")
         return {"limit": np.array(limit, np.float32)}
 
 
 def least_force(mass: Array, friction: Array) -> Array:
-    """N, the least sensible limit for objects of this mass (kg) under this friction: m g / (2 mu), 1 N at least.
+    """Least sensible limit in N for objects of this mass (kg) with this friction: m g / (2 mu), at least 1 N.
 
     Thumb and fingers press on opposite sides, each of which carries half of the weight by friction. The fingers share
-    their side; the thumb alone has the other one.
+    their side; the thumb carries the other.
     """
     return jnp.clip(mass * _GRAVITY / (2.0 * friction), LEAST, MOST)
 
 
 def _limit(scene: Scene) -> Array:
-    """(B, 1) N, positive whether or not it is active."""
+    """Limit (B, 1) in N, positive whether or not it is active."""
     return jnp.maximum(scene.goal["force"].limit, _LOWEST)[:, None]
 
 
 def _excess(scene: Scene) -> Array:
-    """(B, L) N by which each link presses harder than the limit."""
+    """Force (B, L) in N by which each link exceeds the limit."""
     return jnp.maximum(jnp.linalg.norm(scene.features.force, axis=-1) - _limit(scene), 0.0)

@@ -1,4 +1,4 @@
-"""Heading: from where the hand comes, and where its centre should be. The default that is always active."""
+"""Heading: approach direction of the hand and target of its centre. The default, which is always active."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -32,23 +32,23 @@ if TYPE_CHECKING:
     from congrasp.common.task.sampling.bank import Draw
 
 ABOVE = "above"
-"""What is written for the heading straight down, whatever the object's pose."""
+"""Literal for the heading straight down, in any pose of the object."""
 _FAR = 0.15
-"""Metres beyond which the distance costs no more: what a fallen object carries away must not drown all else."""
+"""Distance beyond which the cost saturates, m: a fallen object that rolls away must not dominate the reward."""
 
 
 class HeadingGoal(NamedTuple):
-    """Where the hand comes from and to, object frame."""
+    """Approach direction and target of the hand, object frame."""
 
-    position: Annotated[Array, GoalArray((3,), "m, where the hand's centre should be (p-bar)")]
+    position: Annotated[Array, GoalArray((3,), "m, target of the hand's centre (p-bar)")]
     direction: Annotated[
-        Array, GoalArray((3,), "unit, the way the hand moves (v-bar)", "direction", neutral=(0.0, 0.0, -1.0))
+        Array, GoalArray((3,), "unit, direction in which the hand moves (v-bar)", "direction", neutral=(0.0, 0.0, -1.0))
     ]
     cross: Annotated[
         Array,
         GoalArray(
             (3,),
-            "unit, orthogonal to the direction: along the cross-finger axis w; fixes the guidance's roll only",
+            "unit, orthogonal to the direction: along the cross-finger axis w; it only sets the roll of the guidance",
             neutral=(1.0, 0.0, 0.0),
             required=False,
         ),
@@ -75,36 +75,36 @@ class Heading(Constraint):
     )
     errors = (
         ErrorSpec("heading_rad", "rad", "hold", 0.25, 0.2, "direction"),
-        ErrorSpec("heading_m", "m", "hold", 0.03, 0.02, "hand's centre beside the arrow"),
+        ErrorSpec("heading_m", "m", "hold", 0.03, 0.02, "distance of the hand's centre from the heading's line"),
     )
     options = (
         Option(
             "heading",
-            "The way the hand comes, three numbers in the axes of the object's file (\"0 0 -1\"), or 'above'. Free by "
-            "default.",
+            "Approach direction: three numbers in the axes of the object's file (\"0 0 -1\"), or 'above'. Free "
+            "by default.",
             "direction",
             words=(ABOVE,),
         ),
         Option(
             "at",
-            "Where the middle of the grasping hand should be, three numbers in metres, in the coordinates of the file.",
+            "Target of the grasping hand's centre: three numbers in metres, in the coordinates of the file.",
             "place",
         ),
     )
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
-        """Hand centre, target, residual, direction, object rotation."""
+        """Fields for hand centre, target, residual, direction and object rotation."""
         block = (
-            ObservationField("center", 3, "m, middle between thumb's tip and the other tips' mean, wrist frame"),
-            ObservationField("heading_position", 3, "m, where the centre should be, wrist frame"),
+            ObservationField("center", 3, "m, midpoint of the thumb's tip and the mean of the other tips, wrist frame"),
+            ObservationField("heading_position", 3, "m, target of the centre, wrist frame"),
             ObservationField("heading_position - center", 3, "m, wrist frame"),
-            ObservationField("heading_direction", 3, "unit, the way the hand should come, wrist frame"),
+            ObservationField("heading_direction", 3, "unit, approach direction, wrist frame"),
             ObservationField("object_matrix", 9, "rotation matrix from object to wrist frame, row by row"),
         )
         return (block,)
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> HeadingGoal:
-        """One of the object's headings that its resting pose and region allow, moved back clear of the table."""
+        """Samples one of the object's headings for its resting pose and region, moved back clear of the table."""
         bank, where = draw.bank, (draw.objects, draw.region)
         slot = jax.random.randint(key, draw.objects.shape, 0, bank.heading_index.shape[-1])
         index = *where, bank.heading_index[*where, draw.rests, slot]
@@ -113,7 +113,7 @@ class Heading(Constraint):
         return HeadingGoal(bank.heading_position[index] - back * direction, direction, bank.heading_cross[index])
 
     def initial_wrist(self, hand: Hand, back_off: Array, goal: Goal, q: Array) -> tuple[Array, Array, Array]:
-        """Aligned with the heading and backed off (paper, section Hand Initialization)."""
+        """Wrist aligned with the heading and backed off (paper, section Hand Initialization)."""
         points = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
         center = hand_center(hand, points, chosen_fingers(goal.values, goal))
         position, quaternion = heading_wrist_pose(hand, goal["heading"], center)
@@ -121,7 +121,7 @@ class Heading(Constraint):
         return jnp.ones(position.shape[0], bool), position, quaternion
 
     def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> HeadingFeatures:
-        """The target in the wrist frame."""
+        """Target in the wrist frame."""
         own = goal["heading"]
         return HeadingFeatures(
             features.object_position + rotations.rotate(features.object_quaternion, own.position),
@@ -129,7 +129,7 @@ class Heading(Constraint):
         )
 
     def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
-        """The wrist pose that aligns the present hand with the heading."""
+        """Wrist pose that aligns the current hand with the heading."""
         pose = heading_wrist_pose(scene.hand, scene.goal["heading"], scene.features.center)
         return in_world(*object_pose(scene, current=current), *pose)
 
@@ -146,7 +146,7 @@ class Heading(Constraint):
         return (block,)
 
     def reward(self, scene: Scene) -> dict[str, Array]:
-        """r^head."""
+        """Reward term r^head."""
         axis, own = jnp.array(grasp_frame(scene.hand).heading), scene.features.of["heading"]
         return {
             "heading_direction": jnp.sum(axis * own.direction, -1),
@@ -164,17 +164,17 @@ class Heading(Constraint):
         return {"heading_rad": jnp.arctan2(sine, cosine), "heading_m": jnp.linalg.norm(lateral, axis=-1)}
 
     def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
-        """Direction and position, as far as they are given."""
+        """Parses direction and position, if given."""
         direction = None if isinstance(given["heading"], str) else given["heading"]
         found = {"direction": direction, "position": given["at"]}
         return {name: value for name, value in found.items() if value is not None} or None
 
     def markers(self, own: HeadingGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
-        """An arrow to the hand centre's target."""
+        """Arrow to the target of the hand's centre."""
         return (Arrow(own.position, own.direction),)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """It guides the wrist where nothing stronger does."""
+        """Effect of the heading: it guides the wrist unless a stronger constraint does."""
         return [] if overridden else ["The heading guides the wrist."]
 
 
@@ -183,7 +183,7 @@ def heading_wrist_pose(hand: Hand, heading: HeadingGoal, center: Array) -> tuple
 
     Args:
       hand: the hand.
-      heading: the target.
+      heading: the heading.
       center: (B, 3) hand centre in the wrist frame.
     """
     frame = grasp_frame(hand)
@@ -196,9 +196,9 @@ def heading_wrist_pose(hand: Hand, heading: HeadingGoal, center: Array) -> tuple
 def heading_of_wrist(
     hand: Hand, q: Array, position: Array, quaternion: Array, fingers: Array | None = None
 ) -> dict[str, Array]:
-    """The heading (B, 3) each that a wrist pose (B, 3), (B, 4) with finger angles (B, F) has, in the same frame.
+    """Heading (B, 3) arrays of a wrist pose (B, 3), (B, 4) with finger angles (B, F), in the same frame.
 
-    `fingers` (B, G) bool are those whose tips make the hand centre; all by default.
+    `fingers` (B, G) bool selects the tips that define the hand centre; all by default.
     """
     frame = grasp_frame(hand)
     center = hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)), fingers)
@@ -211,16 +211,16 @@ def heading_of_wrist(
 
 
 def heading_turn(hand: Hand, heading: HeadingGoal, quaternion: Array) -> Array:
-    """(B,) rad between the heading's direction and the heading axis of wrists (B, 4), object frame."""
+    """Angle (B,) in rad between the heading's direction and the heading axis of wrists (B, 4), object frame."""
     axis = jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), heading.direction.shape)
     cosine = jnp.sum(rotations.rotate(quaternion, axis) * heading.direction, -1)
     return jnp.arccos(jnp.clip(cosine, -1.0, 1.0))
 
 
 def orthogonal_cross(heading: HeadingGoal) -> HeadingGoal:
-    """The heading with its cross-finger direction made unit and orthogonal to its direction.
+    """Returns the heading with its cross-finger direction normalised and orthogonal to its direction.
 
-    Where the two are parallel any orthogonal one is taken: of what remains rounding would decide.
+    Where the two are parallel an arbitrary orthogonal direction is used, since the remainder is rounding error.
     """
     axis = jnp.eye(3)[jnp.argmin(jnp.abs(heading.direction), -1)]
     cross, other = (
@@ -232,7 +232,7 @@ def orthogonal_cross(heading: HeadingGoal) -> HeadingGoal:
 
 
 def object_pose(scene: Scene, *, current: bool) -> tuple[Array, Array]:
-    """The object's present pose (B, 3), (B, 4) in the world, or that at the start of the episode."""
+    """Current pose (B, 3), (B, 4) of the object in the world frame, or its pose at the start of the episode."""
     state = scene.state
     if current:
         return state.object_position, state.object_quaternion
@@ -240,4 +240,4 @@ def object_pose(scene: Scene, *, current: bool) -> tuple[Array, Array]:
 
 
 TURNED = float(np.radians(30.0))
-"""Angle between a heading and that of a stronger constraint from which on they contradict, rad."""
+"""Angle between a heading and that of a stronger constraint above which they contradict, rad."""

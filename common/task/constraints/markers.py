@@ -1,4 +1,4 @@
-"""What a constraint looks like in pictures, recordings and the studio; all in the object frame."""
+"""Markers of constraints in pictures, recordings and the studio; all in the object frame."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ class Arrow(NamedTuple):
 
 
 class Polyline(NamedTuple):
-    """Points on a string."""
+    """A sequence of connected points."""
 
     points: np.ndarray
     """(n, 3) m."""
@@ -25,11 +25,11 @@ class Ghost(NamedTuple):
     """A translucent hand."""
 
     position: np.ndarray
-    """(3,) m, of the wrist."""
+    """(3,) position of the wrist, m."""
     quaternion: np.ndarray
-    """(4,), of the wrist."""
+    """(4,) orientation of the wrist."""
     q: np.ndarray | None
-    """(F,) rad, finger angles; None draws the wrist's axes alone."""
+    """(F,) finger angles, rad; None draws only the wrist's axes."""
 
 
 class Paint(NamedTuple):

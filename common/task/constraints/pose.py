@@ -1,4 +1,4 @@
-"""Reference pose: where wrist and fingers should be in the grasp."""
+"""Reference pose: target pose of wrist and fingers in the grasp."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from congrasp.common.task.sampling.bank import Draw
 
 TOUCHING = 0.015
-"""Metres from a joint or fingertip of a reference pose to the surface that it is about to touch."""
+"""Distance from a joint or fingertip of a reference pose to the surface below which it counts as touching, m."""
 _FAR, _TURNED = 0.15, 0.5
-"""Errors (m, rad) beyond which tracking costs no more."""
+"""Errors (m, rad) beyond which the tracking cost saturates."""
 _GATE_FAR, _GATE_NEAR = 0.10, 0.03
 
 
@@ -43,7 +43,7 @@ class PoseGoal(NamedTuple):
     """A wrist pose in the object frame, and finger angles."""
 
     q: Annotated[Array, GoalArray(("F",), "rad, finger angles (q-bar)")]
-    position: Annotated[Array, GoalArray((3,), "m, object frame: the wrist")]
+    position: Annotated[Array, GoalArray((3,), "m, object frame: wrist position")]
     quaternion: Annotated[
         Array, GoalArray((4,), "wrist frame to object frame", "quaternion", neutral=(1.0, 0.0, 0.0, 0.0))
     ]
@@ -53,11 +53,11 @@ class PoseFeatures(NamedTuple):
     """The reference pose in the wrist frame."""
 
     keypoints: Array
-    """(B, P, 3) x-bar: keypoints of the reference pose, carried by its wrist pose in the object frame."""
+    """(B, P, 3) x-bar: keypoints of the reference pose, placed by its wrist pose in the object frame."""
 
 
 class Pose(Constraint):
-    """Finger angles and wrist pose of the grasp; the two are gated apart (paper, section Observation Space)."""
+    """Finger angles and wrist pose of the grasp; the two are gated separately (paper, section Observation Space)."""
 
     name, title, goal = "pose", "reference pose", PoseGoal
     blocks = ("pose_finger", "pose_wrist")
@@ -75,8 +75,8 @@ class Pose(Constraint):
         Weight("pose_wrist_rotation", 0.5, "w_R of the pose term: per square radian of the wrist's rotation."),
     )
     errors = (
-        ErrorSpec("pose_rad", "rad", "hold", 0.25, 0.25, "joints and wrist hinges on average"),
-        ErrorSpec("pose_m", "m", "hold", 0.03, 0.02, "wrist's distance", block="pose_wrist"),
+        ErrorSpec("pose_rad", "rad", "hold", 0.25, 0.25, "mean over joints and wrist hinges"),
+        ErrorSpec("pose_m", "m", "hold", 0.03, 0.02, "distance of the wrist", block="pose_wrist"),
     )
     options = (
         Option(
@@ -87,18 +87,18 @@ class Pose(Constraint):
     )
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
-        """Residuals of joints and keypoints; of the virtual wrist joints."""
+        """Fields for residuals of joints and keypoints, and of the virtual wrist joints."""
         fingers = (
             ObservationField("pose_q - q", len(hand.joints), "rad, to the reference pose"),
             ObservationField("pose_keypoints - keypoints", 3 * len(hand.keypoints), "m, wrist frame"),
         )
         wrist = ObservationField(
-            "pose_u - u", 6, "m and rad, wrist joints of the reference pose, less the present ones"
+            "pose_u - u", 6, "m and rad, wrist joints of the reference pose minus the current ones"
         )
         return fingers, (wrist,)
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> PoseGoal:
-        """One of the object's reference poses."""
+        """Samples one of the object's reference poses."""
         index = draw.objects, draw.region, draw.reference["pose"]
         q, position, quaternion = (getattr(draw.bank, f"pose_{name}")[index] for name in PoseGoal._fields)
         if draw.disturbance is not None:
@@ -109,39 +109,39 @@ class Pose(Constraint):
         return PoseGoal(q, position, quaternion)
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
-        """The heading becomes that of the reference pose."""
+        """Replaces the heading by that of the reference pose."""
         own = goal["pose"]
         return goal.where(asked["pose"], "heading", **heading_of_wrist(hand, own.q, own.position, own.quaternion))
 
     def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The reference wrist."""
+        """Reference wrist pose."""
         return np.asarray(own["position"])[None], np.asarray(own["quaternion"])
 
     def initial_fingers(self, goal: Goal) -> tuple[Array, Array]:
-        """The reference's own fingers (paper, section Hand Initialization)."""
+        """Reference finger angles (paper, section Hand Initialization)."""
         return goal.active["pose_finger"], goal["pose"].q
 
     def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> PoseFeatures:
-        """Keypoints of the reference."""
+        """Keypoints of the reference pose."""
         own = goal["pose"]
         points = kinematics.keypoints(hand, kinematics.link_transforms(hand, own.q))
         points = rotations.transform(own.position, own.quaternion, points)
         return PoseFeatures(rotations.transform(features.object_position, features.object_quaternion, points))
 
     def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
-        """The reference wrist pose."""
+        """Reference wrist pose in the world frame."""
         own = scene.goal["pose"]
         return in_world(*object_pose(scene, current=current), own.position, own.quaternion)
 
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
-        """q-bar - q and x-bar - x; u-bar - u."""
+        """Residuals q-bar - q and x-bar - x; u-bar - u."""
         own, state, features = scene.goal["pose"], scene.state, scene.features
         fingers = [own.q - state.q, flat(features.of["pose"].keypoints - features.keypoints)]
         wrist = in_world(state.object_position, state.object_quaternion, own.position, own.quaternion)
         return fingers, [wrist_to_joints(state, *wrist) - state.u]
 
     def reward(self, scene: Scene) -> dict[str, Array]:
-        """r^pose."""
+        """Reward term r^pose."""
         own, state, features, active = scene.goal["pose"], scene.state, scene.features, scene.gate
         position, quaternion = in_world(state.object_position, state.object_quaternion, own.position, own.quaternion)
         gate = pose_gate(jnp.min(jnp.linalg.norm(features.nearest, axis=-1), -1)) * active("pose_finger")
@@ -166,27 +166,27 @@ class Pose(Constraint):
         }
 
     def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
-        """What the file holds."""
+        """Returns the arrays of the file."""
         return given["pose"]
 
     def markers(self, own: PoseGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
-        """The reference's hand, or its wrist alone."""
+        """Ghost of the reference hand, or of its wrist only."""
         return (Ghost(own.position, own.quaternion, own.q if "pose_finger" in blocks else None),)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """It guides wrist and fingers, or the fingers alone."""
+        """Effect of the pose: it guides wrist and fingers, or only the fingers."""
         if overridden:
-            return ["Of the reference pose only the fingers count: the trajectory decides on the wrist."]
+            return ["Only the fingers of the reference pose count: the trajectory determines the wrist."]
         return ["The reference pose guides wrist and fingers; the heading follows from it."]
 
 
 def pose_gate(distance: Array) -> Array:
-    """g(d): rises linearly from 0 at 0.10 m to 1 at 0.03 m between hand and object."""
+    """Gate g(d) that rises linearly from 0 at 0.10 m to 1 at 0.03 m between hand and object."""
     return jnp.clip((_GATE_FAR - distance) / (_GATE_FAR - _GATE_NEAR), 0.0, 1.0)
 
 
 def _apart_from_heading(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
-    """(B,) rad between the heading and that of the reference."""
+    """Angle (B,) in rad between the heading and that of the reference."""
     return {"turn": heading_turn(hand, goal["heading"], goal["pose"].quaternion)}
 
 
@@ -195,10 +195,10 @@ def _heading_message(hand: Hand, apart: Mapping[str, Any]) -> str:
 
 
 def heading_message(stronger: str, turn: float) -> str:
-    """What a heading that comes another way than a stronger constraint is told; the angle in rad."""
+    """Message for a heading that contradicts a stronger constraint by an angle in rad."""
     return (
-        f"The heading differs by {np.degrees(turn):.0f} degrees from the way in which the {stronger} comes. "
-        f"The {stronger} overrides it: the heading follows from it."
+        f"The heading differs by {np.degrees(turn):.0f} degrees from the approach of the {stronger}. The "
+        f"{stronger} overrides it: the heading follows from it."
     )
 
 
@@ -216,8 +216,8 @@ def _touches(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
 def _affordance_message(hand: Hand, apart: Mapping[str, Any]) -> str:
     names = dict.fromkeys(hand.links[hand.keypoint_links[i]].name for i in np.flatnonzero(apart["touching"]))
     return (
-        f"In the reference pose {', '.join(names)} would touch what must not be touched. The pose names its own "
-        "contacts and overrides the affordance."
+        f"In the reference pose, {', '.join(names)} would touch the avoid region. The pose defines the contacts "
+        "and overrides the affordance."
     )
 
 

@@ -1,7 +1,7 @@
-"""Which constraints are active: the paper's priority rules (figure "Priority among constraints").
+"""Resolves which constraints are active: the paper's priority rules (figure "Priority among constraints").
 
-Each constraint says what it overrides and how it stands to weaker ones; here that is put together. Actors, servers and
-viewers all call `resolve`.
+Each constraint declares what it overrides and its relations to weaker ones; this module combines them. Actors, servers
+and viewers all call `resolve`.
 """
 
 import functools
@@ -21,14 +21,14 @@ from congrasp.common.task.types import Array, Goal, Surface
 
 
 class Resolution(NamedTuple):
-    """What is active, and what the rules did."""
+    """Active constraints, and the effects of the rules."""
 
     goal: Goal
     """Active constraints; overridden headings are replaced."""
     redirected: Array
-    """(B,) bool: a constraint turned the heading."""
+    """(B,) bool: a constraint redirected the heading."""
     aligned: Array
-    """(B,) bool: false where two constraints contradict of which neither overrides the other."""
+    """(B,) bool: false where two constraints contradict and neither overrides the other."""
 
 
 class Contradiction(NamedTuple):
@@ -37,23 +37,23 @@ class Contradiction(NamedTuple):
     weaker: str
     stronger: str
     message: str
-    """What contradicts, by how much, and what becomes of it."""
+    """Description of the contradiction, its size and its effect."""
     refused: bool
-    """Neither overrides the other: the request is an error."""
+    """True if neither overrides the other: the request is an error."""
 
 
 def _overrides(stronger: Constraint, weaker: str) -> bool:
-    """Whether it overrides a constraint or one of its blocks."""
+    """True if it overrides a constraint or one of its blocks."""
     return any(_hits(stronger, block, get_constraint(weaker)) for block in (weaker, *get_constraint(weaker).blocks))
 
 
 def _hits(stronger: Constraint, block: str, owner: Constraint) -> bool:
-    """Whether it overrides this block."""
+    """True if it overrides this block."""
     return not {block, owner.name}.isdisjoint(stronger.overrides) or stronger.name in owner.overridden_by
 
 
 def active_blocks(asked: Mapping[str, Array]) -> dict[str, Array]:
-    """Which blocks are active where these constraints are asked for, (B,) bool each."""
+    """Active blocks for the requested constraints, (B,) bool each."""
     return {
         block: asked[owner.name]
         & ~_any((asked[c.name] for c in CONSTRAINTS if c.name in asked and _hits(c, block, owner)), asked[owner.name])
@@ -64,12 +64,12 @@ def active_blocks(asked: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def _any(flags: Iterable[Array], like: Array) -> Array:
-    """(B,) bool: whether any of the flags is true; as many as `like` has."""
+    """(B,) bool: any of the flags is true; shaped like `like`."""
     return functools.reduce(operator.or_, flags, like & False)
 
 
 def _moot(relation: Relation, stronger: Constraint, asked: Mapping[str, Array]) -> Array:
-    """(B,) bool: something else that is asked for overrides the weaker constraint anyway."""
+    """(B,) bool: another requested constraint overrides the weaker one anyway."""
     others = [c for c in CONSTRAINTS if c.name in asked and c is not stronger and _overrides(c, relation.weaker)]
     if _overrides(stronger, relation.weaker):
         others = [c for c in others if CONSTRAINTS.index(c) > CONSTRAINTS.index(stronger)]
@@ -77,7 +77,7 @@ def _moot(relation: Relation, stronger: Constraint, asked: Mapping[str, Array]) 
 
 
 def _relations(asked: Iterable[str]) -> list[tuple[Constraint, Relation]]:
-    """Relations between constraints that may be asked for together, those of the strongest first."""
+    """Relations between constraints that may be requested together, those of the strongest first."""
     names = {*asked, "heading"}
     return [(c, r) for c in reversed(CONSTRAINTS) if c.name in names for r in c.relations if r.weaker in names]
 
@@ -87,9 +87,8 @@ def resolve(hand: Hand, surface: Surface, goal: Goal, asked: Mapping[str, Array]
 
     Args:
       hand: the hand.
-      surface: the objects' surface points.
-      goal: goal arrays as asked for; those of absent constraints may hold anything finite. What it says is active is
-        ignored.
+      surface: surface points of the objects.
+      goal: requested goal arrays; those of absent constraints may hold any finite values. Its active flags are ignored.
       asked: (B,) bool by the name of each optional constraint of the goal.
     """
     found: dict[str, list[Array]] = {"redirected": [], "refused": []}
@@ -109,7 +108,7 @@ def resolve(hand: Hand, surface: Surface, goal: Goal, asked: Mapping[str, Array]
 
 
 def explain(asked: Iterable[str], redirected: bool = False) -> list[str]:
-    """What the rules do with a request, in sentences, strongest constraint first."""
+    """Describes the effect of the rules on a request, in sentences, strongest constraint first."""
     names = {*asked, "heading"}
     words = []
     for constraint in reversed(CONSTRAINTS):
@@ -122,14 +121,14 @@ def explain(asked: Iterable[str], redirected: bool = False) -> list[str]:
 def contradictions(
     hand: Hand, points: np.ndarray, avoid: np.ndarray, goal: Goal, asked: Iterable[str]
 ) -> list[Contradiction]:
-    """What of one request contradicts the rest, strongest constraint first.
+    """Contradictions within one request, strongest constraint first.
 
     Args:
       hand: the hand.
       points: (N, 3) surface points.
       avoid: (N,) bool, those of the avoid region.
-      goal: goal arrays without batch axis, as asked for.
-      asked: names of the constraints that somebody asked for; the heading too, if it was.
+      goal: requested goal arrays without batch axis.
+      asked: names of the explicitly requested constraints, including the heading if it was requested.
     """
     names = set(asked)
     flags = {name: np.ones(1, bool) for name in names}

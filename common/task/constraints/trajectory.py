@@ -1,4 +1,4 @@
-"""Wrist trajectory: the path along which the wrist comes."""
+"""Wrist trajectory: path of the approaching wrist."""
 
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -33,21 +33,19 @@ if TYPE_CHECKING:
     from congrasp.common.task.sampling.bank import Draw
 
 APART = 0.02
-"""Metres between a pose's wrist and a trajectory's end from which on they contradict."""
+"""Distance between a pose's wrist and a trajectory's end above which they contradict, m."""
 TWISTED = 0.3
-"""Radians between their orientations, likewise."""
+"""Angle between their orientations above which they contradict, rad."""
 CLOSED = 0.4
-"""Share of the way from the open hand to the fist at which the hand centre is taken where no pose names the fingers.
-
+"""Closure, between the open hand and the fist, at which the hand centre is computed if no pose gives the fingers.
 Median distance to the centres of closed reference poses, for the shares 0, 0.4, 0.5 and 1: human 21, 19, 19 and 42 mm,
-Allegro 32, 26, 24 and 46 mm, Sharpa 25, 19, 20 and 51 mm (432, 398 and 417 poses on 32 objects of all families).
-"""
+Allegro 32, 26, 24 and 46 mm, Sharpa 25, 19, 20 and 51 mm (432, 398 and 417 poses on 32 objects of all families)."""
 _FAR, _TURNED = 0.15, 0.5
-"""Errors (m, rad) beyond which tracking costs no more."""
+"""Errors (m, rad) beyond which the tracking cost saturates."""
 
 
 class TrajectoryGoal(NamedTuple):
-    """Wrist poses from far to near, object frame."""
+    """Wrist poses from the first, distant one to the grasp, object frame."""
 
     position: Annotated[Array, GoalArray(("K", 3), "m, object frame: wrist waypoints")]
     quaternion: Annotated[
@@ -68,31 +66,32 @@ class Trajectory(Constraint):
         Weight("trajectory_rotation", 0.5, "w_traj-q: per square radian between the wrist and the active waypoint."),
     )
     errors = (
-        ErrorSpec("trajectory_rad", "rad", "approach", 0.3, 0.2, "wrist's turn against the waypoint", "traj_rad"),
-        ErrorSpec("trajectory_m", "m", "approach", 0.03, 0.03, "wrist's distance from the waypoint", "traj_m"),
+        ErrorSpec("trajectory_rad", "rad", "approach", 0.3, 0.2, "angle of the wrist to the waypoint", "traj_rad"),
+        ErrorSpec("trajectory_m", "m", "approach", 0.03, 0.03, "distance of the wrist from the waypoint", "traj_m"),
     )
     options = (
         Option(
             "trajectory",
-            "Wrist path: a grasp.npz, a constraint set, JSON with position and quaternion, or CSV (x y z w x y z).",
+            "Wrist path: a grasp.npz, a constraint set, JSON with position and quaternion, CSV (x y z w x y z), "
+            "or BVH (cm, y up; FILE:JOINT, RightHand by default).",
             "path",
         ),
     )
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
-        """Residual virtual wrist joints of every waypoint."""
-        size, meaning = 6 * task.trajectory_points, "m and rad, wrist joints of every waypoint, less the present ones"
+        """Fields for residuals of the virtual wrist joints, of every waypoint."""
+        size, meaning = 6 * task.trajectory_points, "m and rad, wrist joints of every waypoint minus the current ones"
         return ((ObservationField("waypoint_u - u", size, meaning),),)
 
     def allowed(self, draw: "Draw") -> Array:
-        """Those clear of the table that agree with an affordance, where one is asked for (region 1)."""
+        """References clear of the table that agree with an affordance, if one is requested (region 1)."""
         ends = draw.bank.trajectory_position[draw.objects, draw.region, :, -1]
         return draw.allowed & jax.vmap(_agrees, (None, 1), 1)(draw, ends)
 
     def sample(self, hand: Hand, draw: "Draw", key: Array) -> TrajectoryGoal:
-        """The trajectory to one of the object's reference poses.
+        """Samples the trajectory to one of the object's reference poses.
 
-        A disturbance that would make it contradict an affordance is left out.
+        A disturbance that would make it contradict an affordance is dropped.
         """
         index = draw.objects, draw.region, draw.reference["trajectory"]
         path = TrajectoryGoal(draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index])
@@ -103,9 +102,9 @@ class Trajectory(Constraint):
         return TrajectoryGoal(*(jnp.where(kept, *pair) for pair in zip(disturbed, path, strict=True)))
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
-        """The last waypoint is the wrist of a reference pose, and the heading becomes the waypoint's.
+        """Replaces the wrist of a reference pose by the last waypoint, and the heading by the waypoint's.
 
-        The heading's position is the hand centre of the pose's fingers; without a pose, of a partly closed hand.
+        The heading's position is the hand centre with the pose's fingers or, without a pose, of a partly closed hand.
         """
         here, last = asked["trajectory"], last_waypoint(goal)
         q = jnp.broadcast_to(jnp.array(closing(hand)), (here.shape[0], len(hand.joints)))
@@ -115,26 +114,26 @@ class Trajectory(Constraint):
         return goal.where(here, "heading", **heading_of_wrist(hand, q, *last, chosen_fingers(asked, goal)))
 
     def wrist_path(self, own: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The waypoints."""
+        """Waypoints."""
         return np.asarray(own["position"]), np.asarray(own["quaternion"])[-1]
 
     def initial_wrist(self, hand: Hand, back_off: Array, goal: Goal, q: Array) -> tuple[Array, Array, Array]:
-        """The first waypoint (paper, section Hand Initialization)."""
+        """First waypoint (paper, section Hand Initialization)."""
         own = goal["trajectory"]
         return goal.active["trajectory"], own.position[:, 0], own.quaternion[:, 0]
 
     def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
-        """The waypoint after the one nearest to the wrist."""
+        """Waypoint after the one nearest to the wrist."""
         return tracked_waypoint(scene, current=current)
 
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
-        """u-bar^(k) - u for every waypoint."""
+        """Residuals u-bar^(k) - u of every waypoint."""
         own, state = scene.goal["trajectory"], scene.state
         waypoints = in_world(state.object_position, state.object_quaternion, own.position, own.quaternion)
         return ([flat(wrist_to_joints(state, *waypoints) - state.u[..., None, :])],)
 
     def reward(self, scene: Scene) -> dict[str, Array]:
-        """r^traj."""
+        """Reward term r^traj."""
         active, features = scene.gate("trajectory"), scene.features
         position, quaternion = tracked_waypoint(scene, current=True)
         far = jnp.minimum(square(features.wrist_position - position), _FAR**2)
@@ -150,20 +149,20 @@ class Trajectory(Constraint):
         }
 
     def parse(self, given: Mapping[str, Any], hand: Hand, obj: GraspObject) -> dict[str, np.ndarray] | None:
-        """What the file holds."""
+        """Returns the waypoints of the file."""
         return given["trajectory"]
 
     def markers(self, own: TrajectoryGoal, blocks: Collection[str]) -> tuple[Marker, ...]:
-        """The wrist's path."""
+        """Path of the wrist."""
         return (Polyline(own.position),)
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
-        """It guides the wrist."""
+        """Effect of the trajectory: it guides the wrist."""
         return ["The wrist trajectory guides the wrist; the heading follows from its last waypoint."]
 
 
 def closing(hand: Hand) -> np.ndarray:
-    """(F,) finger angles q_open + 0.4 (q_closed - q_open), at which an unknown grasp's hand centre is estimated."""
+    """Finger angles (F,) q_open + 0.4 (q_closed - q_open), for estimating the hand centre of an unknown grasp."""
     return np.asarray(hand.q_open + CLOSED * (hand.q_closed - hand.q_open), np.float32)
 
 
@@ -174,15 +173,15 @@ def last_waypoint(goal: Goal) -> tuple[Array, Array]:
 
 
 def active_waypoint(wrist_position: Array, waypoints: Array, lookahead: int) -> Array:
-    """(B,) index min(k* + lookahead, K - 1), with k* the waypoint (B, K, 3) nearest to the wrist (B, 3)."""
+    """Index (B,) min(k* + lookahead, K - 1), where k* is the waypoint (B, K, 3) nearest to the wrist (B, 3)."""
     nearest = jnp.argmin(jnp.sum((waypoints - wrist_position[..., None, :]) ** 2, -1), -1)
     return jnp.minimum(nearest + lookahead, waypoints.shape[-2] - 1)
 
 
 def tracked_waypoint(scene: Scene, *, current: bool) -> tuple[Array, Array]:
-    """World pose (B, 3), (B, 4) of the active waypoint, on the object's current or initial pose.
+    """World pose (B, 3), (B, 4) of the active waypoint, relative to the object's current or initial pose.
 
-    Guidance, reward and errors speak of one waypoint: which it is, the object's pose under the guidance decides.
+    Guidance, reward and errors use the same waypoint, selected with the object's pose of the guidance.
     """
     own, control = scene.goal["trajectory"], scene.task.control
     guiding, _ = in_world(*object_pose(scene, current=control.follow_object), own.position, own.quaternion)
@@ -192,7 +191,7 @@ def tracked_waypoint(scene: Scene, *, current: bool) -> tuple[Array, Array]:
 
 
 def _apart_from_pose(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Array]:
-    """Distance (m) and turn (rad) between the reference pose's wrist and the trajectory's end."""
+    """Distance (m) and angle (rad) between the reference pose's wrist and the trajectory's end."""
     position, quaternion = last_waypoint(goal)
     return {
         "apart": jnp.linalg.norm(goal["pose"].position - position, axis=-1),
@@ -202,14 +201,14 @@ def _apart_from_pose(hand: Hand, surface: Surface, goal: Goal) -> dict[str, Arra
 
 def _pose_message(hand: Hand, apart: Mapping[str, Any]) -> str:
     return (
-        f"The reference pose holds the wrist {100 * apart['apart']:.1f} cm and {np.degrees(apart['twist']):.0f} "
-        "degrees from where the trajectory ends. The trajectory decides on the wrist; of the pose only the fingers "
+        f"The reference pose puts the wrist {100 * apart['apart']:.1f} cm and {np.degrees(apart['twist']):.0f} "
+        "degrees from the trajectory's end. The trajectory determines the wrist; only the fingers of the pose "
         "count."
     )
 
 
 def _apart_from_regions(surface: Surface, end: Array) -> dict[str, Array]:
-    """Metres from a trajectory's end (B, 3) to either region."""
+    """Distances in m from a trajectory's end (B, 3) to either region."""
     return {
         "avoid": least_distance(surface.points, surface.avoid, end),
         "graspable": least_distance(surface.points, ~surface.avoid, end),
@@ -223,15 +222,15 @@ def _agrees(draw: "Draw", end: Array) -> Array:
 
 
 def _contradicts_affordance(apart: Mapping[str, Array]) -> Array:
-    """Whether the trajectory ends as near to the avoid region as to the graspable one, or nearer."""
+    """(B,) bool: the trajectory ends no farther from the avoid region than from the graspable one."""
     return apart["avoid"] <= apart["graspable"]
 
 
 def _affordance_message(hand: Hand, apart: Mapping[str, Any]) -> str:
     return (
-        f"The trajectory ends {100 * apart['avoid']:.1f} cm from what must not be touched, and "
-        f"{100 * apart['graspable']:.1f} cm from what may be grasped. Neither overrides the other: let it end nearer "
-        "to the graspable part, or leave one out."
+        f"The trajectory ends {100 * apart['avoid']:.1f} cm from the avoid region, and "
+        f"{100 * apart['graspable']:.1f} cm from the graspable region. Neither overrides the other: let it end "
+        "nearer to the graspable region, or remove one of the two."
     )
 
 

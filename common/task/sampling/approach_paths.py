@@ -1,8 +1,8 @@
-"""Wrist trajectories made backwards from reference poses (paper, section Hand Morphology).
+"""Generates wrist trajectories backwards from reference poses (paper, section Hand Morphology).
 
 From the final pose the wrist moves out by 15-25 cm within 15 degrees of the heading, with a lateral sinusoid of 1-5 cm
-and up to 30 degrees of rotation. The path is replayed through the wrist's PD controller and what the wrist reaches is
-resampled to K waypoints.
+and up to 30 degrees of rotation. The wrist's PD controller then follows the path, and its motion is resampled to K
+waypoints.
 """
 
 import functools
@@ -29,17 +29,17 @@ _SETTLE_SECONDS = 0.25
 def make_trajectories(
     hand: Hand, position: Array, quaternion: Array, key: Array, *, waypoints: int
 ) -> tuple[Array, Array]:
-    """One trajectory for each reference pose.
+    """Generates one trajectory for each reference pose.
 
     Args:
       hand: its heading axis and wrist gains are used.
       position: (M, 3) final wrist positions in the object frame.
       quaternion: (M, 4) final wrist orientations.
       key: random key of the paths.
-      waypoints: K.
+      waypoints: number K of waypoints.
 
     Returns:
-      Positions (M, K, 3) and quaternions (M, K, 4, continuous in sign), from far to near.
+      Positions (M, K, 3) and quaternions (M, K, 4, continuous in sign), from the far end to the pose.
     """
     count = position.shape[0]
     uniform_key, normal_key = jax.random.split(key)
@@ -76,7 +76,7 @@ def make_trajectories(
 
 
 def _replay(hand: Hand, target: Array) -> Array:
-    """What the wrist's PD controller reaches of targets (T, M, 6): each axis a damped mass, semi-implicit Euler."""
+    """Motion of the wrist's PD controller for targets (T, M, 6): each axis is a damped mass, semi-implicit Euler."""
     gains = hand.wrist
     mass, inertia = hand.wrist_inertia.tolist()
     kp = jnp.array([gains.slide_kp] * 3 + [gains.hinge_kp] * 3)
@@ -85,7 +85,7 @@ def _replay(hand: Hand, target: Array) -> Array:
     weight = jnp.array([mass] * 3 + [inertia] * 3)
 
     def step(state: tuple[Array, Array], goal: Array) -> tuple[tuple[Array, Array], Array]:
-        """One step of the wrist's servos."""
+        """Simulates one step of the wrist's servos."""
         x, v = state
         force = jnp.clip(kp * (goal - x), -limit, limit)
         v = (v + _REPLAY_DT * force / weight) / (1 + _REPLAY_DT * kv / weight)
@@ -95,6 +95,6 @@ def _replay(hand: Hand, target: Array) -> Array:
 
 
 def _perpendicular(vector: Array, axis: Array) -> Array:
-    """Unit vectors along the parts of vectors (M, 3) that are orthogonal to unit axes (M, 3)."""
+    """Normalised components of vectors (M, 3) orthogonal to unit axes (M, 3)."""
     part = vector - jnp.sum(vector * axis, -1, keepdims=True) * axis
     return part / jnp.linalg.norm(part, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The constraint bank: what the constraints of episodes are drawn from, stacked over a pool of objects."""
+"""Constraint bank: source of the constraints of episodes, stacked over a pool of objects."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class ConstraintBank(NamedTuple):
-    """N objects; R resting poses, H headings and M reference poses each; object frame unless said otherwise.
+    """N objects with R resting poses, H headings and M reference poses each; object frame unless stated otherwise.
 
     A compiled reset gathers from it by object index. The axis V has two regions: 0 for the whole surface, 1 for the
     graspable region of an affordance.
@@ -27,7 +27,7 @@ class ConstraintBank(NamedTuple):
     avoid: Array
     """(N, P) bool, the avoid region."""
     rest: Array
-    """(N, R, 7) resting poses in the world; unused rows repeat earlier ones."""
+    """(N, R, 7) resting poses in the world frame; unused rows repeat earlier ones."""
     heading_position: Array
     """(N, V, H, 3)."""
     heading_direction: Array
@@ -37,7 +37,7 @@ class ConstraintBank(NamedTuple):
     heading_index: Array
     """(N, V, R, H) feasible headings of each resting pose, repeated to fill the row."""
     heading_back: Array
-    """(N, V, R, H) metres by which the position of `heading_index` moves back to stay clear of the table."""
+    """(N, V, R, H) distances by which the position of `heading_index` moves back to clear the table, m."""
     pose_q: Array
     """(N, V, M, F)."""
     pose_position: Array
@@ -53,15 +53,15 @@ class ConstraintBank(NamedTuple):
     has_affordance: Array
     """(N, R) bool: the object has an avoid region, and its graspable one can be approached in the resting pose."""
     weight: Array
-    """(N,) how often the object is drawn, in relation to the others."""
+    """(N,) relative frequency of the object; 0 if it lies too flat to be grasped."""
     mass: Array
-    """(N,) kg, before the factor of the episode."""
+    """(N,) mass before the factor of the episode, kg."""
     renewable: Array
-    """(N,) bool: grasps of the policy in training may take the place of the object's references."""
+    """(N,) bool: grasps of the policy in training may replace the object's references."""
     grasps: Array
-    """(N, V) int, how many of these grasps came so far."""
+    """(N, V) int, number of such grasps so far."""
     own: Any = {}  # noqa: RUF012 - never changed
-    """Columns (N, ...) of single constraints by their names (`Constraint.columns`)."""
+    """Columns (N, ...) of single constraints by name (`Constraint.columns`)."""
 
 
 _AXES = {
@@ -73,7 +73,7 @@ _AXES = {
     "has_affordance": "R",
     "pose_valid": "VRM",
 }
-"""Leading axes of an object's arrays whose sizes may differ between objects, among others."""
+"""Leading axes of an object's arrays whose sizes may differ between objects."""
 
 
 SHARED = ConstraintBank._fields[:-1]
@@ -81,26 +81,26 @@ SHARED = ConstraintBank._fields[:-1]
 
 
 def with_columns(hand: Hand, task: "TaskConfig", bank: ConstraintBank) -> ConstraintBank:
-    """The bank with the columns that the task's constraints make of it."""
+    """Returns the bank with the columns of the task's constraints."""
     found = {constraint.name: constraint.columns(hand, bank) for constraint in known(task)}
     return bank._replace(own={name: columns for name, columns in found.items() if columns is not None})
 
 
 def rows_of(bank: ConstraintBank) -> list[ConstraintBank]:
-    """Each object's arrays, without the leading axis N and columns of single constraints."""
+    """Splits a bank into objects, without the leading axis N and columns of single constraints."""
     shared = bank[: len(SHARED)]
     return [ConstraintBank(*(np.asarray(field)[n] for field in shared)) for n in range(len(bank.points))]
 
 
 def stacked(rows: Sequence[ConstraintBank]) -> ConstraintBank:
-    """The bank of objects from each one's arrays; resting poses, headings and references repeat up to the most."""
+    """Stacks the rows of objects into a bank; resting poses, headings and references are repeated up to the longest."""
     most = {
         axis: max(getattr(row, name).shape[_AXES[name].index(axis)] for row in rows)
         for axis, name in (("R", "rest"), ("H", "heading_position"), ("M", "pose_q"))
     }
 
     def repeated(name: str, value: np.ndarray) -> np.ndarray:
-        """One array with as many rows along each of these axes as any object has."""
+        """Repeats the rows of an array along these axes up to the longest of any object."""
         for place, axis in enumerate(_AXES.get(name, "")):
             if axis in most:
                 value = np.take(value, np.resize(np.arange(value.shape[place]), most[axis]), place)
@@ -110,21 +110,21 @@ def stacked(rows: Sequence[ConstraintBank]) -> ConstraintBank:
 
 
 class Draw(NamedTuple):
-    """What was drawn of a bank for B episodes before their constraints are."""
+    """Draws from a bank for B episodes, before their constraints are sampled."""
 
     bank: ConstraintBank
     objects: Array
     """(B,) int."""
     rests: Array
-    """(B,) int, resting pose."""
+    """(B,) int, index of the resting pose."""
     region: Array = 0
-    """(B,) int, the axis V: that of the constraints which are asked for so far."""
+    """(B,) int, index along the axis V: the region of the constraints requested so far."""
     reference: Mapping[str, Array] = MappingProxyType({})
-    """(B,) int by the name of each constraint that is drawn from references: one that it allows, if there is any."""
+    """(B,) int by constraint, for those drawn from references: index of an allowed reference, if there is any."""
     least_force: Array = 1.0
-    """(B,) N, the least limit on a link's force under which the episode's object can be held."""
+    """(B,) least limit on a link's force with which the episode's object can be held, N."""
     disturbance: Array | None = None
-    """(B,) between 0 and 1, how far references are off (`common.task.sampling.disturbances`); None for not at all."""
+    """(B,) in [0, 1], scale of the references' errors (`common.task.sampling.disturbances`); None for no errors."""
 
     def own(self, constraint: str) -> Any:
         """Columns (B, ...) of a constraint for the drawn objects (`Constraint.columns`)."""
@@ -132,5 +132,5 @@ class Draw(NamedTuple):
 
     @property
     def allowed(self) -> Array:
-        """(B, M) bool: references that the table leaves room for."""
+        """(B, M) bool: references that clear the table."""
         return self.bank.pose_valid[self.objects, self.region, self.rests]

@@ -35,25 +35,25 @@ from congrasp.common.task.types import Array
 HEADINGS = 256
 POSES = 20
 _CLOSED_TOGETHER = 16
-"""Objects around which hands close at once, so that an accelerator has enough to do."""
+"""Objects grasped in one batch of closing hands, enough to occupy an accelerator."""
 _CLEARANCE = 0.02
-"""Metres over the table that every waypoint of a trajectory keeps."""
+"""Height over the table that every waypoint of a trajectory keeps, m."""
 SOFT = 0.002
-"""Metres that fingers may be in the table, which contacts are too soft to prevent."""
+"""Depth of fingers in the table that is tolerated because contacts are soft, m."""
 _STEEPEST_UP = 0.1
 """Largest upward component of a reference pose's approach direction."""
 
 
 def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
-    """Heading sets by the paper's rules, and procedural reference poses and trajectories, for a pool of objects.
+    """Builds a bank for a pool of objects: headings by the paper's rules, procedural reference poses and trajectories.
 
-    Those of large pools are kept on disk.
+    Banks of large pools are cached on disk.
 
     Args:
       hand: the hand.
       task: geometry of the approach.
-      objects: N objects, in the hand's size already (`common.objects.pool.scale_objects`).
-      seed: of everything random.
+      objects: N objects, scaled for the hand (`common.objects.pool.scale_objects`).
+      seed: random seed.
 
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
@@ -63,7 +63,7 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
 
 
 def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
-    """What `build_bank` returns."""
+    """Builds the bank of `build_bank` without the cache."""
     count, scale = len(objects), object_scale(hand, task)
     seeds = [(seed, n) for n in range(count)]
     rows = parallel_map(
@@ -75,6 +75,11 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
         itertools.repeat(scale, count),
         itertools.repeat(outline(hand), count),
     )
+    if not any(row["weight"] for row in rows):
+        raise CongraspError(
+            f"None of {count} objects can be grasped: in every resting pose they lie too flat on the table.",
+            "Add other objects.",
+        )
     rests = max(len(row["rest"]) for row in rows)
     for row in rows:
         fill = np.resize(np.arange(len(row["rest"])), rests)
@@ -85,7 +90,7 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
     surfaces = [np.stack([getattr(obj, name) for obj in objects]).astype(np.float32) for name in ("points", "normals")]
     key = jax.random.key(seed)
     references = _references(hand, *surfaces, *chosen, columns["rest"], key, waypoints=task.trajectory_points)
-    own = {"weight": np.ones(count, np.float32), "renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
+    own = {"renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
     own["mass"] = np.array([obj.mass for obj in objects], np.float32)
     return jax.device_put(ConstraintBank(**columns, **references, **own))
 
@@ -103,7 +108,7 @@ def _references(
     *,
     waypoints: int,
 ) -> dict[str, Array]:
-    """The bank's poses and trajectories: the hand closed around N objects (N, P, 3) at headings (N, V, M, 3)."""
+    """Poses and trajectories of the bank: the hand closed around N objects (N, P, 3) at headings (N, V, M, 3)."""
     poses = _closed(hand, points, normals, position, direction, cross)
     shape = position.shape[:-1]
     flat = Poses(*(field.reshape(-1, field.shape[-1]) for field in poses))
@@ -121,17 +126,17 @@ def _references(
 
 @functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
 def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int) -> tuple[Array, Array, Array]:
-    """A trajectory to each of M reference poses, and where the two can be used.
+    """Generates a trajectory to each of M reference poses, and checks in which resting poses they are usable.
 
     Args:
       hand: the hand.
       poses: M poses.
-      rest: (M, R, 7) resting poses of their objects.
+      rest: (M, R, 7) resting poses of the poses' objects.
       key: random key of the trajectories.
-      waypoints: K.
+      waypoints: number K of waypoints.
 
     Returns:
-      Trajectories (M, K, 3) and (M, K, 4), and (M, R) bool.
+      Trajectories (M, K, 3) and (M, K, 4), and a mask (M, R) of usable resting poses.
     """
     path, turns = make_trajectories(hand, poses.position, poses.quaternion, key, waypoints=waypoints)
     room = height_over_table(hand, poses.q, path, turns, rest) > -SOFT
@@ -139,20 +144,20 @@ def make_references(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints
 
 
 def height_over_table(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
-    """(M, R) m, how high the lowest of a hand's capsules stays over the table on the way to each of M reference poses.
+    """Least height (M, R) in m of a hand's capsules over the table along the path to each of M reference poses.
 
     Args:
       hand: the hand.
       q: (M, F) finger angles of the poses.
       path: (M, K, 3) wrist waypoints, in the object frame.
-      turns: (M, K, 4).
+      turns: (M, K, 4) wrist orientations of the waypoints.
       rest: (M, R, 7) resting poses of the objects.
     """
     return jax.lax.map(lambda row: _height_on_the_way(hand, *row), (q, path, turns, rest), batch_size=2048)
 
 
 def _height_on_the_way(hand: Hand, q: Array, path: Array, turns: Array, rest: Array) -> Array:
-    """(R,) m, `height_over_table` of one reference."""
+    """`height_over_table` (R,) of one reference, m."""
     ends = kinematics.capsules(hand, kinematics.link_transforms(hand, q)).reshape(-1, 3)
     ends = rotations.transform(path, turns, jnp.broadcast_to(ends, (len(path), *ends.shape)))
     up = rotations.to_matrix(rest[:, 3:])[:, None, None, 2]
@@ -161,10 +166,10 @@ def _height_on_the_way(hand: Hand, q: Array, path: Array, turns: Array, rest: Ar
 
 
 def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> Array:
-    """(M, R) bool: a reference pose's approach comes from above or level, and its whole trajectory stays in the air.
+    """(M, R) bool: the approach of a reference pose is from above or level, and the trajectory stays above the table.
 
     Args:
-      hand: its heading axis is used.
+      hand: the hand, for its heading axis.
       quaternion: (M, 4) wrist orientations of the poses, in the object frame.
       path: (M, K, 3) wrist waypoints.
       rest: (M, R, 7) resting poses of the objects.
@@ -177,13 +182,13 @@ def clear_of_table(hand: Hand, quaternion: Array, path: Array, rest: Array) -> A
 
 
 def above_table(path: Array, rest: Array) -> Array:
-    """(M, R) bool: all waypoints (M, K, 3) of a wrist stay over the table in the resting poses (M, R, 7) of objects."""
+    """(M, R) bool: all waypoints (M, K, 3) of a wrist are above the table, in resting poses (M, R, 7) of objects."""
     up = rotations.to_matrix(rest[..., 3:])[..., 2, :]
     return jnp.min(jnp.einsum("mri,mki->mrk", up, path), -1) + rest[..., 2] > _CLEARANCE
 
 
 def _closed(hand: Hand, points: Array, normals: Array, *headings: Array) -> Poses:
-    """Reference poses (N, V, M, ...) at headings (N, V, M, 3) by closing the hand around the objects."""
+    """Reference poses (N, V, M, ...) at headings (N, V, M, 3), by closing the hand around the objects."""
 
     def of_object(row: tuple[Array, ...]) -> Poses:
         points, normals, *headings = row
@@ -201,86 +206,112 @@ def headings_of(
     scale: float = 1.0,
     hand: Outline = CENTER,
 ) -> dict[str, np.ndarray]:
-    """What NumPy finds out about one object; resting poses without a reachable heading are left out.
+    """Computes headings and resting poses of one object; resting poses without a reachable heading are dropped.
+
+    An object that lies too flat in all of them, such as a wide board, is given weight 0: no episode draws it.
 
     Args:
       task: geometry of the approach.
       obj: the object.
-      seed: of its headings.
-      given: `HEADINGS` headings to take instead of sampled ones.
-      scale: of the object; the rules' lengths follow it, so that a larger hand gets the headings of the smaller object.
-      hand: what must stay clear of the table.
+      seed: seed of the headings.
+      given: `HEADINGS` headings that replace sampled ones.
+      scale: scale of the object; the lengths of the rules scale with it, so that a larger hand gets the headings of the
+        smaller object.
+      hand: outline that must clear the table.
 
     Raises:
-      CongraspError: it is too wide (`TooWideError`), or can be approached in none of its resting poses.
+      CongraspError: the object is too wide (`TooWideError`), or cannot be approached in any of its resting poses.
     """
     rng = np.random.default_rng(seed)
     inward, width = scale * INWARD, max_width(hand, scale)
+    opposed = task.headings != "center" and given is None
     whole, graspable = (
-        given or sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width)
+        given
+        or sample_headings(
+            obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width, opposed=opposed
+        )
         for use in (False, True)
     )
-    assert whole is not None, "only the graspable region may be out of reach"
+    assert whole is not None, "only the graspable region may be unreachable"
     sets = [whole, graspable or whole]
-    own = CENTER if task.headings == "center" else hand
-    # Captured headings may be off by a centimetre, and a hand held what they are of.
-    regions = [None, obj.non_graspable_points if graspable is not None and given is None else None]
-    found = [
-        within_reach(headings, obj.points, obj.rest_poses, own, avoid)
-        for headings, avoid in zip(sets, regions, strict=True)
-    ]
-    reachable = np.stack([fine for _, fine in found])
-    if task.headings == "above" and reachable[0].any():
-        steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
-        reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
+    # Captured headings may be off by a centimetre, but a hand did hold their objects.
+    avoid = obj.non_graspable_points if graspable is not None and given is None else None
+    cleared, reachable, too_flat = _reachable(task, obj, sets, hand, avoid, opposed=opposed)
     usable = np.flatnonzero(reachable[0].any(-1))
     if len(usable) == 0:
         raise CongraspError(
             f"The object '{obj.name}' cannot be approached in any of its resting poses.",
-            "Scale it, or leave it out.",
+            "Scale it or remove it.",
         )
-    reachable, rest = reachable[:, usable], obj.rest_poses[usable]
+    reachable = reachable[:, usable]
+    # (V, R, H, 3), the positions that the table leaves.
+    positions = np.array([[region[rest].position for rest in usable] for region in cleared])
     index = np.array([[_repeated(row) for row in region] for region in reachable])
-    back = np.array(
-        [
-            [np.linalg.norm(cleared[rest].position - headings.position, axis=-1) for rest in usable]
-            for headings, (cleared, _) in zip(sets, found, strict=True)
-        ]
-    )
+    back = np.linalg.norm(positions - np.array([headings.position for headings in sets])[:, None], axis=-1)
     chosen = [_spread(rng, region) for region in reachable]
-    at = [
-        np.stack([cleared[usable[r]].position[h] for r, h in zip(*some, strict=True)])
-        for some, (cleared, _) in zip(chosen, found, strict=True)
-    ]
     keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
-    avoid = obj.non_graspable_points[keep]
+    avoided = obj.non_graspable_points[keep]
     floats = {
         "points": obj.points[keep],
-        "rest": rest,
+        "rest": obj.rest_poses[usable],
         **{f"heading_{name}": np.stack([getattr(s, name) for s in sets]) for name in Headings._fields},
         "heading_back": np.take_along_axis(back, index, -1),
-        "chosen_position": np.stack(at),
+        "chosen_position": np.stack([p[r, h] for p, (r, h) in zip(positions, chosen, strict=True)]),
         "chosen_direction": np.stack([s.direction[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
         "chosen_cross": np.stack([s.cross[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
     }
     return {
         **{name: value.astype(np.float32) for name, value in floats.items()},
-        "avoid": avoid,
+        "avoid": avoided,
         "heading_index": index.astype(np.int32),
-        "has_affordance": (graspable is not None) & avoid.any() & reachable[1].any(-1),
+        "weight": np.float32(not too_flat),
+        "has_affordance": (graspable is not None) & avoided.any() & reachable[1].any(-1),
     }
 
 
+def _reachable(
+    task: TaskConfig,
+    obj: GraspObject,
+    sets: Sequence[Headings],
+    hand: Outline,
+    avoid: np.ndarray | None,
+    *,
+    opposed: bool,
+) -> tuple[list[list[Headings]], np.ndarray, bool]:
+    """Headings of V = 2 regions moved clear of the table, (V, R, H) bool where they are feasible, and "too flat".
+
+    Args:
+      task: kind of headings.
+      obj: the object.
+      sets: headings for the whole surface, and for the graspable region.
+      hand: outline that must clear the table.
+      avoid: (P,) bool, avoid region of sampled headings; None for captured ones, or without a graspable region.
+      opposed: see `within_reach`.
+    """
+    own = CENTER if task.headings == "center" else hand
+    found = [
+        within_reach(headings, obj, obj.rest_poses, own, region, opposed=opposed)
+        for headings, region in zip(sets, (None, avoid), strict=True)
+    ]
+    if too_flat := not found[0][1].any():
+        found[0] = within_reach(sets[0], obj, obj.rest_poses, own, opposed=False)
+    reachable = np.stack([fine for _, fine in found])
+    if task.headings == "above" and reachable[0].any():
+        steep = np.array([[above(headings, rest) for rest in obj.rest_poses] for headings in sets])
+        reachable = np.where((reachable & steep).any(-1, keepdims=True), reachable & steep, reachable)
+    return [cleared for cleared, _ in found], reachable, too_flat
+
+
 def _repeated(which: np.ndarray) -> np.ndarray:
-    """(H,) indices of what is true in (H,), repeated; zeros where nothing is."""
+    """Indices (H,) of the true entries of a mask (H,), repeated; zeros if there are none."""
     indices = np.flatnonzero(which)
     return np.resize(indices, HEADINGS) if len(indices) else np.zeros(HEADINGS, int)
 
 
 def _spread(rng: np.random.Generator, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Resting poses (M,) and headings (M,) of reference poses, as many for each resting pose that allows any (R, H).
+    """Draws resting poses (M,) and headings (M,) of references, evenly over resting poses with a heading (R, H).
 
-    Where none does, every heading is as likely as another.
+    If there is none, all headings are equally likely.
     """
     rests = np.flatnonzero(allowed.any(1)) if allowed.any() else np.arange(len(allowed))
     rests = np.resize(rng.permutation(rests), POSES)

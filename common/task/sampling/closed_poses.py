@@ -1,7 +1,7 @@
-"""Reference poses made by closing the hand around an object without physics.
+"""Generates reference poses by closing the hand around an object, without physics.
 
-They stand in for final states of a trained policy's grasps until there is one: the wrist is put where the heading wants
-it, and every finger closes from the widest pose until its skin meets the surface.
+They substitute for the final states of a trained policy's grasps until there is a policy. The wrist is aligned with the
+heading, and every finger closes from the widest pose until its skin touches the surface.
 """
 
 import functools
@@ -24,7 +24,7 @@ _STEPS = 40
 
 
 class Poses(NamedTuple):
-    """Reference poses, any number M, in the object frame."""
+    """M reference poses in the object frame."""
 
     q: Array
     """(M, F) finger angles."""
@@ -36,9 +36,9 @@ class Poses(NamedTuple):
 
 @functools.cache
 def _fingers(hand: Hand) -> tuple[np.ndarray, np.ndarray, int]:
-    """Finger index of every joint (F,) and of every keypoint (P,; -1 for the palm), and the number of fingers.
+    """Finger indices of the joints (F,) and of the keypoints (P,; -1 for the palm), and the number of fingers.
 
-    Fingers that a motor moves together are one.
+    Fingers moved by the same motor count as one.
     """
     roots = [next(iter(chain_of(hand, link.name)), "") for link in hand.links]
     owners = np.split(transmission(hand).motor, np.cumsum([len(link.joints) for link in hand.links])[:-1])
@@ -54,7 +54,7 @@ def _fingers(hand: Hand) -> tuple[np.ndarray, np.ndarray, int]:
 def closed_poses(
     hand: Hand, points: Array, normals: Array, heading_position: Array, direction: Array, cross: Array
 ) -> Poses:
-    """Poses at M headings on one object.
+    """Closes the hand at M headings on one object.
 
     Args:
       hand: the hand.
@@ -70,11 +70,11 @@ def closed_poses(
     goal = HeadingGoal(heading_position, direction, cross)
 
     def close(center: Array) -> Array:
-        """(M, F) angles of fingers that close until they touch, with the hand centre (M, 3) at the heading."""
+        """Angles (M, F) of fingers closed until they touch, with the hand centre (M, 3) at the heading."""
         position, quaternion = heading_wrist_pose(hand, goal, center)
 
         def clear(fraction: Array) -> Array:
-            """(M, fingers) bool: fingers at this fraction of their way do not reach into the object."""
+            """(M, fingers) bool: fingers at this fraction of their range do not penetrate the object."""
             q = closure_pose(hand, fraction[None])
             own = kinematics.keypoints(hand, kinematics.link_transforms(hand, q))
             here = rotations.transform(position, quaternion, jnp.broadcast_to(own, (count, *own.shape)))
@@ -92,7 +92,7 @@ def closed_poses(
 
     open_center = jnp.broadcast_to(jnp.array(kinematics.grasp_frame(hand).center), (count, 3))
     q = close(open_center)
-    # Closing moves the hand centre; put the wrist back so that it lies on the heading position, and close again.
+    # Closing moves the hand centre: realign the wrist with the heading position, and close again.
     center = kinematics.hand_center(hand, kinematics.keypoints(hand, kinematics.link_transforms(hand, q)))
     q = close(center)
     position, quaternion = heading_wrist_pose(hand, goal, center)

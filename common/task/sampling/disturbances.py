@@ -1,8 +1,8 @@
-"""Errors that references of people's hands have, for training.
+"""Disturbs references like captured human grasps, for training.
 
-A captured pose is off by some tenths of a radian in its joints and by a centimetre in its wrist, its fingers are more
-or less closed than those of the hand that follows it, and the waypoints of a captured path jitter. What an episode is
-asked for is disturbed by an amount of its own, between nothing and all of the below.
+In a captured pose, joints are off by some tenths of a radian and the wrist by a centimetre, the fingers are more or
+less closed than those of the hand that follows it, and the waypoints of a captured path jitter. The size of the
+disturbance is drawn for each episode, between none and the maxima below.
 """
 
 import jax
@@ -16,7 +16,7 @@ from congrasp.common.task.types import Array
 JOINTS = 0.3
 """rad, largest standard deviation of an independent error of every finger joint."""
 CLOSURE = (0.6, 1.1)
-"""Least and greatest share of the way from the open hand to the reference's fingers that is asked for."""
+"""Least and greatest requested share of the range from the open hand to the reference's fingers."""
 WRIST = 0.01, 0.2
 """m and rad, largest standard deviation of the wrist's errors along and about each axis."""
 JITTER = 0.005
@@ -24,12 +24,12 @@ JITTER = 0.005
 
 
 def disturbed_fingers(hand: Hand, q: Array, amount: Array, key: Array) -> Array:
-    """Reference fingers (B, F) with errors, within their limits.
+    """Disturbs reference fingers (B, F), within their limits.
 
     Args:
       hand: the hand.
-      q: (B, F) rad.
-      amount: (B,) between 0 and 1, share of the largest errors.
+      q: (B, F) finger angles, rad.
+      amount: (B,) between 0 and 1, scale of the errors.
       key: random key.
     """
     closure_key, joint_key = jax.random.split(key)
@@ -41,14 +41,14 @@ def disturbed_fingers(hand: Hand, q: Array, amount: Array, key: Array) -> Array:
 
 
 def disturbed_wrist(position: Array, quaternion: Array, amount: Array, key: Array) -> tuple[Array, Array]:
-    """Wrist poses (B, K, 3), (B, K, 4) moved and turned by one error for all K, with waypoints that jitter.
+    """Disturbs wrist poses (B, K, 3), (B, K, 4) by one rigid motion for all K, with jitter of the waypoints.
 
-    All turn about the last one, so that a path keeps its shape.
+    All rotate about the last one, so that a path keeps its shape.
 
     Args:
-      position: m, object frame.
-      quaternion: wrist frame to object frame.
-      amount: (B,) between 0 and 1, share of the largest errors.
+      position: positions in the object frame, m.
+      quaternion: rotations from the wrist frame to the object frame.
+      amount: (B,) between 0 and 1, scale of the errors.
       key: random key.
     """
     move_key, turn_key, jitter_key = jax.random.split(key, 3)

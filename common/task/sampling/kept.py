@@ -1,4 +1,4 @@
-"""Constraint banks of large pools, kept on disk: they follow from objects, hand and task, and take long to build."""
+"""Disk cache of constraint banks of large pools: they depend only on objects, hand and task, and take long to build."""
 
 import dataclasses
 import hashlib
@@ -19,20 +19,20 @@ from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.wire.codec import Message
 
 LEAST_OBJECTS = 64
-"""Pools from this size on are worth a file."""
+"""Pools of at least this size are cached."""
 MOST_FILES = 8
-"""Banks that are kept; that of 800 objects has some 50 MB."""
+"""Most banks in the cache; that of 800 objects takes about 50 MB."""
 _IRRELEVANT = (
     *("reward", "control", "mass_range", "friction_range", "gain_range", "hold_steps", "drop_height", "disturbed"),
     *("p_", "observation", "history", "sensing"),
 )
-"""Beginnings of the names of settings that no bank depends on."""
+"""Prefixes of the settings that no bank depends on."""
 
 
 def kept_bank(
     hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, build: Callable[[], ConstraintBank]
 ) -> ConstraintBank:
-    """Returns the bank that `build` makes of these arguments, from disk if it was made before."""
+    """Returns the bank built by `build` from these arguments, from the cache if possible."""
     if len(objects) < LEAST_OBJECTS:
         return build()
     path = cache_folder("banks") / f"{_key(hand, task, objects, seed)}.safetensors"
@@ -44,7 +44,7 @@ def kept_bank(
 
 
 def _key(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> str:
-    """What a bank depends on, the code and the device's arithmetic included, as a file's name."""
+    """File name from everything that a bank depends on, including the code and the device's arithmetic."""
     code = source_digest(congrasp.common)
     settings = {name: value for name, value in dataclasses.asdict(task).items() if not name.startswith(_IRRELEVANT)}
     device = jax.local_devices()[0].device_kind

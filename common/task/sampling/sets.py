@@ -17,40 +17,40 @@ from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode
 
 SUFFIX = ".constraints.safetensors"
 REGIONS = ("whole surface", "graspable region")
-"""The axis V: constraints for the whole surface, and for the graspable region alone."""
+"""The axis V: constraints for the whole surface, and for the graspable region only."""
 FORMAT = 2
-_LARGEST = 100.0  # m or rad
-_MASS = 0.2  # kg of an object whose set is of a time when sets did not say it
+_LARGEST = 100.0  # tolerance, m or rad
+_MASS = 0.2  # mass in kg of an object whose set was written before sets recorded it
 MEANING = {
     "surface/points": "(P, 3) m, object frame",
-    "surface/minus": "(P,) bool, the point belongs to the avoid region",
-    "rest": "(R, 7) resting poses in the world, position (m) and quaternion; the table's top is at z = 0",
-    "heading/position": "(V, H, 3) m, object frame: where the hand's centre should be",
-    "heading/direction": "(V, H, 3) unit, object frame: the way the hand moves",
+    "surface/avoid": "(P,) bool, the point belongs to the avoid region",
+    "rest": "(R, 7) resting poses in the world frame, position (m) and quaternion; the table's top is at z = 0",
+    "heading/position": "(V, H, 3) m, object frame: target of the hand's centre",
+    "heading/direction": "(V, H, 3) unit, object frame: direction in which the hand moves",
     "heading/cross": "(V, H, 3) unit, object frame: along the hand's cross-finger axis",
-    "heading/allowed": "(V, R, H) bool, the table leaves room for the heading",
-    "heading/back": "(V, R, H) m by which the position moves back along the direction to stay clear of the table",
+    "heading/allowed": "(V, R, H) bool, the heading clears the table",
+    "heading/back": "(V, R, H) m by which the position moves back along the direction to clear the table",
     "pose/q": "(V, M, F) rad, finger joints",
     "pose/position": "(V, M, 3) m, wrist in the object frame",
     "pose/quaternion": "(V, M, 4) wrist frame to object frame",
     "trajectory/position": "(V, M, K, 3) m, wrist waypoints in the object frame; trajectory m ends at pose m",
     "trajectory/quaternion": "(V, M, K, 4) wrist frame to object frame",
-    "pose/allowed": "(V, R, M) bool, the table leaves room for the pose and its trajectory",
+    "pose/allowed": "(V, R, M) bool, the pose and its trajectory clear the table",
     "heading/training": "(V, H) bool, the heading is for training (80 % are); the others are held out",
-    "pose/training": "(V, M) bool, the same for pose m and trajectory m (captured: 80 % of the data set's)",
+    "pose/training": "(V, M) bool, the same for pose m and trajectory m (captured: 80 % of those of the data set)",
     "visual/vertices": "(n, 3) m, object frame",
     "visual/faces": "(m, 3) indices of vertices",
 }
 
 
 def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
-    """The constraint bank that episodes are drawn from, of constraint sets of one hand.
+    """Builds the constraint bank of episodes from constraint sets of one hand.
 
-    Sets may differ in their numbers of resting poses, headings and references: they are repeated to the largest.
+    Sets may differ in their numbers of resting poses, headings and references: shorter ones are repeated.
 
     Args:
       sets: N constraint sets.
-      split: takes all constraints, those for training, or those that are held out.
+      split: selects all constraints, those for training, or the held-out ones.
 
     Raises:
       CongraspError: the sets are of different hands or sizes, or one of them has no heading left.
@@ -76,21 +76,21 @@ def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
 
 
 def _row(made: Message, split: Split) -> ConstraintBank:
-    """One set as a row of a constraint bank: what belongs to the split, in resting poses that allow a heading."""
+    """Converts a set to a row of a constraint bank: constraints of the split in resting poses with a heading."""
     arrays = made.arrays
     heading, pose = (_allowed(made, kind, split) for kind in ("heading", "pose"))
     usable = np.flatnonzero(heading[0].any(-1))
     if len(usable) == 0:
         raise CongraspError(
             f"The constraint set of '{made.meta['object']}' has no heading ({split}) in any resting pose.",
-            "Leave it out, or take another split.",
+            "Remove it or use another split.",
         )
     heading, back = heading[:, usable], arrays["heading/back"][:, usable]
     count = heading.shape[-1]
     index = np.array([[np.resize(np.flatnonzero(row) if row.any() else [0], count) for row in v] for v in heading])
     return ConstraintBank(
         points=arrays["surface/points"],
-        avoid=arrays["surface/minus"],
+        avoid=arrays["surface/avoid"],
         rest=arrays["rest"][usable],
         heading_position=arrays["heading/position"],
         heading_direction=arrays["heading/direction"],
@@ -103,7 +103,7 @@ def _row(made: Message, split: Split) -> ConstraintBank:
         trajectory_position=arrays["trajectory/position"],
         trajectory_quaternion=arrays["trajectory/quaternion"],
         pose_valid=pose[:, usable],
-        has_affordance=arrays["surface/minus"].any() & heading[1].any(-1),
+        has_affordance=arrays["surface/avoid"].any() & heading[1].any(-1),
         weight=np.float32(1.0),
         mass=np.float32(made.meta.get("object_mass", _MASS)),
         renewable=np.bool_(False),
@@ -112,13 +112,13 @@ def _row(made: Message, split: Split) -> ConstraintBank:
 
 
 def _allowed(made: Message, kind: Literal["heading", "pose"], split: Split) -> np.ndarray:
-    """(V, R, H or M) bool, the headings or references of a split for which the table leaves room."""
+    """(V, R, H or M) bool: headings or references of a split that clear the table."""
     allowed, training = made.arrays[f"{kind}/allowed"], made.arrays[f"{kind}/training"]
     return allowed & _belongs(training, split)[:, None]
 
 
 def _belongs(training: np.ndarray, split: Split) -> np.ndarray:
-    """(V, M) bool, what belongs to a split, of what is for training (V, M)."""
+    """Mask (V, M) of the members of a split, from the mask of those for training (V, M)."""
     return {"all": np.ones_like(training), "training": training, "held-out": ~training}[split]
 
 
@@ -126,9 +126,9 @@ def load(path: pathlib.Path) -> Message:
     """Reads a set.
 
     Raises:
-      CongraspError: no such file, another kind of file, or damaged content.
+      CongraspError: the file is missing, of another kind, or damaged.
     """
-    remedy = "Make it anew with 'congrasp constraints generate'."
+    remedy = "Run 'congrasp constraints generate' again."
     try:
         message = decode(read_file(path, MAX_MESSAGE))
     except OSError as error:
@@ -147,22 +147,22 @@ def load(path: pathlib.Path) -> Message:
 
 
 def _check(message: Message) -> None:
-    """An error for facts of another kind, and for arrays that are not what `MEANING` says."""
+    """Raises an error for invalid metadata, and for arrays that do not match `MEANING`."""
     meta, sizes = message.meta, {"V": len(REGIONS), "F": len(_names(message.meta.get("finger_joints")))}
     for name in ("object", "hand"):
         file_name(meta.get(name), f"the {name} of a constraint set")
     scale = meta.get("object_scale")
     if not isinstance(scale, (int, float)) or not 0 < scale <= 100 or not isinstance(meta.get("object_digest"), str):
-        raise ValueError("its object_scale or object_digest is none")
+        raise ValueError("its object_scale or object_digest is invalid")
     mass = meta.get("object_mass", _MASS)
     if isinstance(mass, bool) or not isinstance(mass, (int, float)) or not 0 < mass <= 1000:
-        raise ValueError("its object_mass is none")
+        raise ValueError("its object_mass is invalid")
     if len(_names(meta.get("variants"))) != len(REGIONS):
         raise ValueError(f"it has other variants than {', '.join(REGIONS)}")
     sizes = check_arrays(message.arrays, MEANING, indices=("visual/faces",), largest=_LARGEST, sizes=sizes)
     faces = message.arrays["visual/faces"]
     if faces.min() < 0 or faces.max() >= sizes["n"]:
-        raise ValueError("visual/faces names vertices that are not there")
+        raise ValueError("visual/faces names vertices that do not exist")
 
 
 def _names(value: Any) -> list[str]:
@@ -172,7 +172,7 @@ def _names(value: Any) -> list[str]:
 def load_for(
     folder: pathlib.Path, objects: Sequence[GraspObject], split: Split = "all"
 ) -> tuple[list[GraspObject], list[Message]]:
-    """The objects that have a set with a heading of the split in a folder, and their sets.
+    """Returns the objects that have a set in a folder with a heading of the split, and their sets.
 
     Raises:
       CongraspError: a set cannot be read, or was made for another object of the same name.
@@ -183,7 +183,9 @@ def load_for(
         if path.is_file():
             made = load(path)
             if made.meta["object_digest"] != store.digest(obj):
-                raise CongraspError(f"{path} was made for another object '{obj.name}'.", "Name that object's folder.")
+                raise CongraspError(
+                    f"{path} was made for another object '{obj.name}'.", "Pass the folder of that object."
+                )
             if _allowed(made, "heading", split)[0].any():
                 chosen.append(obj)
                 sets.append(made)

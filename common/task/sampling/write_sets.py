@@ -1,4 +1,4 @@
-"""Makes constraint sets, the files that `common.task.sampling.sets` reads, and describes them."""
+"""Generates constraint sets, the files read by `common.task.sampling.sets`, and describes them."""
 
 import pathlib
 from collections.abc import Sequence
@@ -24,14 +24,14 @@ _TRAINING = 0.8
 def make_sets(
     hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, bank: ConstraintBank | None = None
 ) -> list[Message]:
-    """The constraint set of each object, as training and evaluation make it.
+    """Generates the constraint set of each object in the same way as training and evaluation.
 
     Args:
       hand: the hand.
       task: geometry of the approach.
       objects: the objects.
-      seed: of the constraints.
-      bank: of these objects in the hand's size, where it is there already; its reference poses are kept.
+      seed: seed of the constraints.
+      bank: an existing bank of these objects, scaled for the hand, whose reference poses are used. None builds one.
 
     Raises:
       CongraspError: an object has no heading that the hand can reach in any resting pose.
@@ -61,19 +61,19 @@ def set_of(
     pose_training: np.ndarray | None = None,
     heading_training: np.ndarray | None = None,
 ) -> Message:
-    """The constraint set of one object.
+    """Returns the constraint set of one object.
 
     Args:
       hand: the hand.
-      row: of the constraint bank, without the axis of the objects.
+      row: row of the constraint bank, without the axis of the objects.
       obj: the object.
-      seed: of the constraints.
-      about: further facts for the file.
-      pose_training: (M,) bool, the references for training; by default the first 80 %, as in evaluations
+      seed: seed of the constraints.
+      about: additional metadata of the file.
+      pose_training: (M,) bool, references for training; by default the first 80 %, as in evaluations
         (`services.evaluate.references`).
-      heading_training: (H,) bool, the headings for training; by default 80 % that are drawn from the seed.
+      heading_training: (H,) bool, headings for training; by default 80 % drawn with the seed.
     """
-    # The bank fills an object's resting poses up to the most of any object by repeating them.
+    # The bank pads an object's resting poses to the most of any object by repetition.
     again = np.flatnonzero((row.rest[1:] == row.rest[0]).all(-1))
     rests = int(again[0]) + 1 if len(again) else len(row.rest)
     allowed = np.zeros((len(REGIONS), rests, row.heading_position.shape[1]), bool)
@@ -88,7 +88,7 @@ def set_of(
         heading_training = for_training(row.heading_position.shape[1], seed)
     arrays = {
         "surface/points": row.points,
-        "surface/minus": row.avoid,
+        "surface/avoid": row.avoid,
         "rest": row.rest[:rests],
         "heading/position": row.heading_position,
         "heading/direction": row.heading_direction,
@@ -127,30 +127,30 @@ def set_of(
 
 
 def for_training(count: int, seed: int | None = None) -> np.ndarray:
-    """(count,) bool, true for 80 % (rounded up): drawn from the seed, or the first ones without one."""
+    """(count,) bool, True for 80 % (rounded up): drawn with the seed or, without a seed, the first ones."""
     order = np.arange(count) if seed is None else np.random.default_rng(seed).permutation(count)
     return np.asarray(order < np.ceil(_TRAINING * count))
 
 
 def _twice(training: np.ndarray) -> np.ndarray:
-    """(V, M) of (M,): the same in both regions."""
+    """Repeats (M,) for both regions: (V, M)."""
     return np.tile(training, (len(REGIONS), 1))
 
 
 def save(constraints: Message, folder: pathlib.Path) -> pathlib.Path:
-    """Writes a set under its object's name; returns the file."""
+    """Writes a set to a file named after its object; returns the file."""
     path = folder / f"{file_name(constraints.meta['object'], 'a constraint set')}{SUFFIX}"
     write_atomically(path, encode(constraints))
     return path
 
 
 def _scale_text(scale: float) -> str:
-    """How much larger than its file the object is; empty where it is not."""
+    """Describes the scale of the object relative to its file; empty for 1."""
     return "" if scale == 1.0 else f", {scale:g} times as large, for this hand"
 
 
 def describe(constraints: Message) -> dict[str, str]:
-    """What a set holds, as text by name."""
+    """Describes the content of a set as text by name."""
     arrays, meta = constraints.arrays, constraints.meta
     allowed, poses = arrays["heading/allowed"], arrays["pose/allowed"]
     waypoints = arrays["trajectory/position"]
@@ -158,11 +158,12 @@ def describe(constraints: Message) -> dict[str, str]:
     rows = {
         "hand": f"{meta['hand']}, {len(meta['finger_joints'])} finger joints",
         "object": f"{meta['object']} ({meta['object_digest']}){_scale_text(meta['object_scale'])}",
-        "avoid region": f"{arrays['surface/minus'].mean():.0%} of {len(arrays['surface/points'])} surface points",
+        "avoid region": f"{arrays['surface/avoid'].mean():.0%} of {len(arrays['surface/points'])} surface points",
         "headings": f"{allowed.shape[2]} for each of: {', '.join(meta['variants'])}",
         "reference poses": f"{poses.shape[2]} for each",
-        "wrist trajectories": f"as many, {waypoints.shape[2]} waypoints, "
-        f"{100 * length.min():.0f} to {100 * length.max():.0f} cm long; each ends at its pose",
+        "wrist trajectories": f"equally many, {waypoints.shape[2]} waypoints, "
+        f"{100 * length.min():.0f} to {100 * length.max():.0f} cm long; "
+        " each ends at its pose",
     }
     if "source" in meta:
         rows["captured"] = f"{meta['source']}: {', '.join(meta['demonstrations'])}"
@@ -171,5 +172,5 @@ def describe(constraints: Message) -> dict[str, str]:
             f"{region}: {int(allowed[v, r].sum())} headings, {int(poses[v, r].sum())} poses"
             for v, region in enumerate(meta["variants"])
         ]
-        rows[f"resting pose {r + 1}"] = f"{100 * rest[2]:.1f} cm high; the table leaves on the {'; '.join(counts)}"
+        rows[f"resting pose {r + 1}"] = f"{100 * rest[2]:.1f} cm high; clear of the table on the {'; '.join(counts)}"
     return rows

@@ -9,13 +9,13 @@ from congrasp.common.io.pickles import read_pickles
 
 
 def read_archive(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Arrays of a file by name; those of dictionaries have the names of `common.io.pickles.read_pickle`.
+    """Reads the arrays of a file by name; those of dictionaries are named as in `common.io.pickles.read_pickle`.
 
     Raises:
-      CongraspError: it is no NPZ file, larger than the limits of `common.io.npz`, or holds what is neither a plain
-        value nor an array.
+      CongraspError: it is not an NPZ file, exceeds the limits of `common.io.npz`, or holds anything but plain values
+        and arrays.
     """
-    arrays = read_npz(path, "Get the file again.", pickled=True)
+    arrays = read_npz(path, "Download the file again.", pickled=True)
     pickles = {name: arrays.pop(name) for name, value in list(arrays.items()) if isinstance(value, bytes)}
     found = read_pickles((f"{path}, '{name[:60]}'", data) for name, data in pickles.items())
     for name, inside in zip(pickles, found, strict=True):

@@ -1,4 +1,4 @@
-"""From sequences to objects and constraint sets, with a report of what was kept and what was dropped, and why."""
+"""Builds objects and constraint sets from sequences, with a report of kept and dropped ones."""
 
 import collections
 import dataclasses
@@ -43,41 +43,41 @@ from congrasp.services.assets.objects.sources import safe_name
 Affordance = Literal["auto", "parts", "contacts", "none"]
 _Shapes = dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
 _TOUCHED = 0.03
-"""Metres around touched points that count as touched."""
+"""Radius around touched points that counts as touched, m."""
 IN_TABLE = 0.005
-"""Metres that a captured hand may be in the table where no resting pose keeps it out."""
+"""Tolerated depth of a captured hand in the table if no resting pose avoids it, m."""
 _VERTICES = 3
-"""Contact points that make a part of an object graspable (O+ in the paper)."""
+"""Least number of contact points that makes a part of an object graspable (O+ in the paper)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is made of the sequences."""
+    """Options for building sets."""
 
     headings: Literal["sampled", "demonstrated"] = "sampled"
-    """sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps."""
+    """sampled: 256 per object by the paper's rules; demonstrated: those of the captured grasps."""
     affordance: Affordance = "auto"
-    """parts: graspable are labelled parts that fingers touch; contacts: what they touch; auto: parts if labelled."""
+    """parts: labelled parts touched by fingers are graspable; contacts: the touched points; auto: parts if labelled."""
     beyond: float = BEYOND
-    """Radians by which a captured joint may exceed its limits; it is then moved to the limit. For `human` alone."""
+    """Tolerance in rad of a captured joint beyond its limits; it is then clamped. Only for `human`."""
     waypoints: int = 15
     seed: int = 0
-    """Of headings, and of the split of all sequences into training and held-out."""
+    """Seed of headings, and of the split of all sequences into training and held-out."""
 
 
 @dataclasses.dataclass
 class Report:
-    """The outcome of each sequence."""
+    """Outcome of each sequence."""
 
     kept: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     dropped: list[dict[str, str]] = dataclasses.field(default_factory=list)
 
     def drop(self, dropped: Dropped) -> None:
-        """Notes that a sequence is not used."""
+        """Records a dropped sequence."""
         self.dropped.append({"sequence": dropped.name, "rule": dropped.rule, "reason": dropped.reason})
 
     def rules(self) -> list[tuple[str, int, str]]:
-        """Of each rule its name, how many sequences it dropped, and the first one's reason."""
+        """Returns the name of each rule, the number of sequences it dropped, and the first reason."""
         counts = collections.Counter(row["rule"] for row in self.dropped)
         first = {row["rule"]: f"{row['sequence']}: {row['reason']}" for row in reversed(self.dropped)}
         return [(rule, count, first[rule]) for rule, count in counts.most_common()]
@@ -98,17 +98,17 @@ def import_sets(
     source: str,
     progress: Callable[[str], None] = lambda doing: None,
 ) -> tuple[list[GraspObject], list[Message], Report]:
-    """Objects and their constraint sets.
+    """Builds objects and their constraint sets.
 
     Args:
-      sequences: from an importer.
-      hand: whose constraints these are; any but the human one follows the demonstrations by its grasp axes.
-      options: see there.
+      sequences: sequences of an importer.
+      hand: hand of the constraints; a hand other than the human one follows the demonstrations by its grasp axes.
+      options: options for building.
       source: name of the data set.
-      progress: is told what is being done, for people.
+      progress: called with a description of the current step.
 
     Returns:
-      Objects and, in the same order, their sets; and what was kept and dropped.
+      Objects and, in the same order, their sets; and the report.
     """
     report = Report()
     read = []
@@ -131,7 +131,7 @@ def import_sets(
         except Dropped as dropped:
             report.drop(dropped)
     objects, sets = [], []
-    # Sets may be of one sequence each: 80 % are those of all sequences, not of each set's.
+    # Sets may hold a single sequence each: 80 % refers to all sequences, not to each set.
     splits = _split(groups.values(), options.seed)
     for number, (group, training) in enumerate(zip(groups.values(), splits, strict=True)):
         try:
@@ -154,14 +154,14 @@ def _rows(
     given: np.ndarray,
     training: np.ndarray,
 ) -> Iterator[dict[str, Any]]:
-    """Outcome of each of M kept demonstrations on an object.
+    """Yields the outcome of each of M kept demonstrations on an object.
 
     Args:
-      hand: whose set it is.
+      hand: hand of the set.
       obj: the object.
-      made: the set.
-      demonstrations: M of them.
-      given: (M, F) finger angles before fingers were moved apart.
+      made: the constraint set.
+      demonstrations: M demonstrations.
+      given: (M, F) finger angles before fingers were separated.
       training: (M,) bool, those for training.
     """
     usable, below = made.arrays["pose/allowed"].any((0, 1)), _from_below(hand, made)
@@ -185,27 +185,27 @@ def _rows(
 
 
 def _split(groups: Collection[_Group], seed: int) -> list[np.ndarray]:
-    """Of each group which of its demonstrations (M,) are for training, 80 % of those of all groups together."""
+    """Masks (M,) of each group's demonstrations for training, 80 % of those of all groups together."""
     ends = np.cumsum([len(group.demonstrations) for group in groups], dtype=int)
     return np.split(for_training(int(ends[-1]), seed), ends[:-1]) if len(ends) else []
 
 
 def _shapes(sequences: list[Sequence], progress: Callable[[str], None]) -> _Shapes:
-    """The objects of the sequences' meshes and their surfaces, or why a mesh cannot be used; each imported once."""
+    """Imports the sequences' meshes once each; returns objects and surfaces, or the reasons for failures."""
     names = {sequence.mesh: safe_name(sequence.object_name) for sequence in reversed(sequences)}
     shapes: _Shapes = {}
     for mesh, obj in import_meshes(names, lambda name: progress(f"Mesh of {name}")).items():
         if isinstance(obj, CongraspError):
             shapes[mesh] = obj
         else:
-            # Without labelled parts the whole surface may be grasped.
+            # Without labelled parts the whole surface is graspable.
             obj = dataclasses.replace(obj, graspable=np.ones_like(obj.graspable))
             shapes[mesh] = obj, Surface(obj)
     return shapes
 
 
 def _shape(sequence: Sequence, shapes: _Shapes) -> tuple[GraspObject, Surface]:
-    """The object of a sequence's mesh and its surface."""
+    """Returns the object of a sequence's mesh and its surface."""
     found = shapes[sequence.mesh]
     if isinstance(found, CongraspError):
         raise Dropped(sequence.name, "unusable mesh", str(found))
@@ -215,7 +215,7 @@ def _shape(sequence: Sequence, shapes: _Shapes) -> tuple[GraspObject, Surface]:
 def _labelled(
     sequence: Sequence, obj: GraspObject, demonstration: Demonstration, affordance: Affordance
 ) -> GraspObject:
-    """The object with the partition into graspable and avoid region that the grasp shows, under a name of its own."""
+    """Returns the object with the grasp's partition into graspable and avoid region, under a separate name."""
     names, clouds = _parts(sequence, obj)
     if affordance == "none" or (affordance == "auto" and not names):
         return obj
@@ -236,7 +236,7 @@ def _labelled(
 
 
 def _parts(sequence: Sequence, obj: GraspObject) -> tuple[list[str], list[np.ndarray]]:
-    """Names and points (n, 3), in the object frame, of the parts that the data set or the object's files label."""
+    """Names and points (n, 3), in the object frame, of the parts labelled by the data set or the object's files."""
     if sequence.parts:
         return [part.name for part in sequence.parts], [part.points + obj.origin for part in sequence.parts]
     if obj.part_names == UNLABELLED:
@@ -245,7 +245,7 @@ def _parts(sequence: Sequence, obj: GraspObject) -> tuple[list[str], list[np.nda
 
 
 def _with_region(sequence: Sequence, make: Callable[[], GraspObject]) -> GraspObject:
-    """The object that `make` returns; the sequence is dropped where its graspable region is too small."""
+    """Returns the object of `make`; drops the sequence if its graspable region is too small."""
     try:
         return make()
     except CongraspError as error:
@@ -253,7 +253,7 @@ def _with_region(sequence: Sequence, make: Callable[[], GraspObject]) -> GraspOb
 
 
 def _nearest(clouds: list[np.ndarray], points: np.ndarray) -> np.ndarray:
-    """(n,) index of the cloud that is nearest to each point (n, 3)."""
+    """Indices (n,) of the cloud nearest to each point (n, 3)."""
     if len(points) == 0:
         return np.zeros(0, int)
     return np.argmin([cKDTree(cloud).query(points)[0] for cloud in clouds], axis=0)
@@ -262,18 +262,17 @@ def _nearest(clouds: list[np.ndarray], points: np.ndarray) -> np.ndarray:
 def _resting_poses(
     hand: Hand, q: np.ndarray, position: np.ndarray, quaternion: np.ndarray, rest: np.ndarray
 ) -> np.ndarray:
-    """(M, R) bool, in which resting poses (R, 7) of the object each of M captured references is asked for.
+    """(M, R) bool: resting poses (R, 7) of the object in which each of M captured references is used.
 
-    Their wrist must stay over the table, and the hand out of it, as with other references. Where no resting pose allows
-    that, because captured hands are off by some millimetres, it is the one in which the hand is least deep in it,
-    if that is no deeper than `IN_TABLE`.
+    The wrist must stay above the table and the hand outside it, as for other references. If no resting pose allows
+    that, because captured hands are off by some millimetres, the one with the least depth is used, up to `IN_TABLE`.
 
     Args:
-      hand: whose references these are.
+      hand: hand of the references.
       q: (M, F) finger angles of the poses.
       position: (M, K, 3) wrist waypoints, in the object frame; the pose is the last one.
-      quaternion: (M, K, 4).
-      rest: (R, 7).
+      quaternion: (M, K, 4) orientations of the waypoints.
+      rest: (R, 7) resting poses.
     """
     rests = np.stack([rest] * len(position))
     clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, rests))
@@ -284,18 +283,18 @@ def _resting_poses(
 def _set(
     hand: Hand, group: _Group, options: Options, number: int, source: str, training: np.ndarray
 ) -> tuple[GraspObject, Message, np.ndarray]:
-    """The object, its constraint set in the size in which the hand grasps it, and the fingers (M, F) it was made of.
+    """Returns the object, its constraint set scaled for the hand, and the initial finger angles (M, F).
 
     Args:
-      hand: whose constraints these are.
+      hand: hand of the constraints.
       group: the object and its M demonstrations.
-      options: see there.
-      number: of the group, for its seed.
+      options: options for building.
+      number: number of the group, for its seed.
       source: name of the data set.
       training: (M,) bool, the demonstrations for training.
 
     Raises:
-      CongraspError: the hand can approach the object in no resting pose.
+      CongraspError: the hand cannot approach the object in any resting pose.
     """
     task = TaskConfig(hand=hand.name, trajectory_points=options.waypoints)
     obj, demonstrations, seed = group.obj, group.demonstrations, (options.seed, number)
@@ -304,7 +303,7 @@ def _set(
     given = None
     if options.headings == "demonstrated":
         given = Headings(*(np.resize(x, (HEADINGS, 3)) for x in demonstrated_headings(demonstrations, scale)))
-    # What people did is not measured against the hand's outline: their table was where it was.
+    # Human grasps are not tested against the hand's outline, since their table was elsewhere.
     fields = headings_of(task, fitting, seed, given, scale, CENTER if given else outline(hand))
     if hand is HUMAN:
         posed = tuple(np.stack([getattr(d, x) for d in demonstrations]) for x in ("q", "position", "quaternion"))
@@ -333,14 +332,14 @@ def _set(
         "object_scale": scale,
         "object_digest": store.digest(obj),
     }
-    # Demonstrated headings repeat, and each belongs where its demonstration does.
+    # Demonstrated headings repeat, and each belongs to the split of its demonstration.
     own = np.resize(training, HEADINGS) if given else None
     made = set_of(hand, row, fitting, options.seed, about, pose_training=training, heading_training=own)
     return obj, made, given_q
 
 
 def _from_below(hand: Hand, made: Message) -> np.ndarray:
-    """(M,) bool: demonstrations that every resting pose excludes, one of them only as the hand comes from below."""
+    """(M,) bool: demonstrations excluded in every resting pose, in one of them only by the approach from below."""
     names = "trajectory/position", "pose/quaternion", "rest"
     path, turn, rest = (made.arrays[name] for name in names)
     rests = np.stack([rest] * path.shape[1])
@@ -349,11 +348,11 @@ def _from_below(hand: Hand, made: Message) -> np.ndarray:
 
 
 def _twice(values: np.ndarray) -> np.ndarray:
-    """The same for both regions (2, ...): the whole surface, and the graspable region."""
+    """Repeats values for both regions (2, ...): the whole surface, and the graspable region."""
     return np.stack([values, values])
 
 
 def _ends_nearer_to_graspable(wrist: np.ndarray, points: np.ndarray, avoid: np.ndarray) -> np.ndarray:
-    """(M,) bool: wrist positions (M, 3) that agree with the affordance (`common.task.constraints.priority`)."""
+    """(M,) bool: wrist positions (M, 3) agree with the affordance (`common.task.constraints.priority`)."""
     away = np.linalg.norm(points[None] - wrist[:, None], axis=-1)
     return away[:, ~avoid].min(-1, initial=np.inf) < away[:, avoid].min(-1, initial=np.inf)

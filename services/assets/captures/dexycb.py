@@ -1,8 +1,8 @@
 """DexYCB: `<date>-subject-XX/<session>` with `meta.yml` and `pose.npz`, in metres, in the master camera's frame.
 
-`pose_y (F, n, 7)`: of each object quaternion (x, y, z, w) and position; `pose_m (F, 1, 51)`: MANO's root axis-angle, 45
-coefficients of its principal components, and a translation that is added to the vertices. What was not seen is all
-zeros, or the identity. Only the grasped object counts; which hand it is stands in `meta.yml`.
+`pose_y (F, n, 7)`: quaternion (x, y, z, w) and position of each object; `pose_m (F, 1, 51)`: MANO's root axis-angle, 45
+coefficients of its principal components, and a translation that is added to the vertices. Unobserved values are zeros,
+or the identity. Only the grasped object is used; `meta.yml` names the hand's side.
 """
 
 import pathlib
@@ -33,14 +33,14 @@ OBJECTS = (
 
 
 def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterator[Sequence | Dropped]:
-    """The sequences of a session's folder, or of all of them in a folder.
+    """Yields the sequences of a session's folder, or of all of them in a folder.
 
     Raises:
       CongraspError: there is no MANO file.
     """
     if model is None:
         raise CongraspError(
-            "DexYCB's hand poses need your own MANO_RIGHT.pkl.", f"Name it with --mano, or set {VARIABLE}."
+            "DexYCB's hand poses need your copy of MANO_RIGHT.pkl.", f"Pass it with --mano, or set {VARIABLE}."
         )
     root = next((folder for folder in (path, *path.parents) if (folder / "calibration").is_dir()), path)
     found = meshes.beside(root / "models")
@@ -50,7 +50,7 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
 
 
 def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel) -> Sequence:
-    """The sequence of a session's folder."""
+    """Reads the sequence of a session's folder."""
     meta = _yaml(name, folder / "meta.yml")
     sides = _value(name, meta, "mano_sides")
     if sides != ["right"]:
@@ -63,7 +63,9 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
         array_of(name, "pose.npz", poses, key, "F", "n", width) for key, width in (("pose_y", 7), ("pose_m", 51))
     )
     if len(objects) != len(hands) or objects.shape[1] != len(ids) or hands.shape[1] != 1:
-        raise Dropped(name, "wrong layout", f"'pose_y' {objects.shape} and 'pose_m' {hands.shape} do not fit meta.yml")
+        raise Dropped(
+            name, "wrong layout", f"'pose_y' {objects.shape} and 'pose_m' {hands.shape} do not match meta.yml"
+        )
     place, hand = objects[:, grasped], hands[:, 0]
     seen = np.isfinite(np.concatenate([place, hand], 1)).all(-1)
     present = seen & (hand != 0).any(-1) & (place[:, 4:] != 0).any(-1)
@@ -87,7 +89,7 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
 
 
 def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
-    """The settings in a YAML file."""
+    """Reads the settings of a YAML file."""
     if not path.is_file():
         raise Dropped(name, "wrong layout", f"there is no {path.name} in {path.parent}")
     try:
@@ -102,7 +104,7 @@ def _yaml(name: str, path: pathlib.Path) -> dict[str, Any]:
 
 
 def _check_structure(text: bytes) -> None:
-    """Refuses what takes a parser far longer than its length says: aliases, and values deep inside one another."""
+    """Refuses YAML that takes a parser disproportionately long: aliases and deep nesting."""
     depth = 0
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
@@ -113,14 +115,14 @@ def _check_structure(text: bytes) -> None:
 
 
 def _value(name: str, meta: dict[str, Any], key: str) -> Any:
-    """A value of `meta.yml`."""
+    """Returns a value of `meta.yml`."""
     if key not in meta:
         raise Dropped(name, "wrong layout", f"meta.yml has no '{key}'")
     return meta[key]
 
 
 def _betas(name: str, root: pathlib.Path, calibration: str) -> np.ndarray:
-    """(10,) shape parameters of a calibration."""
+    """Shape parameters (10,) of a calibration."""
     content = _yaml(name, root / "calibration" / file_name(f"mano_{calibration}", "a calibration") / "mano.yml")
     betas = np.array(content.get("betas", []), float)
     if betas.shape != (10,):

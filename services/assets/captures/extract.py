@@ -1,13 +1,14 @@
-"""From a captured sequence to a reference pose and a wrist trajectory, by the paper's rules (section Constraint Setup).
+"""Extracts a reference pose and a wrist trajectory from a captured sequence (paper, section Constraint Setup).
 
-The paper leaves some terms open; here they mean:
+Definitions of terms that the paper leaves open:
 
 * wrist-object distance: from the wrist's origin to the nearest point of the object's surface;
 * contact: a finger's skin within `CONTACT` of the surface, or below it;
 * grasped: skins of thumb and another finger within `CLOSED` of the surface, where its normals oppose each other;
 * carried: the object has moved by `CARRIED`, and the wrist by less than half as much against it;
 * continuous: the wrist moves at most `JUMP` between two frames, and at most `GAP` frames in a row are missing;
-* too complex: the path is more than `DETOUR` times its straight line, or the wrist turns by more than `TURN` in all.
+* too complex: the path is more than `DETOUR` times its straight line, or the wrist rotates by more than `TURN` in
+  total.
 """
 
 import dataclasses
@@ -24,14 +25,14 @@ from congrasp.services.assets.captures.fit import Fit, fit
 from congrasp.services.assets.captures.sequence import FINGERS, Dropped, Sequence
 
 STABLE = 5
-"""Frames that thumb and another finger must touch in a row."""
+"""Number of consecutive frames in which thumb and another finger must touch."""
 NEAREST = 0.08
-"""Least distance (m) from which a wrist must come."""
+"""Least distance from which a wrist must come, m."""
 FARTHEST = 0.20
-"""Distance (m) at which a trajectory begins at most."""
+"""Greatest distance at which a trajectory begins, m."""
 CONTACT = 0.005
 CLOSED, OPPOSITE = 0.002, -0.5
-"""Metres of skin from the surface, and cosine of its normals, where fingers oppose each other."""
+"""Distance of skin from the surface in m, and cosine of its normals, where fingers oppose each other."""
 LATER = 30
 """Most frames between the first stable contact and the grasping frame."""
 JUMP = 0.10
@@ -39,18 +40,18 @@ GAP = 3
 DETOUR = 2.0
 TURN = 2.5
 DIP = 0.01
-"""Metres by which the distance may fall, going backwards, before its maximum counts as passed."""
+"""Decrease of the distance, going backwards, after which its maximum counts as passed, m."""
 CARRIED, STILL = 0.03, 0.01
-"""Metres by which a carried object has moved, and those within which it still was in its place."""
+"""Displacement of a carried object, and tolerance within which it counts as at rest, m."""
 BEYOND = 0.1
 _RADII = np.array([[0.010] * 3, *[[0.009, 0.0075, 0.0075]] * 3, [0.009, 0.0065, 0.0065]])
-"""(5, 3) m, skin radius of each bone: those that GraspXL gives the MANO hand."""
+"""(5, 3) skin radius of each bone, as in GraspXL's MANO hand, m."""
 _ALONG = (0.25, 0.5, 0.75, 1.0)
 _SPACING, _SAMPLES = 0.0015, (4000, 40_000)
 
 
 class Surface:
-    """A dense sample of an object's surface, to measure distances to it."""
+    """Dense sample of an object's surface for distance queries."""
 
     def __init__(self, obj: GraspObject):
         mesh = trimesh.Trimesh(obj.visual_vertices, obj.visual_faces, process=False)
@@ -60,54 +61,54 @@ class Surface:
         self._tree = cKDTree(self.points)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """(...,) distances of points (..., 3) in the object frame, m; negative inside."""
+        """Distances (...,) of points (..., 3) in the object frame, m; negative inside."""
         away, nearest = self._tree.query(points)
         inside = ((points - self.points[nearest]) * self._normals[nearest]).sum(-1) < 0
         return np.where(inside, -away, away)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
-        """(..., 3) outward unit normals of the surface nearest to points (..., 3)."""
+        """Outward unit normals (..., 3) of the surface nearest to points (..., 3)."""
         return np.asarray(self._normals[self._tree.query(points)[1]])
 
     def within(self, points: np.ndarray, radii: np.ndarray) -> np.ndarray:
-        """(n, 3) samples of the surface within any of the balls (M, 3), (M,)."""
+        """Samples (n, 3) of the surface within any of the balls (M, 3), (M,)."""
         return self.points[sorted(set().union(*self._tree.query_ball_point(points, radii)))]
 
 
 @dataclasses.dataclass(frozen=True)
 class Demonstration:
-    """What is kept of a sequence, in the object frame."""
+    """Result of a sequence, in the object frame."""
 
     name: str
     frame: int
     """The grasping frame."""
     later: int
-    """Frames between the first stable contact and that in which the fingers have closed."""
+    """Frames between the first stable contact and the closed fingers."""
     start: int
     """The frame of the farthest distance."""
     fit: Fit
-    """Finger angles of the `human` hand and residual, before the limits."""
+    """Finger angles of the `human` hand and residual, before clamping to the limits."""
     q: np.ndarray
-    """(20,) finger angles within its limits."""
+    """(20,) finger angles within the limits."""
     position: np.ndarray
-    """(K, 3) wrist waypoints, from far to near; the last is the reference pose's."""
+    """(K, 3) wrist waypoints from the far end; the last is the reference pose's."""
     quaternion: np.ndarray
     """(K, 4)."""
     contact: np.ndarray
-    """(n, 3) points of the object's surface that fingers touch as soon as their contact is stable."""
+    """(n, 3) points of the object's surface touched by fingers from stable contact on."""
 
 
 def extract(
     sequence: Sequence, obj: GraspObject, surface: Surface, waypoints: int, beyond: float = BEYOND
 ) -> Demonstration:
-    """The reference pose and the trajectory of a sequence.
+    """Extracts the reference pose and the trajectory of a sequence.
 
     Args:
-      sequence: of frames.
-      obj: its object; `origin` says where the mesh file's origin is.
-      surface: of the object.
-      waypoints: K.
-      beyond: radians by which a captured joint may exceed its limits; it is then moved to the limit.
+      sequence: captured sequence.
+      obj: its object; `origin` is the mesh file's origin.
+      surface: surface of the object.
+      waypoints: number K of waypoints.
+      beyond: tolerance of a captured joint beyond its limits, rad; it is then clamped.
 
     Raises:
       Dropped: a rule excludes the sequence.
@@ -118,7 +119,7 @@ def extract(
         raise Dropped(sequence.name, "frames missing", "hand and object are in no frame together")
     if far[sequence.present].min() > 1.0:
         nearest = far[sequence.present].min()
-        reason = f"the wrist stays {nearest:.3g} m from the object: are its positions in metres?"
+        reason = f"the wrist stays {nearest:.3g} m from the object: check that its positions are in metres"
         raise Dropped(sequence.name, "wrong units", reason)
     skin = position[:, None, None] + np.einsum("tij,tfkj->tfki", rotation, sequence.joints)
     first = _first_contact(sequence, surface, skin)
@@ -151,26 +152,26 @@ def approach(
     frame: int,
     waypoints: int,
 ) -> tuple[int, np.ndarray, np.ndarray]:
-    """The wrist trajectory that leads to a grasp.
+    """Extracts the wrist trajectory that leads to a grasp.
 
     Args:
-      name: of the motion.
-      position: (T, 3) of the wrist, m, object frame.
-      rotation: (T, 3, 3) of the wrist.
+      name: name of the motion.
+      position: (T, 3) positions of the wrist, object frame, m.
+      rotation: (T, 3, 3) rotations of the wrist.
       far: (T,) wrist-object distance, m.
-      present: (T,) bool, which frames are known.
+      present: (T,) bool, True for known frames.
       frame: the grasping frame.
-      waypoints: K.
+      waypoints: number K of waypoints.
 
     Returns:
-      The frame of the farthest distance, and waypoints (K, 3), (K, 4) from far to near.
+      The frame of the farthest distance, and waypoints (K, 3), (K, 4) from there to the grasp.
 
     Raises:
       Dropped: the wrist starts too near, or its path is too complex.
     """
     start = _farthest(position, far, present, frame)
     if far[start] < NEAREST:
-        reason = f"the wrist comes from {100 * far[start]:.1f} cm only ({100 * NEAREST:.0f} cm are needed)"
+        reason = f"the wrist comes from only {100 * far[start]:.1f} cm ({100 * NEAREST:.0f} cm are needed)"
         raise Dropped(name, "starts too near", reason)
     frames = np.flatnonzero(present[start : frame + 1]) + start
     path, turns = _truncated(position[frames], rotation[frames], far[frames])
@@ -186,7 +187,7 @@ def in_object_frame(sequence: Sequence, obj: GraspObject) -> tuple[np.ndarray, n
 
 
 def _first_contact(sequence: Sequence, surface: Surface, skin: np.ndarray) -> int:
-    """The grasping frame that the data set names, or the first frame of stable contact."""
+    """Grasping frame named by the data set, or the first frame of stable contact."""
     if sequence.grasp is not None:
         if not sequence.present[sequence.grasp]:
             reason = f"hand or object is missing in its grasping frame {sequence.grasp}"
@@ -211,16 +212,16 @@ def _first_contact(sequence: Sequence, surface: Surface, skin: np.ndarray) -> in
 
 
 def _opposed(sequence: Sequence, surface: Surface, skin: np.ndarray, first: int) -> int:
-    """The first frame from that of stable contact on in which thumb and another finger have grasped.
+    """First frame, from that of stable contact on, in which thumb and another finger have grasped.
 
     Frames count while the object is not carried, at most `LATER` of them. If fingers never close in them, it is the
     frame in which an opposing pair comes nearest to the surface; the first one if none opposes.
 
     Args:
-      sequence: of frames.
-      surface: of the object.
+      sequence: captured sequence.
+      surface: surface of the object.
       skin: (T, 5, 4, 3) joints of the fingers, m, object frame.
-      first: the frame of stable contact.
+      first: frame of stable contact.
     """
     frames = np.flatnonzero(sequence.present[: first + LATER + 1])
     moved = np.linalg.norm(sequence.object_position - sequence.object_position[first], axis=-1)
@@ -236,15 +237,15 @@ def _opposed(sequence: Sequence, surface: Surface, skin: np.ndarray, first: int)
 
 
 def _before_carried(sequence: Sequence, position: np.ndarray, frame: int) -> int:
-    """The frame, or the last before it in which the object was where it was picked up, if the hand has carried it.
+    """Returns the frame or, if the object is being carried, the last one before in which it was at rest.
 
-    Skin that is a little off touches late. By then the hand may be where the table would be, were the object on it, and
-    its way there is no approach.
+    Slightly inaccurate skin touches late. By then the hand may be in the place of the table, and its path is not an
+    approach.
 
     Args:
-      sequence: of frames.
-      position: (T, 3) of the wrist, m, object frame.
-      frame: of stable contact.
+      sequence: captured sequence.
+      position: (T, 3) positions of the wrist, object frame, m.
+      frame: frame of stable contact.
     """
     known = np.flatnonzero(sequence.present[: frame + 1])
     moved = np.linalg.norm(sequence.object_position[known] - sequence.object_position[frame], axis=-1)
@@ -261,13 +262,13 @@ def _bones(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _skin_balls(joints: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:
-    """Balls (n, 3), (n,) that fill the fingers with joints (5, 4, 3), larger by a margin."""
+    """Balls (n, 3), (n,) that fill fingers with joints (5, 4, 3), enlarged by a margin."""
     points, radii = _bones(joints)
     return points.reshape(-1, 3), np.broadcast_to(radii + margin, points.shape[:-1]).ravel()
 
 
 def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame: int) -> int:
-    """The frame of the local maximum of the distance, backwards from the grasping frame along continuous motion."""
+    """Frame of the local maximum of the distance, backwards from the grasping frame along continuous motion."""
     best = last = frame
     for t in range(frame - 1, -1, -1):
         if not present[t]:
@@ -282,7 +283,7 @@ def _farthest(position: np.ndarray, far: np.ndarray, present: np.ndarray, frame:
 
 
 def _fit(sequence: Sequence, frame: int) -> Fit:
-    """Finger angles of a frame: the capture's own, or fitted to its joints."""
+    """Finger angles of a frame: those of the capture, or fitted to its joints."""
     if sequence.q is not None:
         return Fit(np.asarray(sequence.q[frame], float), 0.0, 0.0)
     return fit(sequence.joints[frame])
@@ -297,7 +298,7 @@ def _check_limits(name: str, q: np.ndarray, beyond: float) -> None:
 
 
 def _truncated(path: np.ndarray, turns: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, Rotation]:
-    """The path from where it comes within `FARTHEST` for the last time; that point lies between two frames."""
+    """Path from its last entry within `FARTHEST` on; the entry point is interpolated between two frames."""
     rotation = Rotation.from_matrix(turns)
     beyond = np.flatnonzero(far > FARTHEST)
     if len(beyond) == 0 or beyond[-1] == len(far) - 1:
@@ -310,7 +311,7 @@ def _truncated(path: np.ndarray, turns: np.ndarray, far: np.ndarray) -> tuple[np
 
 
 def _check_complexity(name: str, path: np.ndarray, turns: Rotation) -> None:
-    """Drops a sequence whose path (n, 3) has too much of a detour or turns too much."""
+    """Drops a sequence whose path (n, 3) has too much detour or rotation."""
     length = np.linalg.norm(np.diff(path, axis=0), axis=-1).sum()
     straight = np.linalg.norm(path[-1] - path[0])
     if length > DETOUR * straight:
@@ -319,13 +320,13 @@ def _check_complexity(name: str, path: np.ndarray, turns: Rotation) -> None:
         )
     turn = float((turns[1:] * turns[:-1].inv()).magnitude().sum())
     if turn > TURN:
-        raise Dropped(name, "too complex", f"the wrist turns by {turn:.1f} rad on its way")
+        raise Dropped(name, "too complex", f"the wrist rotates by {turn:.1f} rad on its way")
 
 
 def _resampled(path: np.ndarray, turns: Rotation, waypoints: int) -> tuple[np.ndarray, np.ndarray]:
-    """K waypoints at equal distances along the path, with quaternions that are continuous in sign."""
+    """K waypoints at equal distances along the path, with quaternions of continuous sign."""
     length = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=-1).cumsum()])
-    # Where the wrist rests its length does not grow: of such frames the last one counts.
+    # While the wrist rests the path length does not grow: the last of such frames is used.
     keep = np.append(np.diff(length) > 1e-6, True)
     length, path, turns = length[keep], path[keep], turns[keep]
     wanted = np.linspace(length[0], length[-1], waypoints)

@@ -1,7 +1,7 @@
 """Finger angles from joint positions: a captured hand's pose projected onto the joints of the `human` hand.
 
-The two hands have bones of different lengths, so that what is fitted is the direction of every bone, in the wrist
-frame. Four joints of a finger cannot follow three bones exactly; what is left over is reported.
+The two hands have bones of different lengths, so the directions of the bones in the wrist frame are fitted. Four joints
+of a finger cannot follow three bones exactly; the residual is reported.
 """
 
 import functools
@@ -17,7 +17,7 @@ from congrasp.services.assets.captures.sequence import FINGERS
 
 
 class Fit(NamedTuple):
-    """Finger angles and what they leave over."""
+    """Finger angles and residuals."""
 
     q: np.ndarray
     """(20,) rad; may lie outside the hand's limits."""
@@ -31,7 +31,7 @@ class _Finger(NamedTuple):
     axes: np.ndarray  # (n, 3) joint axes, from the palm outwards
     anchors: np.ndarray  # (n, 3)
     first: int  # index of its first joint in q
-    carriers: tuple[int, ...]  # how many of the joints move each of the four points
+    carriers: tuple[int, ...]  # number of joints that move each of the four points
     points: np.ndarray  # (4, 3) three link origins and the tip, at zero
 
 
@@ -59,21 +59,21 @@ def _fingers() -> tuple[_Finger, ...]:
 
 
 def joint_positions(q: np.ndarray) -> np.ndarray:
-    """(..., 5, 4, 3) m, the `human` hand's joints and tips of `FINGERS` at angles q (..., 20), in its wrist frame."""
+    """Joints and tips (..., 5, 4, 3) of `FINGERS` of the `human` hand at angles q (..., 20), in its wrist frame, m."""
     return np.stack([_points(f, q[..., f.first : f.first + len(f.axes)]) for f in _fingers()], -3)
 
 
 def fit(joints: np.ndarray) -> Fit:
-    """The `human` hand's finger angles whose bones point as those of a capture.
+    """Fits the `human` hand's finger angles to the directions of a capture's bones.
 
     Args:
-      joints: (5, 4, 3) m, joints and tips of the captured hand, in the wrist frame.
+      joints: (5, 4, 3) joints and tips of the captured hand, in the wrist frame, m.
     """
     q = np.zeros(len(HUMAN.joints))
     for finger, wanted in zip(_fingers(), _directions(joints), strict=True):
 
         def residual(angles: np.ndarray, finger: _Finger = finger, wanted: np.ndarray = wanted) -> np.ndarray:
-            """(9,) by which the bones' directions differ from those wanted."""
+            """Differences (9,) between the bones' directions and the wanted ones."""
             return (_directions(_points(finger, angles)) - wanted).ravel()
 
         q[finger.first :][: len(finger.axes)] = least_squares(residual, np.zeros(len(finger.axes)), method="lm").x
@@ -91,7 +91,7 @@ def _directions(points: np.ndarray) -> np.ndarray:
 
 
 def _points(finger: _Finger, angles: np.ndarray) -> np.ndarray:
-    """(..., 4, 3) a finger's joints and tip at its angles (..., n), by the product of exponentials."""
+    """Joints and tip (..., 4, 3) of a finger at its angles (..., n), by the product of exponentials."""
     vectors = (angles[..., None] * finger.axes).reshape(-1, 3)
     turns = Rotation.from_rotvec(vectors).as_matrix().reshape(*angles.shape, 3, 3)
     turn, shift = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3)), np.zeros((*angles.shape[:-1], 3))

@@ -1,9 +1,9 @@
 """GRAB: one NPZ file a sequence, `grab/s1/mug_drink_1.npz`, in metres, 120 frames a second.
 
-MANO's translation is added to the vertices, so that the wrist lies at the rest shape's wrist joint plus the
-translation. GRAB turns an object's vertices from the right: its rotation is the transpose of the one written. Where
-GrabNet's `frame_names.npz` lies in the folder, its first frame of a sequence is the grasping frame; otherwise the
-labels of the object's contacts say which fingers touch.
+MANO's translation is added to the vertices, so the wrist is at the rest shape's wrist joint plus the translation. GRAB
+multiplies an object's vertices from the right: its rotation is the transpose of the stored one. If the folder has
+GrabNet's `frame_names.npz`, its first frame of a sequence is the grasping frame; otherwise the labels of the object's
+contacts give the touching fingers.
 """
 
 import functools
@@ -25,7 +25,7 @@ _LABELS = {"thumb": (53, 55), "index": (41, 43), "middle": (44, 46), "ring": (50
 
 
 def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterator[Sequence | Dropped]:
-    """The sequences of a file, or of all subjects' folders in a folder."""
+    """Yields the sequences of a file, or of all subjects' folders in a folder."""
     root = _root(path)
     found = meshes.beside(root / "tools" / "object_meshes" / "contact_meshes")
     files = sorted(file for file in path.glob("**/s*/*.npz")) if path.is_dir() else [path]
@@ -35,12 +35,12 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
 
 
 def _root(path: pathlib.Path) -> pathlib.Path:
-    """The folder that holds `tools`, at or above the path."""
+    """Folder that holds `tools`, at or above the path."""
     return next((folder for folder in (path, *path.parents) if (folder / "tools").is_dir()), path)
 
 
 def _grasping_frames(root: pathlib.Path) -> dict[tuple[str, str], int]:
-    """The first grasping frame of each (subject, sequence) that GrabNet names."""
+    """First grasping frame of each (subject, sequence) named by GrabNet."""
     first: dict[tuple[str, str], int] = {}
     for file in sorted(root.glob("**/frame_names.npz")) if root.is_dir() else []:
         for name in np.ravel(read_archive(file).get("frame_names", [])):
@@ -54,7 +54,7 @@ def _grasping_frames(root: pathlib.Path) -> dict[tuple[str, str], int]:
 def _sequence(
     file: pathlib.Path, root: pathlib.Path, meshes: Meshes, model: ManoModel | None, named: dict[tuple[str, str], int]
 ) -> Sequence:
-    """The sequence of a file."""
+    """Reads the sequence of a file."""
     name = f"{file.parent.name}/{file.stem}"
     data = read_archive(file)
     parts = {key.partition("/")[0] for key in data}
@@ -93,7 +93,7 @@ _WIDTHS = {
 
 
 def _template(root: pathlib.Path, data: dict[str, np.ndarray]) -> pathlib.Path | None:
-    """The mesh of the subject's right hand, where it is there."""
+    """Mesh of the subject's right hand, if it exists."""
     text = data.get("rhand/vtemp")
     path = root / str(text) if text is not None else None
     inside = path is not None and path.resolve().is_relative_to(root.resolve())
@@ -102,12 +102,12 @@ def _template(root: pathlib.Path, data: dict[str, np.ndarray]) -> pathlib.Path |
 
 @functools.lru_cache(maxsize=32)
 def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> mano.Skeleton:
-    """A subject's skeleton, by the template of the hand at rest."""
+    """Skeleton of a subject, from the template of the hand at rest."""
     return mano.skeleton(model, template=template)
 
 
 def _touching(data: dict[str, np.ndarray], frames: int) -> np.ndarray | None:
-    """(T, 5) bool, from the labels of the object's contacts."""
+    """Contact flags (T, 5), from the labels of the object's contacts."""
     labels = data.get("contact/object")
     if labels is None or labels.ndim != 2 or len(labels) != frames:
         return None

@@ -1,7 +1,7 @@
 """MANO's pose parameters as joints of fingers, in the wrist frame of the `human` hand.
 
-MANO's wrist frame has the fingers towards -x, the back of the hand +y and the thumb's side +z. Without the user's own
-MANO file the bones are those of the `human` hand; then a thumb, whose rest directions differ, is off by some degrees.
+MANO's wrist frame has the fingers towards -x, the back of the hand +y and the thumb's side +z. Without the user's MANO
+file the bones are those of the `human` hand; the thumb, whose rest directions differ, is then off by some degrees.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from congrasp.services.assets.objects.sources import load_geometry
 TO_HUMAN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Vectors of MANO's wrist frame in that of the human hand."""
 MEAN_WRIST = np.array([0.0957, 0.0064, 0.0062])
-"""(3,) m, the wrist joint of the mean shape, which MANO's translation is added to."""
+"""(3,) wrist joint of the mean shape, to which MANO's translation is added, m."""
 _ORDER = [MANO_FINGERS.index(finger) for finger in FINGERS]
 
 
@@ -34,10 +34,10 @@ class Skeleton:
     """(5, 4, 3) joints and tip of each of `MANO_FINGERS`."""
 
     def joints(self, rotations: np.ndarray) -> np.ndarray:
-        """(T, 5, 4, 3) joints and tips of `FINGERS` in the human hand's wrist frame.
+        """Joints and tips (T, 5, 4, 3) of `FINGERS` in the human hand's wrist frame.
 
         Args:
-          rotations: (T, 15, 3, 3) of each joint against its parent, in MANO's order.
+          rotations: (T, 15, 3, 3) rotation of each joint relative to its parent, in MANO's order.
         """
         local = rotations.reshape(-1, 5, 3, 3, 3)
         bones = np.diff(self.fingers, axis=1)
@@ -52,12 +52,12 @@ class Skeleton:
 def skeleton(
     model: ManoModel | None, betas: np.ndarray | None = None, template: pathlib.Path | None = None
 ) -> Skeleton:
-    """A subject's skeleton.
+    """Returns a subject's skeleton.
 
     Args:
-      model: the user's MANO file; the human hand's bones at MANO's mean wrist without.
+      model: the user's MANO file; None uses the human hand's bones at MANO's mean wrist.
       betas: shape parameters.
-      template: a subject's own mesh at rest, in place of betas.
+      template: a subject's mesh at rest, instead of betas.
     """
     if model is None:
         order = [FINGERS.index(finger) for finger in MANO_FINGERS]
@@ -72,22 +72,22 @@ def skeleton(
 
 
 def read_vertices(path: pathlib.Path) -> np.ndarray:
-    """(n, 3) vertices of a mesh or a point cloud, in the file's order.
+    """Reads the vertices (n, 3) of a mesh or a point cloud, in the file's order.
 
     Raises:
       CongraspError: it cannot be read, or holds several.
     """
-    found = load_geometry(path, "Get the file again.", maintain_order=True)
+    found = load_geometry(path, "Download the file again.", maintain_order=True)
     if not hasattr(found, "vertices"):
-        raise CongraspError(f"{path} holds no single mesh or point cloud.", "Get the file again.")
+        raise CongraspError(f"{path} does not hold a single mesh or point cloud.", "Download the file again.")
     return np.asarray(found.vertices, float)
 
 
 def axis_angles(vectors: np.ndarray) -> np.ndarray:
-    """(T, n, 3, 3) rotation matrices of axis-angle vectors (T, 3 n)."""
+    """Rotation matrices (T, n, 3, 3) of axis-angle vectors (T, 3 n)."""
     return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(len(vectors), -1, 3, 3)
 
 
 def wrist_rotation(matrices: np.ndarray) -> np.ndarray:
-    """(T, 3, 3) orientations of the human hand's wrist frame, from MANO's root rotations (T, 3, 3)."""
+    """Orientations (T, 3, 3) of the human hand's wrist frame, from MANO's root rotations (T, 3, 3)."""
     return matrices @ TO_HUMAN.T

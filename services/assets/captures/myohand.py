@@ -1,10 +1,10 @@
 """MyoDM's reference motions (MyoSuite): NPZ files with the joints of MyoHand, and an object's pose.
 
 `time (T,)` s; `robot (T, 29)`: three slides (m), three hinges, pronation, deviation and wrist flexion, then the twenty
-finger joints in the `human` hand's own order (rad); `object (T, 7)`: position (m) and quaternion (w, x, y, z). A file
-is named `MyoHand_<object>_<action>.npz`. The arm is MyoHand's on its table (Apache-2.0, MyoHub): slides and hinges move
-a base in front of the table, and the wrist hangs on it by shoulder, elbow and forearm, which are rigid. The object's
-slides are measured from a point above the table's middle.
+finger joints in the order of the `human` hand (rad); `object (T, 7)`: position (m) and quaternion (w, x, y, z). A file
+is named `MyoHand_<object>_<action>.npz`. The arm is MyoHand's at its table (Apache-2.0, MyoHub): slides and hinges move
+a base in front of the table, to which shoulder, elbow and forearm connect the wrist rigidly. The object's slides are
+relative to a point above the table's centre.
 """
 
 import pathlib
@@ -22,17 +22,17 @@ from congrasp.services.assets.captures.sequence import Dropped, Sequence, array_
 HOLDS = "MyoHand_<object>_<action>.npz"
 _BASE = np.array([0.1, -0.55, 0.32])
 _ELBOW = np.array([0.002797970, 0.304212085, -0.000513865])
-"""The forearm's origin in the base."""
+"""Origin of the forearm in the base."""
 _FOREARM = Rotation.from_quat([0.000281544, 0.707106501, -0.000281544, 0.707106949], scalar_first=True)
 _PRONATION = np.array([-0.017161, 0.992666, -0.119668])
 _WRIST = np.array([0.018, -0.242, 0.025])
-"""The wrist in the forearm."""
+"""Pose of the wrist in the forearm."""
 _OBJECT = np.array([0.0, 0.0, 0.035])
 _LARGEST = 2 * np.pi
 
 
 def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None = None) -> Iterator[Sequence | Dropped]:
-    """The sequences of a file, or of all NPZ files of a folder; MANO has no part in them."""
+    """Yields the sequences of a file, or of all NPZ files of a folder; MANO is not used."""
     for file in sorted(path.glob("**/*.npz")) if path.is_dir() else [path]:
         yield read_or_drop(file.stem, _sequence, file, meshes)
 
@@ -47,7 +47,7 @@ def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
 
 
 def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
-    """The sequence of a file."""
+    """Reads the sequence of a file."""
     name = file.stem
     arrays = read_archive(file)
     time = array_of(name, "the file", arrays, "time", "T")
@@ -64,7 +64,7 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
         )
     largest = float(np.abs(robot[present, 3:]).max())
     if largest > _LARGEST:
-        raise Dropped(name, "wrong units", f"a joint is at {largest:.4g}: are its angles in radians?")
+        raise Dropped(name, "wrong units", f"a joint is at {largest:.4g}: check that its angles are in radians")
     robot[~present], pose[~present] = robot[present][0], pose[present][0]
     position, rotation = wrist_pose(robot)
     object_name = name.removeprefix("MyoHand_").rsplit("_", 1)[0]

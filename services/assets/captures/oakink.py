@@ -1,8 +1,8 @@
 """OakInk-Image: annotations of frames as pickles, in metres, in a world frame; affordance from OakBase's parts.
 
 `anno/seq_all.json` lists [sequence, subject, frame, camera]; `anno/general_info/<those joined by __>.pkl` holds
-`hand_anno` (`hand_pose (16, 4)` quaternions (w, x, y, z), `hand_shape (10,)`, and `hand_tsl (3,)`, which is the wrist
-itself) and `obj_anno (4, 4)`. The same frames are annotated for several cameras, of which one is taken; frames are
+`hand_anno` (`hand_pose (16, 4)` quaternions (w, x, y, z), `hand_shape (10,)`, and `hand_tsl (3,)`, the position of the
+wrist) and `obj_anno (4, 4)`. The same frames are annotated for several cameras, of which one is used; frames are
 sorted. An object's mesh is centred on its bounding box before the annotated pose moves it.
 `OakBase/<category>/<object>` holds `part_*.ply` with `part_*.json`.
 """
@@ -27,12 +27,12 @@ from congrasp.services.assets.objects.sources import read_mesh
 
 HOLDS = "anno/seq_all.json"
 _LARGEST_JSON = 256 << 20
-_REMEDY = "Get the file again."
+_REMEDY = "Download the file again."
 _Frames = list[tuple[int, str]]
 
 
 def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterator[Sequence | Dropped]:
-    """The sequences of the folder that holds `anno`.
+    """Yields the sequences of the folder that holds `anno`.
 
     Raises:
       CongraspError: there is no list of sequences.
@@ -40,7 +40,7 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
     root = next((folder for folder in (path, path / "image") if (folder / "anno").is_dir()), path)
     index = root / "anno" / "seq_all.json"
     if not index.is_file():
-        raise CongraspError(f"There is no {index}.", "Name the folder that holds OakInk-Image's 'anno'.")
+        raise CongraspError(f"There is no {index}.", "Pass the folder that holds OakInk-Image's 'anno'.")
     found = meshes.beside(root / "obj", path / "obj")
     names = _names(path)
     for (name, _), frames in sorted(_sequences(read_json(index, _LARGEST_JSON, _REMEDY)).items()):
@@ -58,7 +58,7 @@ def _sequences(rows: list[list[Any]]) -> dict[tuple[str, int], _Frames]:
 
 
 def _names(path: pathlib.Path) -> dict[str, str]:
-    """Objects' names by their ids."""
+    """Names of objects by id."""
     names: dict[str, str] = {}
     for file in sorted(path.glob("**/metaV2/*object_id.json")):
         names |= {key: str(value.get("name", key)) for key, value in read_json(file, _LARGEST_JSON, _REMEDY).items()}
@@ -74,7 +74,7 @@ def _sequence(
     names: dict[str, str],
     root: pathlib.Path,
 ) -> Sequence:
-    """The sequence of some frames' annotations."""
+    """Reads the sequence of some frames' annotations."""
     object_id = name.split("_")[0]
     object_name = names.get(object_id, object_id)
     mesh = meshes.find(name, object_id if meshes.has(object_id) else object_name)
@@ -109,7 +109,7 @@ def _sequence(
 
 
 def _frame(name: str, file: pathlib.Path, content: dict[str, np.ndarray]) -> tuple[np.ndarray, ...] | None:
-    """Hand pose (16, 4), shape (10,), wrist (3,) and object pose (4, 4); None if there is no hand or object."""
+    """Hand pose (16, 4), shape (10,), wrist (3,) and object pose (4, 4); None without a hand or object."""
     known = {key.partition("/")[0] for key in content}
     for key in ("hand_anno", "obj_anno"):
         if key not in known:
@@ -123,7 +123,7 @@ def _frame(name: str, file: pathlib.Path, content: dict[str, np.ndarray]) -> tup
 def _shaped(
     name: str, file: pathlib.Path, key: str, content: dict[str, np.ndarray], shape: tuple[int, ...]
 ) -> np.ndarray:
-    """An array of this shape."""
+    """Returns an array of this shape."""
     if key not in content:
         raise Dropped(name, "wrong layout", f"{file.name} has no '{key}'")
     array = content[key].astype(float)
@@ -134,13 +134,13 @@ def _shaped(
 
 @functools.lru_cache(maxsize=64)
 def _middle(mesh: pathlib.Path) -> np.ndarray:
-    """(3,) middle of the bounding box of a mesh."""
+    """Centre (3,) of the bounding box of a mesh."""
     return np.asarray(read_mesh(mesh).bounds, float).mean(0)
 
 
 @functools.lru_cache(maxsize=64)
 def _parts(root: pathlib.Path, *names: str) -> tuple[Part, ...]:
-    """The labelled parts of an object in OakBase, if it is there."""
+    """Labelled parts of an object in OakBase; empty if it is missing."""
     folder = next((f for name in names for f in sorted(root.glob(f"**/OakBase/*/{name}")) if f.is_dir()), None)
     if folder is None:
         return ()

@@ -1,4 +1,4 @@
-"""Meshes of a data set's objects: where they are, and the objects that congrasp makes of them."""
+"""Meshes of a data set's objects: search and import."""
 
 import dataclasses
 import pathlib
@@ -15,37 +15,37 @@ from congrasp.services.assets.objects.sources import SUFFIXES, Source, find_sour
 
 @dataclasses.dataclass(frozen=True)
 class Meshes:
-    """Folders in which the meshes of objects are looked for, in this order."""
+    """Folders searched for the meshes of objects, in this order."""
 
     folders: tuple[pathlib.Path, ...]
 
     def beside(self, *folders: pathlib.Path) -> "Meshes":
-        """These, and then the data set's own folders."""
+        """Returns these folders followed by those of the data set."""
         return Meshes((*self.folders, *folders))
 
     def has(self, name: str) -> bool:
-        """Whether there is a mesh of that name."""
+        """True if there is a mesh of that name."""
         return self._look(name, "") is not None
 
     def find(self, sequence: str, name: str, inside: str = "") -> pathlib.Path:
-        """The mesh file `<name>.*`, or the folder `<name>` with one.
+        """Finds the mesh file `<name>.*`, or the folder `<name>` with one.
 
         Args:
-          sequence: that needs it.
-          name: of the object.
-          inside: the file in the folder, where that has several.
+          sequence: name of the sequence that needs it.
+          name: name of the object.
+          inside: file in the folder, if it has several.
 
         Raises:
-          Dropped: there is none.
+          Dropped: there is no such mesh.
         """
         found = self._look(name, inside)
         if found is None:
             where = f" in {', '.join(map(str, self.folders))}" if self.folders else ""
-            raise Dropped(sequence, "no mesh", f"there is no mesh of '{name}'{where}: name its folder with --meshes")
+            raise Dropped(sequence, "no mesh", f"there is no mesh of '{name}'{where}: pass its folder with --meshes")
         return found
 
     def _look(self, name: str, inside: str) -> pathlib.Path | None:
-        """The first mesh of a name."""
+        """Returns the first mesh of a name."""
         file_name(name, "the mesh of an object")
         for folder in self.folders:
             for suffix in SUFFIXES:
@@ -61,14 +61,14 @@ class Meshes:
 def import_meshes(
     meshes: Mapping[pathlib.Path, str], progress: Callable[[str], None]
 ) -> dict[pathlib.Path, GraspObject | CongraspError]:
-    """The objects of meshes in metres, one for each core at a time; imports are remembered.
+    """Imports meshes in metres, one per core at a time; imports are cached.
 
     Args:
-      meshes: files, or folders, and the data set's names of their objects.
-      progress: is told each object's name once it is there, and how many there are.
+      meshes: files or folders, with the data set's names of their objects.
+      progress: called with each finished object's name, and the number of objects.
 
     Returns:
-      The object of each mesh, or why it cannot be used.
+      The object of each mesh, or the error.
     """
     sources, found = {}, dict[pathlib.Path, GraspObject | CongraspError]()
     for mesh, name in meshes.items():
@@ -85,12 +85,12 @@ def import_meshes(
 
 
 def _source(mesh: pathlib.Path, name: str) -> Source:
-    """The files of one object, under a data set's name.
+    """Returns the files of one object, under a data set's name.
 
     Raises:
-      CongraspError: there are none, or those of several objects.
+      CongraspError: there are none, or they belong to several objects.
     """
     sources = find_sources(mesh)
     if len(sources) > 1:
-        raise CongraspError(f"{mesh} holds {len(sources)} objects.", "Name the folder of one, or its file.")
+        raise CongraspError(f"{mesh} holds {len(sources)} objects.", "Pass the folder of one, or its file.")
     return dataclasses.replace(sources[0], name=name)

@@ -1,4 +1,4 @@
-"""Captured references that no hand can take: too deep in their object, or wider than the hand opens."""
+"""Refuses captured references that a hand cannot take: too deep in their object, or wider than the hand opens."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ from congrasp.services.assets.captures.extract import Demonstration
 from congrasp.services.assets.captures.sequence import Dropped
 
 DEEPEST = 0.01
-"""Metres that skin may be in the object; captured hands are off by about as much."""
+"""Tolerated depth of skin in the object, similar to the error of captured hands, m."""
 _ALONG = np.linspace(0.0, 1.0, 5)[:, None]
 
 
@@ -22,15 +22,15 @@ def check_reference(hand: Hand, demonstration: Demonstration, obj: GraspObject, 
     """Raises Dropped for a reference that the hand cannot take.
 
     Args:
-      hand: whose reference it becomes; any but the human one closes around the object by itself, so that only the width
-        counts.
-      demonstration: of the human hand.
-      obj: the object, in its own size.
+      hand: hand of the reference; for a hand other than the human one, which closes around the object by itself, only
+        the width is checked.
+      demonstration: demonstration of the human hand.
+      obj: the unscaled object.
       scale: factor on the object's lengths for the hand.
     """
     wide, opening = scale * width(demonstration), widest_gap(hand)
     if wide > opening:
-        reason = f"thumb and fingers touch it {100 * wide:.1f} cm apart, and the hand opens {100 * opening:.1f} cm"
+        reason = f"thumb and fingers touch it {100 * wide:.1f} cm apart, but the hand opens only {100 * opening:.1f} cm"
         raise Dropped(demonstration.name, "too wide", reason)
     deep = depth(demonstration, obj) if hand is HUMAN else 0.0
     if deep > DEEPEST:
@@ -39,16 +39,16 @@ def check_reference(hand: Hand, demonstration: Demonstration, obj: GraspObject, 
 
 
 def width(demonstration: Demonstration) -> float:
-    """Extent in metres of what the fingers touch along the cross-finger axis."""
+    """Extent of the touched points along the cross-finger axis, m."""
     turn = Rotation.from_quat(demonstration.quaternion[-1], scalar_first=True)
     along = demonstration.contact @ turn.apply(grasp_frame(HUMAN).cross)
     return float(np.ptp(along)) if len(along) else 0.0
 
 
 def depth(demonstration: Demonstration, obj: GraspObject) -> float:
-    """How deep in metres the human hand's skin is in a piece of the object; negative where it does not touch.
+    """Depth in m of the human hand's skin in a piece of the object; negative without contact.
 
-    It is exact where a finger's axis is in the piece, and an upper bound beyond its edges.
+    It is exact if a finger's axis is in the piece, and an upper bound beyond its edges.
     """
     ends = np.asarray(capsules(HUMAN, link_transforms(HUMAN, jnp.asarray(demonstration.q, jnp.float32))), float)
     axes = (1 - _ALONG) * ends[:, :1] + _ALONG * ends[:, 1:]
@@ -59,7 +59,7 @@ def depth(demonstration: Demonstration, obj: GraspObject) -> float:
 
 
 def _above_faces(piece: Piece, points: np.ndarray) -> np.ndarray:
-    """(N,) m, the largest height of points (N, 3) above the planes of a piece's faces; negative inside."""
+    """Greatest height (N,) of points (N, 3) above the planes of a piece's faces, m; negative inside."""
     vertices, _ = tessellate(piece)
     planes = hull_of(vertices).equations
     return np.asarray((points @ planes[:, :3].T + planes[:, 3]).max(-1))

@@ -1,7 +1,7 @@
-"""Fingers of a reference pose that lie inside one another, moved apart.
+"""Separates overlapping fingers of a reference pose.
 
-Captured hands have other bones and flesh than the hand that follows them, so that their angles put its fingers into one
-another: poses that no hand can hold.
+Captured hands have other bones and flesh than the hand that follows them. Their angles therefore make its fingers
+overlap, in poses that no hand can hold.
 """
 
 import functools
@@ -18,20 +18,20 @@ from congrasp.common.task.plausibility import overlaps
 from congrasp.common.task.types import Array
 
 DEEPEST = 0.001
-"""Metres that two links may be in one another: skin and flesh give way by as much."""
+"""Tolerated overlap of two links, as skin and flesh give way, m."""
 _ITERATIONS = 100
 
 
 def separated(hand: Hand, q: np.ndarray) -> np.ndarray:
-    """The nearest finger angles whose links overlap by at most `DEEPEST`.
+    """Returns the nearest finger angles whose links overlap by at most `DEEPEST`.
 
-    They minimise |q - q_0|^2 where no two links that may not overlap (`common.task.plausibility.overlaps`) do so by
-    more, by sequential quadratic programming. Motors move, so that joints that follow others, or share a tendon, still
-    do; all stay within their limits.
+    They minimise |q - q_0|^2 subject to the limit on all pairs of `common.task.plausibility.overlaps`, by sequential
+    quadratic programming. The variables are motors, so that couplings and tendons are preserved; all joints stay within
+    their limits.
 
     Args:
       hand: any hand.
-      q: (M, F) rad, within the limits; poses that do not overlap by more are returned as they are.
+      q: (M, F) rad, within the limits; poses within the limit are returned unchanged.
     """
     deep = np.asarray(deepest(hand, q)) > DEEPEST
     return np.stack([_apart(hand, row) if moved else row for row, moved in zip(q, deep, strict=True)])
@@ -39,14 +39,14 @@ def separated(hand: Hand, q: np.ndarray) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnums=0)
 def deepest(hand: Hand, q: Array) -> Array:
-    """(M,) m, how deep two links of the hand are in one another at finger angles (M, F); 0 where none is."""
+    """Greatest overlap (M,) of two links at finger angles (M, F), m; 0 if there is none."""
     return jnp.maximum(overlaps(hand, link_transforms(hand, q)).max(-1), 0.0)
 
 
 def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
-    """(F,) of one pose (F,)."""
+    """Separates one pose (F,)."""
     own, motors = transmission(hand), range(len(hand.motors))
-    # Of each motor, how far it may go until the first of its joints is at a limit.
+    # Range of each motor until the first of its joints is at a limit.
     ends = np.sort([(limit - q) / own.ratio for limit in (hand.lower, hand.upper)], axis=0)
     bounds = [(min(ends[0][own.motor == m].max(), 0.0), max(ends[1][own.motor == m].min(), 0.0)) for m in motors]
     weight = np.bincount(own.motor, own.ratio**2)
@@ -59,7 +59,7 @@ def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
         constraints={
             "type": "ineq",
             "fun": lambda way: np.asarray(_room(hand, q, way), float),
-            # Of two axes that meet, nothing says which way leads apart.
+            # For two intersecting axes the direction of separation is undefined.
             "jac": lambda way: np.nan_to_num(np.asarray(_room_change(hand, q, way), float)),
         },
         options={"maxiter": _ITERATIONS},
@@ -70,7 +70,7 @@ def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
 
 
 def _room_of(hand: Hand, q: Array, way: Array) -> Array:
-    """(Q,) mm that two links may still come nearer, where motors have gone a way (M,) from angles (F,)."""
+    """Remaining clearance (Q,) in mm of pairs of links after a motion (M,) of the motors from angles (F,)."""
     own = transmission(hand)
     return 1e3 * (DEEPEST - overlaps(hand, link_transforms(hand, q + own.ratio * way[own.motor])))
 

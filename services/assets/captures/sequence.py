@@ -1,4 +1,4 @@
-"""What every importer yields: one captured grasp of one object by a right hand, in metres, in any world frame.
+"""Output of importers: one captured grasp of one object by a right hand, in metres, in any world frame.
 
 The wrist frame is that of the `human` hand: its origin at the wrist, fingers towards -y, the thumb's side +x, the back
 of the hand +z.
@@ -18,12 +18,12 @@ FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
 class Dropped(Exception):
-    """A sequence, or a file, that cannot be used.
+    """A sequence or file that cannot be used.
 
     Attributes:
-      name: the sequence's.
-      rule: what excludes it, in two or three words, to count by.
-      reason: why, as a sentence without a full stop.
+      name: name of the sequence.
+      rule: the rule that excludes it, in two or three words, for counting.
+      reason: the reason as a sentence without a full stop.
     """
 
     def __init__(self, name: str, rule: str, reason: str):
@@ -33,7 +33,7 @@ class Dropped(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A part of an object's surface, as a data set labels it."""
+    """A part of an object's surface, labelled by a data set."""
 
     name: str
     points: np.ndarray
@@ -42,32 +42,32 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """T frames of a hand and an object. Rotations are matrices from the named body's frame to the world."""
+    """T frames of a hand and an object. Rotations are matrices from a body's frame to the world frame."""
 
     name: str
     object_name: str
     mesh: pathlib.Path
-    """The object's mesh file, or a folder that `congrasp objects import` takes."""
+    """Mesh file of the object, or a folder accepted by `congrasp objects import`."""
     wrist_position: np.ndarray
     """(T, 3)."""
     wrist_rotation: np.ndarray
     """(T, 3, 3)."""
     joints: np.ndarray
-    """(T, 5, 4, 3) of each of `FINGERS` its three joints and its tip, from the palm outwards, in the wrist frame."""
+    """(T, 5, 4, 3) three joints and the tip of each of `FINGERS`, from the palm outwards, in the wrist frame."""
     object_position: np.ndarray
-    """(T, 3) of the mesh file's origin."""
+    """(T, 3) positions of the mesh file's origin."""
     object_rotation: np.ndarray
-    """(T, 3, 3) of the mesh file's axes."""
+    """(T, 3, 3) rotations of the mesh file's axes."""
     present: np.ndarray
     """(T,) bool: hand and object are known in the frame."""
     q: np.ndarray | None = None
-    """(T, 20) the `human` hand's finger angles, where the format has them."""
+    """(T, 20) finger angles of the `human` hand, if the format has them."""
     grasp: int | None = None
-    """The grasping frame, where the data set names it."""
+    """Grasping frame, if the data set names it."""
     touching: np.ndarray | None = None
-    """(T, 5) bool: which fingers touch the object, where the data set says it."""
+    """(T, 5) bool: fingers that touch the object, if the data set has them."""
     parts: Items[Part] = ()
-    """The object's labelled parts, where the data set has them."""
+    """Labelled parts of the object, if the data set has them."""
 
     def __post_init__(self) -> None:
         frames = len(self.present)
@@ -80,7 +80,7 @@ class Sequence:
 
 
 def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> Sequence | Dropped:
-    """What `read(*arguments)` returns, or why the sequence of this name cannot be used."""
+    """Returns the result of `read(*arguments)`, or the reason why the sequence of this name cannot be used."""
     try:
         return read(*arguments)
     except Dropped as dropped:
@@ -90,17 +90,17 @@ def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> S
 
 
 def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape: int | str) -> np.ndarray:
-    """A copy of an array of floats that a file holds.
+    """Returns a copy of an array of floats from a file.
 
     Args:
-      name: of the sequence.
-      where: what holds the array, for the reason.
-      values: what it holds by name.
+      name: name of the sequence.
+      where: container of the array, for the reason.
+      values: arrays by name.
       key: name of the array.
-      shape: its sizes; a letter stands for any.
+      shape: expected sizes; a letter matches any.
 
     Raises:
-      Dropped: it is not there, or has another shape.
+      Dropped: the array is missing, or has another shape.
     """
     if key not in values:
         raise Dropped(name, "wrong layout", f"{where} has no '{key}'")

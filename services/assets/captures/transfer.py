@@ -1,8 +1,8 @@
-"""What of a captured grasp holds for a hand of any build: how the point between the fingertips came to the object.
+"""Transfers captured grasps to any hand by the motion of the point between the fingertips.
 
-A human's finger angles and wrist mean nothing to a robot hand. Its hand centre takes the place of the human one, with
-the grasp axes v and w (`common.hands.kinematics.grasp_frame`) along the human ones; the fingers then close around the
-object. Lengths grow with the object, which is brought to the hand's size.
+A human's finger angles and wrist do not apply to a robot hand. Its hand centre is placed at the human one, with the
+grasp axes v and w (`common.hands.kinematics.grasp_frame`) along the human ones; the fingers then close around the
+object. Lengths scale with the object, which is scaled for the hand.
 """
 
 from collections.abc import Sequence
@@ -21,14 +21,14 @@ from congrasp.services.assets.captures.extract import Demonstration
 from congrasp.services.assets.captures.fit import joint_positions
 
 _AT_ONCE = 20
-"""Poses that are closed in one compiled call."""
+"""Number of poses closed in one compiled call."""
 
 
 def demonstrated_headings(demonstrations: Sequence[Demonstration], scale: float) -> Headings:
-    """Hand centre (M, 3) m, heading axis and cross-finger axis (M, 3) of the captured grasps, object frame.
+    """Hand centres (M, 3) m, heading axes and cross-finger axes (M, 3) of the captured grasps, object frame.
 
     Args:
-      demonstrations: M of one object.
+      demonstrations: M demonstrations on one object.
       scale: factor on the object's lengths.
     """
     frame = grasp_frame(HUMAN)
@@ -45,9 +45,9 @@ def transferred(
 
     Args:
       hand: any hand.
-      demonstrations: of one object.
-      obj: the object in the hand's size.
-      scale: factor by which it was brought to that size.
+      demonstrations: demonstrations on one object.
+      obj: object scaled for the hand.
+      scale: factor of this scaling.
 
     Returns:
       Finger angles (M, F) that close the hand at the last waypoint, and waypoints (M, K, 3) m and (M, K, 4) of its
@@ -64,18 +64,18 @@ def transferred(
         human = Rotation.from_quat(demonstration.quaternion, scalar_first=True)
         turn = human * onto
         path = scale * (human.apply(center) + demonstration.position)
-        # The hand centre of the closed hand, in the wrist frame, is what the last pose leaves between the two.
+        # The hand centre of the closed hand in the wrist frame follows from the last pose.
         positions.append(path - turn.apply(turn[-1].inv().apply(path[-1] - last)))
         quaternions.append(continuous(turn.as_quat(scalar_first=True)))
     return q, np.array(positions), np.array(quaternions)
 
 
 def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.ndarray, Rotation]:
-    """The wrist's path of a hand whose open grasp moves as that of a human hand; where there are no fingers to go by.
+    """Path of the wrist of a hand whose open grasp moves like that of a human hand, for captures without fingers.
 
     Args:
       hand: any hand.
-      position: (T, 3) m, of the human wrist.
+      position: (T, 3) positions of the human wrist, m.
       rotation: T orientations of its frame, that of the `human` hand.
     """
     turn = rotation * _onto_human(hand)
@@ -83,17 +83,17 @@ def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.n
 
 
 def _centers(demonstrations: Sequence[Demonstration]) -> np.ndarray:
-    """(M, 3) m, the human hand's centre in its wrist frame: between the thumb's tip and the mean of the others."""
+    """Centres (M, 3) of the human hand in its wrist frame, m: between the thumb's tip and the mean of the others."""
     tips = joint_positions(np.stack([d.q for d in demonstrations]))[:, :, 3]
     return (tips[:, 0] + tips[:, 1:].mean(1)) / 2
 
 
 def _onto_human(hand: Hand) -> Rotation:
-    """From the hand's wrist frame to the human one, with the grasp axes on one another."""
+    """Rotation from the hand's wrist frame to the human one that aligns the grasp axes."""
     return Rotation.from_matrix(_axes(HUMAN) @ _axes(hand).T)
 
 
 def _axes(hand: Hand) -> np.ndarray:
-    """(3, 3) v, w and v x w as columns, in the wrist frame."""
+    """Axes v, w and v x w as columns (3, 3), in the wrist frame."""
     frame = grasp_frame(hand)
     return np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)], -1)

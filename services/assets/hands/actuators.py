@@ -12,25 +12,25 @@ import numpy as np
 from congrasp.common.hands.spec import Coupling, Joint, Motor
 
 FINGERTIP_FORCE = 15.0
-"""N, with which a joint without a torque limit can press its fingertip."""
+"""Force with which a joint without a torque limit can press its fingertip, N."""
 LARGEST_FORCE = 40.0
-"""N, above which a torque limit is no finger's."""
-_REACH = 0.3  # rad of error at which a joint gives all its torque, where the file has no gain
-_SLACK = 0.3  # rad that a limited tendon may leave between two joints to count as a coupling
-_ROOM = 0.25  # least share of its range that a coupling leaves a joint
+"""Fingertip force above which a torque limit is implausible, N."""
+_REACH = 0.3  # error at which a joint reaches its full torque if the file has no gain, rad
+_SLACK = 0.3  # play of a limited tendon between two joints that still counts as a coupling, rad
+_ROOM = 0.25  # least share of its range that a coupling leaves to a joint
 _PULL = 0.05  # least share of a tendon's largest lever that counts
-_SLOW = 0.1  # s, longest time in which damping holds a joint back
+_SLOW = 0.1  # longest time constant of damping, s
 
 
 @dataclasses.dataclass(frozen=True)
 class Servo:
-    """A motor as a file has it: gains of the joint or tendon that it pulls; 0 where the file is silent."""
+    """A motor of the file, with gains of its joint or tendon; 0 where the file has none."""
 
     joints: dict[int, float]
     kp: float
     limit: float
     reach: tuple[float, float] | None
-    """Range of its targets, where it is a position servo that has one."""
+    """Range of its targets, for a position servo that has one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Follow:
 
 
 def servos(model: mujoco.MjModel, notes: list[str]) -> list[Servo]:
-    """The motors of joints and of tendons; what is replaced or simplified is added to the notes."""
+    """Returns the motors of joints and of tendons; replacements and simplifications are added to the notes."""
     found, muscles, through_space, slopes = [], 0, 0, _slopes(model)
     for a in range(model.nu):
         kind, gear = mujoco.mjtTrn(model.actuator_trntype[a]), float(model.actuator_gear[a, 0])
@@ -73,20 +73,18 @@ def servos(model: mujoco.MjModel, notes: list[str]) -> list[Servo]:
     if muscles:
         notes.append(f"{muscles} muscles move it in the file: here every joint has a motor")
     if through_space:
-        notes.append(
-            f"{through_space} motors pull tendons through space: a straight line through their lengths is taken"
-        )
+        notes.append(f"{through_space} motors pull spatial tendons, which are linearised")
     return found
 
 
 def couplings(model: mujoco.MjModel, hand: set[int], driven: set[int], notes: list[str]) -> list[Follow]:
-    """Joints that follow others, each but once, with leaders that follow none.
+    """Returns joints that follow others, each once, with leaders that follow none.
 
     Args:
       model: the model.
       hand: the hand's joints.
       driven: joints that a motor moves.
-      notes: what is left out or simplified is added to it.
+      notes: omissions and simplifications are appended.
     """
     found: dict[int, Follow] = {}
     for a, b, ratio, offset in (*_equalities(model, notes), *_limited_tendons(model, driven)):
@@ -104,24 +102,24 @@ def couplings(model: mujoco.MjModel, hand: set[int], driven: set[int], notes: li
             passed.add(link.b)
             link = Follow(first.a, above.b, link.ratio * above.ratio, link.offset + link.ratio * above.offset)
         if link.b in passed:
-            notes.append(f"joints are coupled in a circle: the coupling of '{model.joint(first.a).name}' is left out")
+            notes.append(f"joints are coupled in a circle: the coupling of '{model.joint(first.a).name}' is dropped")
         elif _fits(model, link):
             settled.append(link)
         else:
             joints = f"'{model.joint(link.a).name}' to '{model.joint(link.b).name}'"
-            notes.append(f"the coupling of {joints} is left out: their limits leave it no room ('couplings')")
+            notes.append(f"the coupling of {joints} is dropped: their limits leave it no range ('couplings')")
     return settled
 
 
 def _fits(model: mujoco.MjModel, link: Follow) -> bool:
-    """Whether a follower's limits leave its leader a part of its range."""
+    """True if a follower's limits leave its leader a part of its range."""
     lower, upper = _limits(model, link.b)
     ends = sorted((limit - link.offset) / link.ratio for limit in _limits(model, link.a))
     return bool(min(upper, ends[1]) - max(lower, ends[0]) > _ROOM * (upper - lower))
 
 
 def _limits(model: mujoco.MjModel, j: int) -> np.ndarray:
-    """(2,) limits of a joint from the file's pose."""
+    """Limits (2,) of a joint relative to the file's pose."""
     return np.asarray(model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]])
 
 
@@ -138,18 +136,18 @@ def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[tuple[int, int,
             if np.abs(data[2:]).max() > 0:
                 where = np.linspace(float(_limits(model, two)[0]), float(_limits(model, two)[1]), 50)
                 ratio, offset = map(float, np.polyfit(where, np.polynomial.polynomial.polyval(where, data), 1))
-                notes.append(f"'{model.joint(one).name}' follows by a curve: a straight line through it is taken")
+                notes.append(f"'{model.joint(one).name}' follows a curve, which is linearised")
             found.append((one, two, ratio, offset))
         elif kind == mujoco.mjtEq.mjEQ_TENDON and two < 0 and len(pulled := _tendon(model, one)) == 2:
             (b, own), (a, other) = pulled.items()
             found.append((a, b, -own / other, float(data[0]) / other))
         elif kind == mujoco.mjtEq.mjEQ_CONNECT:
-            notes.append("closed loops of links are left open (name a URDF whose joints mimic one another)")
+            notes.append("closed loops of links are opened (import a URDF whose joints mimic one another)")
     return found
 
 
 def _limited_tendons(model: mujoco.MjModel, driven: set[int]) -> list[tuple[int, int, float, float]]:
-    """The same for tendons whose limits leave two joints, of which one has no motor, next to no way of their own."""
+    """Couplings by tendons whose limits leave two joints, one of them without a motor, almost no relative motion."""
     found = []
     for t in range(model.ntendon):
         pulled = _tendon(model, t)
@@ -166,7 +164,7 @@ def _limited_tendons(model: mujoco.MjModel, driven: set[int]) -> list[tuple[int,
 
 
 def _tendon(model: mujoco.MjModel, t: int) -> dict[int, float]:
-    """Coefficients of a fixed tendon by joints; empty for one that runs through space."""
+    """Coefficients of a fixed tendon by joint; empty for a spatial one."""
     where = range(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
     if any(model.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT for w in where):
         return {}
@@ -174,7 +172,7 @@ def _tendon(model: mujoco.MjModel, t: int) -> dict[int, float]:
 
 
 def _slopes(model: mujoco.MjModel) -> np.ndarray:
-    """(ntendon, njnt) m/rad, by how much tendons get longer over the range of a joint, the others in its middle."""
+    """Changes (ntendon, njnt) of tendon lengths per joint angle, m/rad, with the other joints at their centres."""
     data = mujoco.MjData(model)
     turning = np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (model.jnt_limited > 0))
     where = model.jnt_qposadr[turning]
@@ -190,13 +188,13 @@ def _slopes(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _through_space(slopes: np.ndarray) -> dict[int, float]:
-    """Coefficients of a tendon through space by joints, without those that it hardly pulls, from its slopes (njnt,)."""
+    """Coefficients of a spatial tendon by joint, from its slopes (njnt,), without negligible ones."""
     least = _PULL * np.abs(slopes).max(initial=0.0)
     return {int(j): float(slopes[j]) for j in np.flatnonzero(np.abs(slopes) > least)}
 
 
 def _shared_out(pulls: list[dict[int, float]]) -> list[dict[int, float]]:
-    """What motors pull if no joint hangs on two tendons: it stays with the motor that pulls it alone, or most."""
+    """Assigns every joint to one tendon: the motor that pulls only this joint, or pulls it most."""
     owner = {
         j: max((k for k, pull in enumerate(pulls) if j in pull), key=lambda k: (len(pulls[k]) == 1, abs(pulls[k][j])))
         for j in set[int]().union(*pulls)
@@ -205,7 +203,7 @@ def _shared_out(pulls: list[dict[int, float]]) -> list[dict[int, float]]:
 
 
 class Drive:
-    """Gains of a hand's joints and motors from a file, and what had to be proposed for want of them."""
+    """Gains of a hand's joints and motors from a file, and proposals for missing ones."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, joints: dict[int, str], levers: dict[int, float]):
         """Reads motors and couplings.
@@ -214,7 +212,7 @@ class Drive:
           model: the model.
           data: its data in the file's pose.
           joints: names of the hand's joints.
-          levers: m from each of them to the tip of its finger.
+          levers: distance of each from the tip of its finger, m.
         """
         self.notes: list[str] = []
         self._model, self._names, self._levers = model, joints, levers
@@ -230,23 +228,21 @@ class Drive:
         passive = [name for j, name in joints.items() if j not in driven and j not in self._leaders]
         if driven and passive:
             self.notes.append(
-                f"no motor in the file, here one each ('couplings' in the hand file): {', '.join(passive)}"
+                f"no motor in the file, one each is added ('couplings' in the hand file): {', '.join(passive)}"
             )
         pulls = [self._reduced(servo) for servo in found]
         self._pulls = list(zip(found, _shared_out(pulls), strict=True))
         if idle := sum(bool(before) and not after for before, (_, after) in zip(pulls, self._pulls, strict=True)):
-            self.notes.append(
-                f"{idle} motors that pull joints of others alone are left out ('tendons' in the hand file)"
-            )
+            self.notes.append(f"{idle} motors that only pull joints of others are dropped ('tendons' in the hand file)")
 
     def couplings(self) -> tuple[Coupling, ...]:
-        """As data."""
+        """Returns the couplings as data."""
         return tuple(
             Coupling(self._names[x.a], self._names[x.b], round(x.ratio, 6), round(x.offset, 6)) for x in self.links
         )
 
     def joint(self, j: int, lower: float, upper: float, joint: Joint) -> Joint:
-        """A joint with the gains of its motor, zeros if it has none, within what its motor reaches."""
+        """Returns a joint with the gains of its motor, zeros if it has none, within the motor's range."""
         dof = self._model.jnt_dofadr[j]
         armature = float(self._model.dof_armature[dof]) or 5e-4
         damping = float(self._model.dof_damping[dof])
@@ -274,7 +270,7 @@ class Drive:
         )
 
     def tendons(self) -> tuple[Motor, ...]:
-        """Motors of tendons, with coefficients of at most one."""
+        """Returns motors of tendons, with coefficients of at most one."""
         found = []
         for servo, pulled in self._pulls:
             if len(pulled) < 2:
@@ -289,7 +285,7 @@ class Drive:
         return tuple(found)
 
     def remarks(self) -> list[str]:
-        """What was proposed, once all joints and tendons were asked for."""
+        """Returns the proposals, once all joints and tendons have been requested."""
         found = []
         if self._limitless:
             found.append(
@@ -309,7 +305,7 @@ class Drive:
         return [*self.notes, *found]
 
     def _reduced(self, servo: Servo) -> dict[int, float]:
-        """What a servo pulls, with joints that follow others in the place of these."""
+        """Joints pulled by a servo, with following joints replaced by their leaders."""
         pulled: dict[int, float] = {}
         for j, c in servo.joints.items():
             link = self._leaders.get(j)
@@ -319,7 +315,7 @@ class Drive:
         return {j: c for j, c in pulled.items() if c}
 
     def _gains(self, j: int, servo: Servo | None, scale: float, name: str) -> tuple[float, float]:
-        """kp and torque limit of a motor; without a gain of the file kp gives all the torque at `_REACH`."""
+        """Returns kp and torque limit of a motor; without a gain in the file, kp gives the full torque at `_REACH`."""
         kp = servo.kp * scale**2 if servo else 0.0
         limit = servo.limit * abs(scale) if servo else 0.0
         if self._model.jnt_actfrclimited[j]:
@@ -335,7 +331,7 @@ class Drive:
         return kp or limit / _REACH, limit
 
     def _damping(self, moved: dict[int, float], kp: float) -> float:
-        """kv = 1.4 sqrt(kp I) with the inertia I of all that a motor moves, by the joints' ratios."""
+        """Returns kv = 1.4 sqrt(kp I), with the inertia I of everything that a motor moves, by the joints' ratios."""
         dofs = [self._model.jnt_dofadr[j] for j in moved]
         ratios = np.array([*moved.values()])
         inertia = self._inertia[np.ix_(dofs, dofs)].copy()

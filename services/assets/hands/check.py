@@ -1,8 +1,8 @@
-"""The self-check of a hand: whether it can grasp at all, decided by geometry and physics before a GPU trains it.
+"""Self-check of a hand before training: tests by geometry and physics whether it can grasp.
 
-Every check is a line: what was measured, and where it is in doubt or failed, which field or option mends it. What is
-measured of palm, joints, opening and strength follows from the hand's data; servos, overlaps and grips are simulated
-(`servos`, `grips`) in the physics of the full task.
+Every check is a line with a measurement and, if in doubt or failed, the field or option to change. Palm, joints,
+opening and strength are computed from the hand's data; servos, overlaps and grips are simulated (`servos`, `grips`) in
+the physics of the full task.
 """
 
 import functools
@@ -33,46 +33,46 @@ from congrasp.services.assets.hands.grips import Grip, grips
 from congrasp.services.assets.hands.servos import Response, closed_overlap, responses
 
 Verdict = Literal["passed", "doubt", "failed"]
-_APART = 0.03, 0.06  # m from a finger's first joint to the palm: more is in doubt, and too much
-_REACH = 2.5, 4.0  # fingers' lengths from the wrist to the hand centre, likewise
-_STAYS = 0.01  # m: a joint whose closing moves its fingertip less is not one that closes
-_ALONG = -0.1, -0.3  # cosine between a closing fingertip's way and its opponent: less is in doubt, and the wrong way
+_APART = 0.03, 0.06  # distance of a finger's first joint from the palm, m: limits for doubt and failure
+_REACH = 2.5, 4.0  # distance of the hand centre from the wrist in finger lengths: limits for doubt and failure
+_STAYS = 0.01  # least displacement of a fingertip by a closing joint, m
+_ALONG = -0.1, -0.3  # cosine between a closing fingertip's motion and its opponent: limits for doubt and failure
 _GAP = 0.3, 0.5  # shares of the opening to which the fingertips close
-_FITTING = 0.9, 0.6  # shares of the objects that the opening spans
-_CARRIED = 2.0, 1.0  # the weights of a median object that friction carries
+_FITTING = 0.9, 0.6  # shares of the objects spanned by the opening
+_CARRIED = 2.0, 1.0  # weights of a median object that friction carries
 _OVERSHOOT = 0.25, 0.6  # shares of a step
 _UNREST = 0.05, 0.5  # rad/s
 _ERROR = 0.1, 0.6  # shares of a step, 0.6 s after it
 _OVERLAP = 0.004, 0.012  # m
 _POOL = 48
-_LARGEST = 1 << 20  # bytes of a file of findings
-_NEAR = 0.25  # share of the way from the open to the closed pose in which joints are looked at
+_LARGEST = 1 << 20  # limit of a file of findings, bytes
+_NEAR = 0.25  # share of the range from the open to the closed pose at which joints are tested
 
 
 class Finding(NamedTuple):
-    """What one check found."""
+    """Result of one check."""
 
     check: str
     verdict: Verdict
     measured: str
     remedy: str = ""
-    """What mends it; empty where it passed."""
+    """Remedy; empty if it passed."""
 
     def __str__(self) -> str:
-        """One line."""
+        """Formats it as one line."""
         remedy = f" -> {self.remedy}" if self.remedy else ""
         return f"{self.verdict:7s} {self.check:9s} {self.measured}{remedy}"
 
 
 class Checked(NamedTuple):
-    """A hand's self-check."""
+    """Self-check of a hand."""
 
     findings: list[Finding]
     grips: list[Grip]
 
     @property
     def failed(self) -> bool:
-        """Whether any check failed."""
+        """True if any check failed."""
         return any(finding.verdict == "failed" for finding in self.findings)
 
 
@@ -81,8 +81,8 @@ def check_hand(hand: Hand, task: TaskConfig, threads: int) -> Checked:
 
     Args:
       hand: the hand.
-      task: the full task for it (`services.train.recipe`), whose physics holds.
-      threads: of the physics.
+      task: the full task for it (`services.train.recipe`), whose physics is used.
+      threads: threads of the physics.
     """
     found = [_palm(hand), *_joints(hand), _opening(hand), _strength(hand)]
     found += [*_servos(hand, responses(hand, task, threads)), _open_overlap(hand)]
@@ -93,52 +93,52 @@ def check_hand(hand: Hand, task: TaskConfig, threads: int) -> Checked:
 
 
 def write_findings(path: pathlib.Path, findings: Sequence[Finding]) -> None:
-    """Writes what was found as JSON, which `read_findings` reads."""
+    """Writes findings as JSON for `read_findings`."""
     write_atomically(path, json.dumps({"findings": [finding._asdict() for finding in findings]}, indent=1).encode())
 
 
 def read_findings(path: pathlib.Path) -> list[Finding]:
-    """What a file of `write_findings` says; a CongraspError if it cannot be read."""
+    """Reads a file of `write_findings`; raises a CongraspError if it cannot be read."""
     try:
         return [Finding(**fields) for fields in read_json(path, _LARGEST)["findings"]]
     except (OSError, LookupError, TypeError) as error:
         raise CongraspError(
-            f"{path} holds no self-check: {error}.", "Make it with 'congrasp hands check --json'."
+            f"{path} holds no self-check: {error}.", "Create it with 'congrasp hands check --json'."
         ) from None
 
 
 def _verdict(value: float, doubt: float, fail: float) -> Verdict:
-    """By two limits, of which `fail` is the worse."""
+    """Verdict by two limits, of which `fail` is the stricter."""
     worse = (lambda limit: value > limit) if fail > doubt else (lambda limit: value < limit)
     return "failed" if worse(fail) else "doubt" if worse(doubt) else "passed"
 
 
 def _worst(*verdicts: Verdict) -> Verdict:
-    """The worst of some verdicts."""
+    """Returns the worst of some verdicts."""
     order: tuple[Verdict, ...] = ("failed", "doubt", "passed")
     return min(verdicts, key=order.index)
 
 
 def _finding(check: str, verdict: Verdict, measured: str, remedy: str) -> Finding:
-    """A finding, with its remedy where it needs one."""
+    """Returns a finding, with its remedy if it needs one."""
     return Finding(check, verdict, measured, "" if verdict == "passed" else remedy)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _tips(hand: Hand, q: jax.Array) -> jax.Array:
-    """(N, G, 3) fingertips, thumb first, of finger angles (N, F), wrist frame, m."""
+    """Fingertips (N, G, 3), thumb first, for finger angles (N, F), wrist frame, m."""
     return kinematics.keypoints(hand, kinematics.link_transforms(hand, q))[:, len(hand.links) :]
 
 
 @functools.cache
 def _objects() -> list[GraspObject]:
-    """Objects such as the hand will be given, at the human hand's size."""
+    """Objects typical for the hand, at the human hand's scale."""
     seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + _POOL)
     return list(map(procedural.generate, seeds, procedural.family_turns(_POOL, HELD_OUT_SEED)))
 
 
 def _palm(hand: Hand) -> Finding:
-    """Whether the fingers are on the palm, and the wrist is near them."""
+    """Checks that the fingers are on the palm, and the wrist is near them."""
     capsules = hand.links[0].capsules
     points = np.concatenate([np.linspace(one.start, one.end, 20) for one in capsules])
     radii = np.repeat([one.radius for one in capsules], 20)
@@ -155,13 +155,13 @@ def _palm(hand: Hand) -> Finding:
         _worst(_verdict(apart[farthest], *_APART), _verdict(reach, *_REACH)),
         f"fingers begin within {100 * max(apart[farthest], 0.0):.1f} cm of it ({hand.fingers[farthest]}), the hand "
         f"centre is {reach:.1f} fingers' lengths from the wrist",
-        f"import with --palm and the body that carries '{hand.finger_roots[farthest]}', or mend the capsules of "
-        f"'{hand.links[0].name}'",
+        f"import with --palm and the body that carries '{hand.finger_roots[farthest]}', or correct the capsules "
+        f"of '{hand.links[0].name}'",
     )
 
 
 def _joints(hand: Hand) -> list[Finding]:
-    """Whether closing brings the fingertips to one another, as a whole and joint by joint."""
+    """Checks that closing brings the fingertips together, as a whole and joint by joint."""
     way = hand.q_closed - hand.q_open
     shares = np.linspace(0, 1, 21)
     tips = np.asarray(_tips(hand, jnp.asarray(hand.q_open + shares[:, None] * way, jnp.float32)))
@@ -170,8 +170,8 @@ def _joints(hand: Hand) -> list[Finding]:
         _finding(
             "closing",
             _verdict(float(gaps.min() / gaps[0]), *_GAP),
-            f"thumb and fingers come from {100 * gaps[0]:.1f} to {100 * gaps.min():.1f} cm",
-            "close further: raise the angles of closed_pose, and turn the thumb against the fingers in open_pose",
+            f"thumb and fingers close from {100 * gaps[0]:.1f} to {100 * gaps.min():.1f} cm",
+            "close further: increase the angles of closed_pose, and turn the thumb towards the fingers in open_pose",
         )
     ]
     followers = {coupling.joint for coupling in hand.couplings}
@@ -192,7 +192,7 @@ def _joints(hand: Hand) -> list[Finding]:
                     f"cosine of {cosine:.2f} to its opponent",
                     "change its ratio or its leader in couplings"
                     if joint.name in followers
-                    else f"turn its axis, or close it towards {limit:.2f} in closed_pose; leave it out if it spreads",
+                    else f"turn its axis, or close it towards {limit:.2f} in closed_pose; omit it if it spreads",
                 )
             )
     if not moved:
@@ -203,8 +203,11 @@ def _joints(hand: Hand) -> list[Finding]:
 
 
 def _approach(hand: Hand, joint: int, finger: int) -> tuple[float, float]:
-    """The cosine between the way of a fingertip as one joint closes and the way to its opponent (the thumb's is the
-    middle of the others), at the beginning of closing; and how long (m) its way is in all."""
+    """Closing direction of a joint: cosine to the opponent of its fingertip, and path length.
+
+    The cosine is that between the motion of a fingertip as one joint begins to close and the direction to its opponent
+    (for the thumb the mean of the others). The path length in m covers the whole closing motion.
+    """
     way, small = float(hand.q_closed[joint] - hand.q_open[joint]), 0.01
     cosines, levers = [], []
     for share in (0.0, _NEAR):
@@ -221,7 +224,7 @@ def _approach(hand: Hand, joint: int, finger: int) -> tuple[float, float]:
 
 
 def _opening(hand: Hand) -> Finding:
-    """Whether the open hand spans the objects that it will be given."""
+    """Checks that the open hand spans its objects."""
     radii = hand.keypoint_radii[len(hand.links) :]
     clear = grasp_frame(hand).opening - float(radii[0] + radii[1:].mean())
     widths = hand.object_scale * np.array([np.ptp(obj.points, axis=0).min() for obj in _objects()])
@@ -232,26 +235,26 @@ def _opening(hand: Hand) -> Finding:
         _verdict(share, *_FITTING),
         f"{100 * clear:.1f} cm clear; {100 * share:.0f} % of the objects (x {hand.object_scale:g}) have a narrower "
         f"side, {100 * np.median(widths):.1f} cm in the middle",
-        f"object_scale {max(np.floor(10 * scale) / 10, 0.1):.1f} (import with --object-scale), or open the open_pose",
+        f"object_scale {max(np.floor(10 * scale) / 10, 0.1):.1f} (import with --object-scale), or widen the open_pose",
     )
 
 
 def _strength(hand: Hand) -> Finding:
-    """Whether the fingertips press hard enough to carry a median object between them by friction."""
+    """Checks that the fingertips press hard enough to carry a median object by friction."""
     forces = tip_forces(hand)
     mass = hand.object_scale**3 * float(np.median([obj.mass for obj in _objects()]))
     weight, carried = protocols.GRAVITY * mass, 2 * float(min(forces[0], forces[1:].sum()))
     return _finding(
         "strength",
         _verdict(carried / weight, *_CARRIED),
-        f"fingertips press with {forces.min():.1f} to {forces.max():.1f} N, so that they carry {carried:.1f} N by "
-        f"friction; a median object weighs {weight:.1f} N",
-        "check torque_limit (N.m) of the motors, or take a smaller object_scale",
+        f"fingertips press with {forces.min():.1f} to {forces.max():.1f} N and carry {carried:.1f} N by friction; "
+        f"a median object weighs {weight:.1f} N",
+        "check torque_limit (N.m) of the motors, or use a smaller object_scale",
     )
 
 
 def _servos(hand: Hand, found: list[Response]) -> list[Finding]:
-    """Whether motors go where they are told, and rest there."""
+    """Checks that motors reach their targets and come to rest."""
     bad = []
     for motor, one in zip(hand.motors, found, strict=True):
         shakes = _worst(_verdict(one.overshoot, *_OVERSHOOT), _verdict(one.unrest, *_UNREST))
@@ -274,15 +277,15 @@ def _servos(hand: Hand, found: list[Response]) -> list[Finding]:
 
 
 def _response(one: Response) -> str:
-    """A response in words."""
+    """Describes a response."""
     return (
-        f"overshoots a step by {100 * one.overshoot:.0f} %, shakes at {one.unrest:.2f} rad/s half a second later, and "
-        f"is {100 * one.error:.0f} % off then"
+        f"overshoots a step by {100 * one.overshoot:.0f} %, oscillates at {one.unrest:.2f} rad/s half a second "
+        f"later, and is then {100 * one.error:.0f} % off"
     )
 
 
 def _open_overlap(hand: Hand) -> Finding:
-    """Whether different fingers are in one another while the hand is open; housings of one finger nest at knuckles."""
+    """Checks that different fingers of the open hand do not overlap; housings of one finger may nest at knuckles."""
     names = [link.name for link in hand.links]
     transforms = kinematics.link_transforms(hand, jnp.asarray(hand.q_open))
     ends = np.asarray(kinematics.capsules(hand, transforms))
@@ -297,27 +300,27 @@ def _open_overlap(hand: Hand) -> Finding:
         )
         depth = float((hand.capsule_radii[first] + hand.capsule_radii[second] - apart).max())
         if depth > deepest:
-            deepest, pair = depth, f" ({pair_of[0]} and {pair_of[1]}, which do not collide then)"
+            deepest, pair = depth, f" ({pair_of[0]} and {pair_of[1]}, which then do not collide)"
     return _finding(
         "open",
         _verdict(deepest, *_OVERLAP),
-        f"fingers overlap by {1e3 * deepest:.1f} mm at most{pair}",
-        "open the open_pose, or make the capsules of the two smaller",
+        f"fingers overlap by at most {1e3 * deepest:.1f} mm{pair}",
+        "widen the open_pose, or make the capsules of the two smaller",
     )
 
 
 def _closed_overlap(depth: float) -> Finding:
-    """Whether links go through one another as the empty hand closes."""
+    """Checks that links of the closing empty hand do not penetrate each other."""
     return _finding(
         "closed",
         _verdict(depth, *_OVERLAP),
-        f"the closing hand's links press {1e3 * depth:.1f} mm into one another",
-        "end the closed_pose earlier, or make torque_limit or capsules of what meets there smaller",
+        f"links of the closing hand overlap by {1e3 * depth:.1f} mm",
+        "end the closed_pose earlier, or reduce torque_limit or the capsules that meet",
     )
 
 
 def _grip(grip: Grip, sound: bool) -> Finding:
-    """Whether an object is held, lifted, and survives six pushes."""
+    """Checks that an object is held, lifted, and survives six pushes."""
     lifted, half, newton = (grip.survived[name] for name in protocols.SURVIVAL)
     verdict: Verdict = "passed" if half else "doubt" if grip.held else "failed"
     fate = (
@@ -334,7 +337,7 @@ def _grip(grip: Grip, sound: bool) -> Finding:
         grip.obj.name,
         verdict,
         f"{size}: {fate}; {int(grip.touching.sum())} links touch it",
-        "close further (closed_pose), turn the thumb against the fingers (open_pose), or take a smaller object_scale"
+        "close further (closed_pose), turn the thumb towards the fingers (open_pose), or use a smaller object_scale"
         if sound
-        else "mend what failed above first",
+        else "repair the failures above first",
     )

@@ -1,7 +1,7 @@
-"""MuJoCo reads robot descriptions in a process of its own: a few lines of one can ask for more than a machine has.
+"""Compiles robot descriptions with MuJoCo in a child process, since a few lines can exceed a machine's resources.
 
-`python -m services.assets.hands.compile FILE RESULT` is that process. It leaves the compiled model in RESULT, and what
-it left out of it, or why there is none, in RESULT.json.
+`python -m congrasp.services.assets.hands.compile FILE RESULT` is that process. It writes the compiled model to RESULT,
+and its omissions, or the reason for a failure, to RESULT.json.
 """
 
 import json
@@ -23,17 +23,17 @@ import congrasp
 from congrasp.common.errors import CongraspError
 
 MEMORY = 3 << 30
-"""Bytes of address space for reading a file."""
+"""Limit of the address space for reading a file, bytes."""
 SECONDS = 30
-"""Time for the same."""
+"""Limit of the time for reading a file, s."""
 MAX_FILE = 64 << 20
-"""Bytes of a file."""
+"""Limit of a file, bytes."""
 MAX_COUNT = 1000
-"""Largest count of a replicate, composite or flexcomp in the file itself; nested ones meet the limits above."""
+"""Largest count of a replicate, composite or flexcomp in the file; nested ones are bounded by the limits above."""
 LIMITS = {"nbody": 1000, "nv": 500, "ngeom": 10_000, "nmesh": 1000, "nmeshvert": 5_000_000, "nu": 1000, "neq": 1000}
-"""Most parts of a model, by MuJoCo's names."""
+"""Limits of a model's parts, by MuJoCo's names."""
 LEAST = 1e-3, 1e-7
-"""kg and kg m2, what a moving link without mass gets: of a file that has such links, no other has less."""
+"""Mass (kg) and inertia (kg m2) of moving links without mass."""
 _COUNTS = re.compile(r"""\bcount\s*=\s*["']([^"']*)["']""")
 _FINITE = (
     *(
@@ -55,21 +55,21 @@ _REMEDY = "MuJoCo must be able to load it."
 
 
 def compiled_model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
-    """The model of a URDF or MJCF file, without the meshes that are not there.
+    """Compiles a URDF or MJCF file, without missing meshes.
 
     Args:
       path: the file.
-      notes: what was left out is added to it.
+      notes: omissions are appended.
 
     Raises:
       CongraspError: it cannot be read, or not within `MEMORY` and `SECONDS`, or it has more parts than `LIMITS`.
     """
     if path.suffix.lower() not in (".xml", ".urdf", ".mjcf"):
-        raise CongraspError(f"{path} is neither URDF nor MJCF.", "Name a file that ends in .urdf or .xml.")
+        raise CongraspError(f"{path} is neither URDF nor MJCF.", "Pass a file that ends in .urdf or .xml.")
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Check the path.")
     if path.stat().st_size > MAX_FILE:
-        raise CongraspError(f"{path} has more than {MAX_FILE >> 20} MB.", "Name a robot description.")
+        raise CongraspError(f"{path} has more than {MAX_FILE >> 20} MB.", "Pass a robot description.")
     with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
         result = pathlib.Path(folder, "model.mjb")
         search = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
@@ -99,13 +99,15 @@ def compiled_model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
 
 
 def robot_spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
-    """The model of a URDF or MJCF file to build on, once `compiled_model` has read it; raises as that does."""
+    """Returns the modifiable model of a URDF or MJCF file, after `compiled_model` has read it; raises the same
+    errors.
+    """
     compiled_model(path, notes)
     return _spec(path, [])
 
 
 def _child(source: str, result: str) -> None:
-    """Compiles a file into another; ends by itself, should the parent be gone."""
+    """Compiles a file into another; ends if the parent is gone."""
     signal.alarm(SECONDS + 5)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -121,12 +123,12 @@ def _child(source: str, result: str) -> None:
     except MemoryError:
         said = {"error": f"it takes more than {MEMORY >> 30} GB"}
     except (ValueError, mujoco.FatalError) as error:
-        said = {"error": (str(error).strip().splitlines() or ["MuJoCo does not say why"])[0].rstrip(".")[:300]}
+        said = {"error": (str(error).strip().splitlines() or ["MuJoCo gives no reason"])[0].rstrip(".")[:300]}
     pathlib.Path(result).with_suffix(".json").write_text(json.dumps(said))
 
 
 def _check_values(model: mujoco.MjModel) -> None:
-    """A ValueError where a body or a joint has values that none has; a mass of zero is one that the file leaves out."""
+    """Raises a ValueError if a body or a joint has impossible values; a mass of zero means that the file omits it."""
     for name in _FINITE:
         values = getattr(model, name)
         if not np.isfinite(values).all():
@@ -137,7 +139,7 @@ def _check_values(model: mujoco.MjModel) -> None:
 
 
 def _spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
-    """The model of a file, not compiled; a ValueError or MuJoCo's error where it cannot be read."""
+    """Returns the model of a file, not compiled; raises a ValueError or MuJoCo's error if it cannot be read."""
     for count in _COUNTS.findall(path.read_text(errors="replace")):
         if any(float(number) > MAX_COUNT for number in count.split()):
             raise ValueError(f"it repeats a part {count[:40]} times, more than {MAX_COUNT}")
@@ -159,7 +161,7 @@ def _spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
 
 
 def _compiled(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
-    """The compiled model of a file; raises as `_spec` does."""
+    """Returns the compiled model of a file; raises like `_spec`."""
     spec = _spec(path, notes)
     try:
         return spec.compile()
@@ -174,7 +176,7 @@ def _compiled(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
 
 
 def _urdf(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
-    """The model of a URDF file: its meshes are looked for as ROS names them, and formats that MuJoCo lacks are read."""
+    """Returns the model of a URDF file; searches its meshes as ROS does, and converts formats that MuJoCo lacks."""
     try:
         robot = ET.fromstring(path.read_text(errors="replace"))
     except ET.ParseError as error:
@@ -204,7 +206,7 @@ def _urdf(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
 
 
 def _mesh_file(path: pathlib.Path, name: str) -> pathlib.Path | None:
-    """The mesh of a name in a URDF file, as a path from there or from a folder above it; None where there is none."""
+    """Path of a mesh named in a URDF file, relative to it or to a parent folder; None if there is none."""
     plain = name.removeprefix("file://").removeprefix("package://").removeprefix("model://")
     above = [path.parent, *path.parent.parents[:3]]
     parts = pathlib.PurePosixPath(plain).parts
@@ -213,27 +215,27 @@ def _mesh_file(path: pathlib.Path, name: str) -> pathlib.Path | None:
 
 
 def _readable(file: pathlib.Path) -> bytes:
-    """A mesh's content as MuJoCo reads it, or nothing."""
+    """Content of a mesh in a format that MuJoCo reads, or nothing."""
     if file.stat().st_size > MAX_FILE:
         return b""
     if file.suffix.lower() in _NATIVE:
         return file.read_bytes()
     try:
         scene = trimesh.load_scene(file)
-        # COLLADA states its unit. Its upward axis is left as it is, as ROS does.
+        # COLLADA states its unit. Its upward axis is ignored, as in ROS.
         scene = scene.convert_units("meters") if file.suffix.lower() == ".dae" else scene
         return trimesh.exchange.stl.export_stl(scene.to_mesh())
-    except Exception:  # whatever readers of many formats raise
+    except Exception:  # readers of many formats raise arbitrary errors
         return b""
 
 
 def _missing(count: int) -> str:
-    """What to say of meshes that are left out."""
-    return f"{count} meshes were not found beside the file, or cannot be read: what follows without them is rough"
+    """Note on missing meshes."""
+    return f"{count} meshes were not found or cannot be read: results without them are approximate"
 
 
 def _found(path: pathlib.Path, spec: mujoco.MjSpec, file: str) -> bool:
-    """Whether a mesh file is where the model says, or beside it."""
+    """True if a mesh file is at the model's path, or next to the model."""
     folder = path.parent / (spec.compiler.meshdir or "")
     return (folder / file).exists() or (folder / pathlib.Path(file).name).exists()
 

@@ -1,4 +1,4 @@
-"""Capsules for what a link looks like in its file: collision geometry, else what is drawn, else its inertia."""
+"""Capsules for a link's geometry: collision geometry, else visual geometry, else its inertia."""
 
 from typing import Literal
 
@@ -16,13 +16,13 @@ _KINDS: dict[mujoco.mjtGeom, Literal["box", "cylinder", "capsule", "ellipsoid"]]
     mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
     mujoco.mjtGeom.mjGEOM_SPHERE: "ellipsoid",
 }
-_FLAT = 1.6  # broader than this, a link gets several capsules side by side
-_PLAUSIBLE = (0.002, 0.15)  # m, half of an inertia's box
-_BARE = 0.005  # m, radius of a link of which nothing is known
+_FLAT = 1.6  # a broader link gets several parallel capsules
+_PLAUSIBLE = (0.002, 0.15)  # half extent of an inertia's box, m
+_BARE = 0.005  # radius of a link without any geometry, m
 
 
 def surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """Points on what collides of a body, or on what is drawn of it if nothing collides."""
+    """Points on a body's collision geometry, or on its visual geometry if there is none."""
     mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
     solid = [g for g in mine if model.geom_contype[g] | model.geom_conaffinity[g]] or mine
     found: list[np.ndarray] = []
@@ -34,7 +34,7 @@ def surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.nd
 
 
 def solids_of(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> tuple[Solid, ...]:
-    """What collides of bodies; none where that is nothing, or has a mesh among it."""
+    """Collision geometry of bodies; empty if there is none, or a mesh is among it."""
     found = []
     for g in np.flatnonzero(np.isin(model.geom_bodyid, bodies)):
         if not model.geom_contype[g] | model.geom_conaffinity[g]:
@@ -53,7 +53,7 @@ def solids_of(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> 
 
 
 def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
-    """A geom as a mesh in its own frame; None of a plane."""
+    """Mesh of a geom in its frame; None for a plane."""
     kind, size = mujoco.mjtGeom(model.geom_type[g]), model.geom_size[g]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         m = model.geom_dataid[g]
@@ -76,7 +76,7 @@ def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
 
 
 def inertia_box(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """Corners of the box with a body's mass and inertia, if the file has them and it is as large as a link."""
+    """Corners of the box with a body's mass and inertia, if the file has them and its size is that of a link."""
     mass, (x, y, z) = model.body_mass[body], model.body_inertia[body]
     if mass < 1e-4 or (mass, x, y, z) == (LEAST[0], *3 * (LEAST[1],)):
         return []
@@ -88,12 +88,12 @@ def inertia_box(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[n
 
 
 def bare(*centers: np.ndarray) -> list[np.ndarray]:
-    """Points around centres, for a link of which the file shows nothing."""
+    """Points around centres, for a link without geometry in the file."""
     return [c + _BARE * d for c in centers for d in np.concatenate([np.eye(3), -np.eye(3)])]
 
 
 def fit_capsules(points: np.ndarray) -> tuple[Capsule, ...]:
-    """Capsules along the longest side of the points' box (n, 3); several side by side where it is flat."""
+    """Fits capsules along the longest side of the points' box (n, 3); several in parallel if it is flat."""
     to_box, extents = trimesh.bounds.oriented_bounds(points)
     order = np.argsort(extents)[::-1]
     length, breadth, height = np.maximum(extents[order], 1e-3)
@@ -114,7 +114,7 @@ def fit_capsules(points: np.ndarray) -> tuple[Capsule, ...]:
 
 
 def far_end(capsules: tuple[Capsule, ...], origin: np.ndarray) -> np.ndarray:
-    """(3,) mean of the capsules' ends that are farther from a point (3,): where a finger has its tip."""
+    """Mean (3,) of the capsules' ends that are farther from a point (3,): the tip of a finger."""
     ends = [
         max((capsule.start, capsule.end), key=lambda end: float(np.linalg.norm(np.subtract(end, origin))))
         for capsule in capsules

@@ -1,9 +1,9 @@
 """Scripted grips: a hand closes around a ball, a cylinder and a box without a policy, lifts them, and they are pushed.
 
-The hand comes from above: its heading axis points down, and the object lies in the grasp frame, the cylinder's and the
-box's length across the plane in which the fingers close. Each object is tried at several places along the heading axis
-and with several forces, side by side. It is held in place until the fingers have closed; then it is let go, without a
-table. The lift and the pushes are those of `actors.stress`.
+The hand is above: its heading axis points down, and the object is in the grasp frame, with the length of cylinder and
+box across the closing plane of the fingers. Each object is tried in parallel at several positions along the heading
+axis and with several forces. It is fixed until the fingers have closed and then released, without a table. The lift and
+the pushes are those of `actors.stress`.
 """
 
 import dataclasses
@@ -29,46 +29,46 @@ from congrasp.common.objects.spec import GraspObject
 
 OBJECTS = ("ball", "cylinder", "box")
 SIZES = (0.4, 0.3)
-"""Widths of the objects as shares of the hand's opening; cylinder and box are twice as long as they are wide."""
+"""Widths of the objects as shares of the hand's opening; cylinder and box are twice as long as wide."""
 DENSITY = 650.0
-"""kg/m^3, the middle of procedural objects."""
+"""Density of the objects, the median of procedural ones, kg/m^3."""
 _PLACES = (0.0, 0.5, 1.0)
-"""Half widths of the object from the hand centre towards the palm."""
+"""Distances of the object from the hand centre towards the palm, in half widths."""
 _FIRMNESS = (0.3, 0.8)
 """Shares of the torque limits with which fingers press."""
 _SPEED = 0.06
-"""rad per control step by which motors close at most."""
+"""Greatest closing speed of motors, rad per control step."""
 _CLOSE, _HOLD = 100, 50
-"""Control steps."""
+"""Durations in control steps."""
 
 
 class Grip(NamedTuple):
-    """What became of the best attempt at an object."""
+    """Result of the best attempt at an object."""
 
     obj: GraspObject
     width: float
     """m."""
     held: bool
-    """Half a second after it was let go."""
+    """Held half a second after the release."""
     survived: dict[str, bool]
-    """By the names of `actors.stress.SURVIVAL`."""
+    """Survived parts, by the names of `actors.stress.SURVIVAL`."""
     touching: np.ndarray
-    """(L,) bool, links in contact half a second after it was let go."""
+    """(L,) bool, links in contact half a second after the release."""
     q: np.ndarray
-    """(F,) finger angles then, rad."""
+    """(F,) finger angles at that time, rad."""
     object_position: np.ndarray
-    """(3,) m, wrist frame, then."""
+    """(3,) position of the object at that time, wrist frame, m."""
     object_quaternion: np.ndarray
     """(4,) object frame to wrist frame."""
 
     @property
     def rank(self) -> tuple[int, ...]:
-        """How good it is."""
+        """Rank of the attempt."""
         return (self.held, *map(int, self.survived.values()), int(self.touching.sum()))
 
 
 def grip_objects(width: float) -> list[GraspObject]:
-    """A ball, a cylinder and a box of a width in metres; their length lies along y."""
+    """Returns a ball, a cylinder and a box of a width in metres; their length is along y."""
     half = width / 2
     pieces = (
         draft.ellipsoid((half, half, half)),
@@ -79,12 +79,12 @@ def grip_objects(width: float) -> list[GraspObject]:
 
 
 def grips(hand: Hand, task: TaskConfig, threads: int) -> list[Grip]:
-    """The best attempt at each of `OBJECTS`, of the larger ones, or of the smaller ones where those are not held.
+    """Returns the best attempt at each of `OBJECTS`: the larger ones, or the smaller ones if those are not held.
 
     Args:
       hand: the hand.
-      task: its physics: time step, contacts, collisions.
-      threads: of the physics.
+      task: the task, for its physics: time step, contacts, collisions.
+      threads: threads of the physics.
     """
     found: dict[str, Grip] = {}
     for share in SIZES:
@@ -97,7 +97,7 @@ def grips(hand: Hand, task: TaskConfig, threads: int) -> list[Grip]:
 
 
 def _attempts(hand: Hand, task: TaskConfig, width: float, threads: int) -> list[Grip]:
-    """All attempts at objects of one width."""
+    """Runs all attempts at objects of one width."""
     objects = grip_objects(width)
     tried = list(itertools.product(range(len(objects)), _PLACES, _FIRMNESS))
     index, places, firmness = (np.array(column) for column in zip(*tried, strict=True))
@@ -112,9 +112,9 @@ def _attempts(hand: Hand, task: TaskConfig, width: float, threads: int) -> list[
 
 
 def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
-    """Open hands above objects that are held in place at the world's origin, `depth` (B,) m from the hand centre."""
+    """Open hands above objects fixed at the origin of the world frame, `depth` (B,) m from the hand centre."""
     frame, count = grasp_frame(hand), len(index)
-    own = np.stack([frame.cross, np.cross(frame.cross, frame.heading), -frame.heading])  # onto x, y and z
+    own = np.stack([frame.cross, np.cross(frame.cross, frame.heading), -frame.heading])  # to x, y and z
     ones, turn = np.ones(count), np.asarray(rotations.from_matrix(jnp.asarray(own)))
     return ResetState(
         object_index=index,
@@ -132,7 +132,7 @@ def _start(hand: Hand, index: np.ndarray, depth: np.ndarray) -> ResetState:
 
 
 def _close(physics: NativePhysics, hand: Hand, start: ResetState, firmness: np.ndarray) -> np.ndarray:
-    """(B, M) targets of fingers that have closed around what is held in place, and is let go then."""
+    """Targets (B, M) of fingers closed around the fixed object, which is then released."""
     physics.start(start)
     reach = firmness[:, None] * np.array([motor.torque_limit / motor.kp for motor in hand.motors])
     q = target = motor_positions(hand, np.asarray(start.q))
@@ -155,7 +155,7 @@ def _shake(
     target: np.ndarray,
     objects: Sequence[GraspObject],
 ) -> PhysicsState:
-    """Half a second without support, the lift, and the pushes; the states have a leading axis T."""
+    """Simulates half a second without support, the lift, and the pushes; the states have a leading axis T."""
     task = dataclasses.replace(task, approach_steps=0)
     protocol, time = protocols.stress(task, objects, _HOLD), jnp.arange(_HOLD + protocols.stress_steps(task))
     base = jnp.tile(jnp.asarray(start.base_quaternion)[:1], (len(time), 1))
@@ -173,14 +173,14 @@ def _shake(
 def _judged(
     task: TaskConfig, start: ResetState, states: PhysicsState, objects: Sequence[GraspObject], width: float
 ) -> list[Grip]:
-    """What became of the attempts."""
+    """Results of the attempts."""
     wrist = rotations.compose_pose(
         start.base_position, start.base_quaternion, states.u[..., :3], rotations.euler_to_quaternion(states.u[..., 3:])
     )
     seen = rotations.relative_pose(*wrist, states.object_position, states.object_quaternion)
     position, quaternion = (np.asarray(leaf) for leaf in seen)
     last = _HOLD - 1
-    moved = np.linalg.norm(states.object_position[last], axis=-1)  # it was let go at the origin
+    moved = np.linalg.norm(states.object_position[last], axis=-1)  # it was released at the origin
     held = (moved < protocols.FARTHEST) & ~states.diverged.any(0)
     survived = protocols.survival(position[last:], quaternion[last:], held, task)
     touching = states.contact_found[last].any(-1)

@@ -1,6 +1,6 @@
-"""Poses of a hand's links by MuJoCo, for one hand pose at a time, so that recorders and pictures start no JAX backend.
+"""Poses of a hand's links by MuJoCo, for one hand pose at a time, so that recorders and pictures need no JAX backend.
 
-`common.hands.kinematics.link_poses` is the same for batches in JAX.
+`common.hands.kinematics.link_poses` computes the same for batches in JAX.
 """
 
 import functools
@@ -14,7 +14,7 @@ from congrasp.common.hands.spec import Hand
 
 @functools.cache
 def _model(hand: Hand) -> mujoco.MjModel:
-    """The hand alone, with its wrist at the origin."""
+    """Returns a model of the hand only, with its wrist at the origin."""
     spec = mujoco.MjSpec()
     add_hand(spec, hand)
     return spec.compile()

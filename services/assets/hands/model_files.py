@@ -1,7 +1,7 @@
-"""A hand from a URDF or MJCF file: what it says is taken over, and what it does not say is proposed.
+"""A hand from a URDF or MJCF file: its content is used, and missing values are proposed.
 
-MuJoCo reads the file. Which bodies are the hand: `tree`. Links become capsules: `geometry`. Motors, couplings and
-tendons: `motors`. The pose in which the fingers close is found by their kinematics: `poses`.
+MuJoCo reads the file. Bodies of the hand: `tree`. Capsules of links: `geometry`. Motors, couplings and tendons:
+`motors`. Open and closed poses, from kinematics: `poses`.
 """
 
 import dataclasses
@@ -24,47 +24,47 @@ from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_o
 from congrasp.services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
 from congrasp.services.assets.hands.visual import link_mesh
 
-_LEVER = 0.02  # m from a joint to the tip that it moves, at least
-_TURN = np.deg2rad(10)  # of the joint with the largest range, below which nothing can be grasped
-_SMALL = 0.03  # m of opening below which a hand is doubtful
+_LEVER = 0.02  # least distance of a joint from the tip that it moves, m
+_TURN = np.deg2rad(10)  # largest range of a joint below which grasping is impossible
+_SMALL = 0.03  # opening below which a hand is doubtful, m
 
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
-    """A hand as it was understood, and what was not in the file."""
+    """An imported hand, and the values missing in the file."""
 
     hand: Hand
     palm: str
-    """Its name in the file; the hand calls it `palm`."""
+    """Name of the palm in the file; the hand names it `palm`."""
     notes: tuple[str, ...]
     meshes: Meshes
-    """What its file draws."""
+    """Visual meshes of the file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Choices:
-    """What a user knows better than the file."""
+    """Choices of the user that override the file."""
 
     name: str = ""
     palm: str = ""
     thumb: str = ""
     object_scale: float = 0.0
     own_collision: bool = False
-    """Whether links collide by the file's own collision geometry instead of capsules."""
+    """Uses the file's collision geometry instead of capsules."""
 
 
 _GUESSED = Choices()
 
 
 def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
-    """The hand of a file.
+    """Imports the hand of a file.
 
     Args:
-      path: URDF (.urdf) or MJCF (.xml); meshes lie where it says, as MuJoCo finds them.
-      choices: name, palm's body, thumb's last body and object scale, where they are not to be guessed; collision.
+      path: URDF (.urdf) or MJCF (.xml); meshes are found by MuJoCo.
+      choices: name, body of the palm, last body of the thumb and object scale, which are otherwise guessed; collision.
 
     Raises:
-      CongraspError: the file cannot be read, or what it shows is no hand of hinges with at least two fingers.
+      CongraspError: the file cannot be read, or is not a hand of hinges with at least two fingers.
     """
     notes: list[str] = []
     model = compiled_model(path, notes)
@@ -74,7 +74,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     if len(tree.ends) < 2:
         raise CongraspError(
             f"{path} has {len(tree.ends)} finger(s) on its palm '{body_name(model, tree.palm)}'.",
-            "Name another --palm.",
+            "Pass another --palm.",
         )
     _to_palm(data, tree.palm)
     links, drive = _links(model, data, tree, notes)
@@ -94,7 +94,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     if max(joint.upper - joint.lower for joint in hand.joints) < _TURN:
         raise CongraspError(
             f"No joint of the hand in {path} turns by 10 degrees.",
-            'Are its angles in radians, without <compiler angle="radian"/>?',
+            'Check that its angles are in radians, or add <compiler angle="radian"/>.',
         )
     _check(path, hand, "pose")
     hand = dataclasses.replace(hand, thumb=thumb_of(hand, choices.thumb, notes))
@@ -111,7 +111,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
 
 
 def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
-    """Raises a CongraspError for a hand that cannot be; faults that have the word `but` in them do not count yet."""
+    """Raises a CongraspError for an invalid hand; faults that contain the word `but` are ignored."""
     for fault in faults(hand):
         if not but or but not in fault:
             raise CongraspError(
@@ -120,7 +120,7 @@ def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
 
 
 def describe(proposal: Proposal) -> list[str]:
-    """What was understood and what was proposed, as lines of text."""
+    """Describes the import and its proposals, as lines of text."""
     hand = proposal.hand
     frame = grasp_frame(hand)
     tips = [chain_of(hand, hand.links[i].name) for i in hand.tip_links]
@@ -150,12 +150,12 @@ def describe(proposal: Proposal) -> list[str]:
 
 
 def _text(vector: np.ndarray) -> str:
-    """A vector (3,) with three digits."""
+    """Formats a vector (3,) with three digits."""
     return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
 
 
 def _to_palm(data: mujoco.MjData, palm: int) -> None:
-    """Moves places and axes of the simulation's world into the palm's frame."""
+    """Transforms positions and axes of the simulation from the world frame to the palm's frame."""
     turn, origin = data.xmat[palm].reshape(3, 3).copy(), data.xpos[palm].copy()
     for places in (data.xpos, data.xipos, data.xanchor, data.geom_xpos):
         places[:] = (places - origin) @ turn
@@ -165,7 +165,7 @@ def _to_palm(data: mujoco.MjData, palm: int) -> None:
 
 
 def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[str]) -> tuple[list[Link], Drive]:
-    """The links, and what moves them; `notes` says what is proposed."""
+    """Returns the links and their drive; proposals are added to `notes`."""
     names = {link: "palm" if link == tree.palm else body_name(model, link) for link in tree.groups}
     above = {link: tree.owner[int(model.body_parentid[link])] for link in tree.groups if link != tree.palm}
     at = {link: np.zeros(3) if link == tree.palm else data.xanchor[hinges(model, link)[0]] for link in tree.groups}
@@ -209,27 +209,27 @@ def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[s
 def _with_solids(
     model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, links: list[Link], notes: list[str]
 ) -> list[Link]:
-    """The links with the file's own collision geometry; `notes` says which keep their capsules."""
+    """Returns the links with the file's collision geometry; `notes` lists those that keep their capsules."""
     found = [solids_of(model, data, bodies) for bodies in tree.groups.values()]
     if kept := [link.name for link, solids in zip(links, found, strict=True) if not solids]:
-        notes.append(f"no collision geometry but meshes, these collide by their capsules: {', '.join(kept)}")
+        notes.append(f"only meshes as collision geometry, capsules are used: {', '.join(kept)}")
     return [dataclasses.replace(link, solids=solids) for link, solids in zip(links, found, strict=True)]
 
 
 def _meshes(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[str]) -> Meshes:
-    """What the file draws of each link, unless it is larger than a hand."""
+    """Visual meshes of each link, unless larger than a hand."""
     found = {
         "palm" if link == tree.palm else body_name(model, link): link_mesh(model, data, bodies)
         for link, bodies in tree.groups.items()
     }
     drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
     if large := [name for name, (vertices, _) in drawn.items() if np.abs(vertices).max() > MAX_DISTANCE]:
-        notes.append(f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and left out: {', '.join(large)}")
+        notes.append(f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and dropped: {', '.join(large)}")
     return {name: mesh for name, mesh in drawn.items() if name not in large}
 
 
 def _joint_names(model: mujoco.MjModel, tree: Tree, taken: set[str]) -> dict[int, str]:
-    """Names of the hand's joints in its order, apart from those of links."""
+    """Names of the hand's joints in its order, distinct from those of links."""
     order = [j for link in tree.groups if link != tree.palm for j in hinges(model, link)]
     names = {j: identifier(model.joint(j).name, f"joint_{j}") for j in order}
     return {j: f"{name}_joint" if name in taken | TAKEN_JOINTS else name for j, name in names.items()}
@@ -238,7 +238,7 @@ def _joint_names(model: mujoco.MjModel, tree: Tree, taken: set[str]) -> dict[int
 def _levers(
     model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, above: dict[int, int], tips: dict[int, np.ndarray]
 ) -> dict[int, float]:
-    """m from each joint of the hand to the farthest tip that it moves."""
+    """Distance of each joint of the hand from the farthest tip that it moves, m."""
     levers = {j: _LEVER for link in tree.groups if link != tree.palm for j in hinges(model, link)}
     for end, tip in tips.items():
         link = end
@@ -250,9 +250,9 @@ def _levers(
 
 
 def _joint(model: mujoco.MjModel, data: mujoco.MjData, j: int, name: str, drive: Drive) -> Joint:
-    """A hinge."""
+    """Returns a hinge."""
     if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
-        raise CongraspError(f"The joint '{name}' is not a hinge.", "Hands of hinges alone can be imported.")
+        raise CongraspError(f"The joint '{name}' is not a hinge.", "Only hands of hinges can be imported.")
     if not model.jnt_limited[j]:
         raise CongraspError(f"The joint '{name}' has no limits.", "Give it a range.")
     lower, upper = model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]]

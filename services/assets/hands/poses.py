@@ -1,8 +1,8 @@
-"""A thumb, an open and a closed pose for a hand whose file names none, from its kinematics.
+"""Computes a thumb, an open and a closed pose from kinematics, for a hand whose file has none.
 
-First a pinch is looked for: the pose nearest to zero in which the thumb's tip meets the others'. It tells which way
-joints close. The open hand is then turned and spread so that thumb and fingers face each other over an opening of
-somewhat more than a finger's length, and closes by every joint that brings them together from there.
+First a pinch is computed: the pose nearest to zero in which the thumb's tip meets the others'. It determines the
+closing direction of joints. The open hand is then turned and spread so that thumb and fingers face each other over an
+opening of slightly more than a finger's length. It closes by every joint that brings them together.
 """
 
 import dataclasses
@@ -18,28 +18,30 @@ from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand, chain_of, link_origin
 
-_CLOSED = 0.8  # share of the way from zero to a joint's end at which it is closed, where thumb and fingers can meet
-_FLEXED = 0.15  # the same for the fingers of an open hand, as far as nothing else matters
-_SQUEEZE = 0.3  # rad that motors go on when their fingers have met the palm or others
-_OPENING = 1.25  # finger lengths between the tips of an open hand; of what is between them at zero, where that is less
-_AHEAD = 0.3  # finger lengths by which tips of an open hand are at least ahead of where their fingers begin
-_TOWARDS = 0.6  # least share of a tip's motion that leads to the hand's centre, for a joint that closes
-_TURNED = 0.1  # least share of its range that a joint goes to the pinch, to tell the way in which it closes
-_ALIKE = 0.3  # share of its range by which a joint goes farther to one side, to tell the same where it does not
-_EFFORT = 0.1  # weight of a radian of all joints, against a finger length
-_STILL = 0.004  # m/rad, below which a joint does not move its tip
-_APART = 0.02  # m between tips that count as met
-_MORE = 4  # starts at random
+_CLOSED = 0.8  # share of the range from zero to a joint's end at which it is closed, where thumb and fingers can meet
+_FLEXED = 0.15  # the same for the fingers of an open hand, unless other terms matter
+_SQUEEZE = 0.3  # rad by which motors continue after their fingers have met the palm or others
+_OPENING = (
+    1.25  # distance between the tips of an open hand in finger lengths; or as a share of that at zero, if smaller
+)
+_AHEAD = 0.3  # least distance of the tips of an open hand ahead of the fingers' bases, in finger lengths
+_TOWARDS = 0.6  # least share of a tip's motion towards the hand's centre, for a closing joint
+_TURNED = 0.1  # least share of a joint's range in the pinch that determines its closing direction
+_ALIKE = 0.3  # asymmetry of a joint's range that determines it otherwise
+_EFFORT = 0.1  # weight of a radian of all joints relative to a finger length
+_STILL = 0.004  # m/rad below which a joint does not move its tip
+_APART = 0.02  # distance at which tips count as touching, m
+_MORE = 4  # number of random starts
 _STEPS = 40
 _THUMB = re.compile(r"thumb|(^|_)th(j?\d|base|prox|hub|mid|dist)", re.IGNORECASE)
 
 
 def thumb_of(hand: Hand, wanted: str, notes: list[str]) -> str:
-    """The last link of the finger that is called a thumb, or else of the one that best faces all others."""
+    """Returns the last link of the finger named as a thumb, or else of the one that best faces all others."""
     tips = [link.name for link in hand.links if link.tip is not None]
     if wanted:
         if wanted not in tips:
-            raise CongraspError(f"'{wanted}' is not the last link of a finger.", f"Name one of: {', '.join(tips)}.")
+            raise CongraspError(f"'{wanted}' is not the last link of a finger.", f"Pass one of: {', '.join(tips)}.")
         return wanted
     for tip in tips:
         chain = [link for link in hand.links if link.name in chain_of(hand, tip)]
@@ -48,12 +50,14 @@ def thumb_of(hand: Hand, wanted: str, notes: list[str]) -> str:
     costs = [_faced(_Body(dataclasses.replace(hand, thumb=tip)), 0)[1] for tip in tips]
     best, second = np.argsort(costs)[:2]
     if len(tips) > 2:
-        notes.append(f"'{tips[best]}' is taken for the thumb, before '{tips[second]}', for want of a name (--thumb)")
+        notes.append(
+            f"'{tips[best]}' is assumed to be the thumb, before '{tips[second]}', because none is named (--thumb)"
+        )
     return tips[int(best)]
 
 
 def propose_poses(hand: Hand, notes: list[str]) -> Hand:
-    """The hand with an open and a closed pose; `notes` says what is doubtful."""
+    """Returns the hand with an open and a closed pose; doubts are added to `notes`."""
     body = _Body(hand)
     opened, _, apart = _faced(body, _MORE)
     if apart > _APART:
@@ -73,7 +77,7 @@ def propose_poses(hand: Hand, notes: list[str]) -> Hand:
     names = [joint.name for joint in hand.joints if joint.name not in {x.joint for x in hand.couplings}]
 
     def pose(motors: np.ndarray) -> dict[str, float]:
-        """Angles of joints that follow none by their names, without zeros."""
+        """Angles of the joints that follow none by name, without zeros."""
         angles = joint_positions(hand, motors.astype(np.float32))
         q = {joint.name: angle for joint, angle in zip(hand.joints, angles, strict=True)}
         return {name: round(float(q[name]), 6) for name in names if abs(q[name]) > 1e-4}
@@ -104,49 +108,49 @@ class _Body:
         self._finger = {self._model.body(link.name).id: root for link, root in zip(hand.links, roots, strict=True)}
         carrier = {joint.name: root for link, root in zip(hand.links, roots, strict=True) for joint in link.joints}
         self.fingers = [{carrier[name] for name in self._moved(m)} for m in range(len(hand.motors))]
-        """Root links of the fingers that each motor moves."""
+        """Root links of the fingers moved by each motor."""
         self.thumb = np.array([hand.finger_roots[0] in fingers for fingers in self.fingers])
         """(M,) bool: motors of the thumb."""
         origins = {link.name: link_origin(link) for link in hand.links}
         self.roots = np.array([origins[root] for root in hand.finger_roots])
-        """(tips, 3) where the fingers begin, thumb first."""
+        """(tips, 3) bases of the fingers, thumb first."""
         tips = self.tips(np.clip(0.0, *self.limits))
         row = tips[1:] - tips[1:].mean(0)
         sideways = np.linalg.svd(row)[2][0] if len(row) > 1 else np.zeros(3)
         self.across = np.eye(3) - np.outer(sideways, sideways)
-        """Projection that leaves out the direction in which the fingers stand side by side."""
+        """Projection that removes the direction in which the fingers are side by side."""
         last = [list(link.joints)[-1].name for link in (hand.links[i] for i in hand.tip_links)]
         self._last = [next(m for m in range(len(hand.motors)) if name in self._moved(m)) for name in last]
         straight = (tips - self.roots)[1:]
         self.size = float(np.linalg.norm(straight, axis=-1).mean())
-        """m, length of the fingers."""
+        """Length of the fingers, m."""
         self.ahead = straight.mean(0) / np.linalg.norm(straight.mean(0))
-        """(3,) unit, where the fingers point at zero."""
+        """(3,) unit, direction of the fingers at zero."""
 
     def _moved(self, m: int) -> set[str]:
-        """Names of the joints that a motor moves."""
+        """Names of the joints moved by a motor."""
         pulled = {*self.hand.motors[m].joints}
         return pulled | {x.joint for x in self.hand.couplings if x.leader in pulled}
 
     def _place(self, motors: np.ndarray) -> None:
-        """Puts the model where the motors are."""
+        """Moves the model to motor positions."""
         self._data.qpos[6:] = joint_positions(self.hand, motors)
 
     def tips(self, motors: np.ndarray) -> np.ndarray:
-        """(tips, 3) in the wrist frame, thumb first."""
+        """Tips (tips, 3) in the wrist frame, thumb first."""
         self._place(motors)
         mujoco.mj_kinematics(self._model, self._data)
         turns = self._data.xmat[self._links].reshape(-1, 3, 3)
         return self._data.xpos[self._links] + np.einsum("tij,tj->ti", turns, self._local)
 
     def gap(self, motors: np.ndarray) -> np.ndarray:
-        """(fingers, 3) from the thumb's tip to the others', without what these are apart from one another sideways."""
+        """Vectors (fingers, 3) from the thumb's tip to the others', without their lateral offsets."""
         tips = self.tips(motors)
         middle = tips[1:].mean(0) - tips[0]
         return (tips[1:] - tips[0]) @ self.across + middle @ (np.eye(3) - self.across)
 
     def pads(self, motors: np.ndarray, way: np.ndarray) -> np.ndarray:
-        """(tips, 3) unit, where the tips go when their last joints close, which do so by the signs `way` (M,)."""
+        """Unit directions (tips, 3) of the tips as their last joints close, with signs `way` (M,)."""
         tips = self.tips(motors)
         mujoco.mj_comPos(self._model, self._data)
         found, jacobian = np.zeros((len(tips), 3)), np.zeros((3, self._model.nv))
@@ -157,9 +161,9 @@ class _Body:
         return found
 
     def closing(self, motors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(M,) the share of each motor's motion of its tip that leads to the hand's centre, and the tip's speed, m/rad.
+        """Share (M,) of each motor's motion of its tip towards the hand's centre, and the tip's speed, m/rad.
 
-        Of many fingers in a row the outer ones need not come to its middle: the more there are, the less that counts.
+        With many fingers in a row the outer ones need not reach its centre: the weight decreases with their number.
         """
         tips = self.tips(motors)
         towards = 0.5 * (tips[0] + tips[1:].mean(0)) - tips
@@ -185,9 +189,9 @@ class _Body:
 
 
 def _faced(body: _Body, more: int) -> tuple[np.ndarray, float, float]:
-    """(M,) the motors of the open hand, by how much they miss what is wanted of it, and m between tips in a pinch.
+    """Motors (M,) of the open hand, its residual, and the distance between tips in a pinch, m.
 
-    `more` starts at random are tried besides the obvious ones.
+    `more` random starts are tried in addition to the standard ones.
     """
     lower, upper = body.limits
     flat = np.clip(0.0, lower, upper)
@@ -198,12 +202,12 @@ def _faced(body: _Body, more: int) -> tuple[np.ndarray, float, float]:
     share, _ = body.closing(0.5 * (flat + pinch))
     flexing = ~body.thumb & (share * np.sign(way) > _TOWARDS)
     rest = np.where(flexing, flat + _FLEXED * (np.where(way > 0, upper, lower) - flat), flat)
-    weight = np.where(body.thumb, 4.0, np.where(flexing, 8.0, 24.0))  # fingers spread only for a good reason
+    weight = np.where(body.thumb, 4.0, np.where(flexing, 8.0, 24.0))  # fingers spread only if it helps
     straight = body.tips(flat)
     target = _OPENING * min(1.0, float(np.linalg.norm(straight[1:].mean(0) - straight[0])) / body.size)
 
     def residuals(motors: np.ndarray) -> np.ndarray:
-        """Pads of thumb and fingers face each other across the opening, not aside of one another or behind the palm."""
+        """Residuals of pads of thumb and fingers, which should face each other across the opening."""
         tips, pads = body.tips(motors), body.pads(motors, np.sign(way))
         between = tips[1:].mean(0) - tips[0]
         wide = float(np.linalg.norm(between))
@@ -218,7 +222,7 @@ def _faced(body: _Body, more: int) -> tuple[np.ndarray, float, float]:
 
 
 def _pinch(body: _Body, flat: np.ndarray, more: int) -> np.ndarray:
-    """(M,) the motors where the tips meet, or come nearest, on the shortest way from `flat`."""
+    """Motors (M,) where the tips meet, or are nearest, on the shortest path from `flat`."""
     lower, upper = body.limits
 
     def residuals(motors: np.ndarray) -> np.ndarray:
@@ -231,14 +235,14 @@ def _pinch(body: _Body, flat: np.ndarray, more: int) -> np.ndarray:
 
 
 def _effort(way: np.ndarray) -> np.ndarray:
-    """(M,) residuals of a way (M,) of the motors, rad."""
+    """Residuals (M,) of a motion (M,) of the motors, rad."""
     return _EFFORT * way / np.sqrt(len(way))
 
 
 def _least(
     body: _Body, residuals: Callable[[np.ndarray], np.ndarray], starts: list[np.ndarray], more: int
 ) -> tuple[np.ndarray, float]:
-    """(M,) the motors with the least squares of residuals, of these starts and `more` others; half the squares."""
+    """Motors (M,) with the least squares of residuals, from these starts and `more` others; half the squares."""
     lower, upper = body.limits
     rng = np.random.default_rng(0)
     found = [
@@ -250,7 +254,7 @@ def _least(
 
 
 def _closed(body: _Body, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(M,) where motors come to on their way from `start` to `end`: hardly beyond where fingers meet palm or others."""
+    """Motors (M,) reached from `start` towards `end`: barely beyond contact of fingers with palm or others."""
     share = np.zeros(len(start))
     going = np.ones(len(start), bool)
     before = body.touching(start)

@@ -1,4 +1,4 @@
-"""How a hand's motors follow their targets, in free air: the response to a step, and closing without an object."""
+"""Tracking of a hand's motors in free air: the response to a step, and closing without an object."""
 
 import dataclasses
 from typing import NamedTuple
@@ -16,35 +16,38 @@ from congrasp.common.task import plausibility
 from congrasp.services.assets.hands.grips import grip_objects
 
 STEP = 0.1
-"""rad, as far as a target moves in a control step."""
+"""Step of a target in a control step, rad."""
 _STEPS = 60
-_SETTLED = 10  # the last control steps, in which a joint should be at rest
-_FAR = (0.0, 0.0, -5.0)  # m, where the object that every scene has is out of reach
+_SETTLED = 10  # last control steps, in which a joint should be at rest
+_FAR = (0.0, 0.0, -5.0)  # distance at which the scene's object is out of reach, m
 
 
 class Response(NamedTuple):
-    """A motor's response to a step of its target."""
+    """Response of a motor to a step of its target."""
 
     overshoot: float
-    """Beyond the target, as a share of the step."""
+    """Overshoot as a share of the step."""
     unrest: float
-    """rad/s, the standard deviation of the motor's speed in the last tenth of a second; a slow one has none."""
+    """Standard deviation of the motor's speed in the last tenth of a second, rad/s; zero for a slow one."""
     error: float
-    """Distance from the target in the end, as a share of the step."""
+    """Final distance from the target, as a share of the step."""
     diverged: bool
-    """The simulation broke off."""
+    """True if the simulation diverged."""
 
 
 def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
-    """The responses (M) of the motors, one after the other, to steps of `STEP` or half of their range from the open
-    pose towards the side with more room; the other motors are to stay, and links do not collide."""
+    """Responses (M) of the motors to steps, in turn.
+
+    A step is `STEP` or half of the range, from the open pose towards the side with more room. The other motors stay,
+    and links do not collide.
+    """
     task = dataclasses.replace(task, hand_self_collision=False, hand_table_collision=False)
     (lower, upper), opened = motor_limits(hand), motor_positions(hand, hand.q_open)
     size = np.minimum(STEP, (upper - lower) / 2)
     way = np.where(upper - opened >= opened - lower, size, -size)
     states = _states(hand, task, np.tile(opened + np.diag(way), (_STEPS, 1, 1)), threads)
     each = np.arange(len(hand.motors))
-    gone = (motor_positions(hand, states.q)[:, each, each] - opened) / way  # (T, M) shares of the step
+    gone = (motor_positions(hand, states.q)[:, each, each] - opened) / way  # (T, M) as shares of the step
     speed = motor_positions(hand, states.q_velocity)[-_SETTLED:, each, each]
     return [
         Response(
@@ -58,7 +61,7 @@ def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
 
 
 def closed_overlap(hand: Hand, task: TaskConfig, threads: int) -> float:
-    """How deep in metres links are in one another once the empty hand has closed, as far as its contacts let it."""
+    """Greatest overlap in m of links after the empty hand has closed, as far as its contacts allow."""
     share = np.minimum(np.arange(1, 2 * _STEPS + 1) / _STEPS, 1.0)[:, None, None]
     opened, closed = (motor_positions(hand, q) for q in (hand.q_open, hand.q_closed))
     states = _states(hand, task, opened + share * (closed - opened), threads)
@@ -66,7 +69,7 @@ def closed_overlap(hand: Hand, task: TaskConfig, threads: int) -> float:
 
 
 def _states(hand: Hand, task: TaskConfig, targets: np.ndarray, threads: int) -> PhysicsState:
-    """The states, with leading axis T, under targets (T, B, M) of the motors that begin with the open pose."""
+    """States, with leading axis T, for motor targets (T, B, M) from the open pose on."""
     count = targets.shape[1]
     ones = np.ones(count)
     start = ResetState(

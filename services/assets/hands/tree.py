@@ -1,7 +1,7 @@
-"""Which bodies of a model are a hand: its palm, and what branches off it.
+"""Finds the bodies of a hand in a model: its palm, and the branches from it.
 
-A body without a hinge belongs to what carries it, so that a model is a tree of links. The palm is the link off which
-most branches go; what stands before it (an arm, a wrist) is left out, since the wrist is a virtual mount here.
+A body without a hinge belongs to its parent, so that a model is a tree of links. The palm is the link with most
+branches; bodies before it (an arm, a wrist) are dropped, since the wrist is a virtual mount.
 """
 
 import dataclasses
@@ -23,18 +23,18 @@ class Tree:
     groups: dict[int, list[int]]
     """Bodies of each link, the palm's first."""
     owner: dict[int, int]
-    """The link that each body belongs to."""
+    """Link of each body."""
     ends: tuple[int, ...]
-    """The last link of each finger."""
+    """Last link of each finger."""
 
 
 def identifier(name: str, other: str) -> str:
-    """A name that may stand in a hand file, or another where the file has none."""
+    """Returns a valid name for a hand file, or another if the file has none."""
     return re.sub(r"\W+", "_", name).strip("_") or other
 
 
 def body_name(model: mujoco.MjModel, body: int) -> str:
-    """A body's name as an identifier."""
+    """Returns a body's name as an identifier."""
     return identifier(model.body(body).name, f"body_{body}")
 
 
@@ -45,19 +45,19 @@ def hinges(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
-    """The hand of a model.
+    """Returns the hand of a model.
 
     Args:
-      model: anything with a hand in it.
-      wanted: the palm's body, or nothing.
-      notes: what is doubtful is added to it.
+      model: model with a hand.
+      wanted: body of the palm, or empty.
+      notes: doubts are appended.
 
     Raises:
       CongraspError: there is no body of that name.
     """
     names = [model.body(i).name for i in range(model.nbody)]
     if wanted and wanted not in names:
-        raise CongraspError(f"There is no body '{wanted}'.", f"Name one of: {', '.join(filter(None, names))}.")
+        raise CongraspError(f"There is no body '{wanted}'.", f"Pass one of: {', '.join(filter(None, names))}.")
     palm = names.index(wanted) if wanted else _palm(model, notes)
     owner, groups = {palm: palm}, {palm: [palm]}
     for body in range(palm + 1, model.nbody):
@@ -71,7 +71,7 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
         if link != palm:
             above = owner[int(model.body_parentid[link])]
             depth[link], root[link] = depth[above] + 1, link if above == palm else root[above]
-    last: dict[int, int] = {}  # where a finger branches again, its longest branch has the tip
+    last: dict[int, int] = {}  # where a finger branches again, the tip is on its longest branch
     for link in groups:
         if link != palm and depth[link] > depth.get(last.get(root[link], palm), 0):
             last[root[link]] = link
@@ -79,8 +79,8 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
 
 
 def _palm(model: mujoco.MjModel, notes: list[str]) -> int:
-    """The body with most branches; of several, one that is called so, the last from the root."""
-    carrier = list(range(model.nbody))  # of each body, the one whose joints move it
+    """Body with most branches; among several, one named as a palm, the last from the root."""
+    carrier = list(range(model.nbody))  # for each body, the one whose joints move it
     branches: dict[int, int] = {}
     for body in range(1, model.nbody):
         parent = carrier[int(model.body_parentid[body])]
@@ -101,7 +101,7 @@ def _palm(model: mujoco.MjModel, notes: list[str]) -> int:
 
 
 def _fork(model: mujoco.MjModel, carrier: list[int], link: int) -> int:
-    """The body of a link whose bodies carry all of its branches: that of the world may be a fixed mount below."""
+    """Body of a link whose bodies carry all of its branches: the world body may be a fixed mount below."""
     carriers = [
         int(model.body_parentid[body])
         for body in range(1, model.nbody)

@@ -1,4 +1,4 @@
-"""What a hand's file draws of each link: as meshes of few triangles, which are kept beside the hand's own file."""
+"""Visual meshes of each link in a hand's file, simplified, and stored next to the hand's file."""
 
 import io
 import pathlib
@@ -14,7 +14,7 @@ from congrasp.services.assets.hands.geometry import geom_mesh
 
 
 def link_mesh(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> tuple[np.ndarray, np.ndarray] | None:
-    """What is drawn of bodies; None where that is nothing."""
+    """Visual mesh of bodies; None if there is none."""
     parts = []
     for body in bodies:
         mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
@@ -30,13 +30,13 @@ def link_mesh(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> 
     whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), faces)
     if len(whole.faces) > MAX_FACES:
         whole = whole.simplify_quadric_decimation(face_count=MAX_FACES)
-    if not 0 < len(whole.faces) <= MAX_FACES:  # many separate parts cannot be simplified so far
+    if not 0 < len(whole.faces) <= MAX_FACES:  # many separate parts cannot be simplified that far
         whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts])).convex_hull
     return np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32)
 
 
 def save_meshes(path: pathlib.Path, meshes: Meshes) -> None:
-    """Writes the meshes of a hand beside its file; without any, what was there is removed."""
+    """Writes the meshes of a hand next to its file; without any, removes an existing file."""
     if not meshes:
         beside(path).unlink(missing_ok=True)
         return

@@ -1,14 +1,17 @@
-"""Objects that a user points to: object files, folders of them, meshes to import, names, and seeds of the generator."""
+"""Objects named by a user: object files, folders of them, meshes to import, names, and seeds of the generator."""
 
+import hashlib
 import logging
 import pathlib
+import re
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import store
-from congrasp.common.objects.procedural import generate
+from congrasp.common.objects.procedural import family_turns, generate
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.parallel import parallel_map
 from congrasp.services.assets.objects.meshes import import_source, import_sources
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.sources import SUFFIXES, Source, find_sources
@@ -18,7 +21,7 @@ _METRES_OR_ASK = ImportOptions()
 
 
 class ObjectAt(NamedTuple):
-    """An object that a path holds, read or imported only when it is wanted."""
+    """An object at a path, read or imported on demand."""
 
     name: str
     path: pathlib.Path
@@ -33,19 +36,30 @@ class ObjectAt(NamedTuple):
         """
         if self.source:
             return import_source(self.source, options)
-        return _generated(self.path) or store.load(self.path)
+        if self.path.suffix == store.SUFFIX:
+            return store.load(self.path)
+        family, _, seed = str(self.path).partition(":")
+        return generate(int(seed), family)
+
+    def digest(self) -> str:
+        """A hash of its files' content; of an object of the generator what it is made of."""
+        if not self.source and not self.path.exists():
+            return str(self.path)
+        files = [file.path for file in self.source.files()] if self.source else [self.path]
+        return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
 
 
 def objects_at(path: pathlib.Path) -> list[ObjectAt]:
-    """What a path holds: an object file, the object files of a folder, or else meshes (see `find_sources`).
+    """Objects at a path: an object file, the object files of a folder, or else meshes (see `find_sources`).
 
-    FAMILY:SEED, such as mug:7, is an object of the generator, where no file has that name.
+    FAMILY:SEED, such as mug:7, is an object of the generator, and FAMILY:FIRST-LAST are many of them, where no file has
+    that name; the families of a group, such as all:0-999, take turns.
 
     Raises:
       CongraspError: there is nothing of the kind.
     """
     if made := _generated(path):
-        return [ObjectAt(made.name, path, None)]
+        return made
     files = [path] if path.suffix == store.SUFFIX else sorted(path.glob(f"*{store.SUFFIX}"))
     if files:
         return [ObjectAt(file.stem, file, None) for file in files]
@@ -58,12 +72,12 @@ def objects_of(
     *,
     track: Callable[[str, int | None], Callable[[int], None]] | None = None,
 ) -> list[GraspObject]:
-    """Every object of a path; what an import has to say goes to the log.
+    """Loads every object of a path; notes of imports go to the log.
 
     Args:
       path: see `objects_at`.
       options: how meshes become objects.
-      track: (what is done, how much) -> what is told how much is done; import may take long.
+      track: (label, total) -> function to call with the number done; imports may take long.
 
     Raises:
       CongraspError: there is nothing of the kind, or it cannot be read or imported.
@@ -85,13 +99,14 @@ def load_each(
     on_error: Callable[[ObjectAt, CongraspError], None] = _refuse,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[GraspObject]:
-    """Objects in the order given; meshes are imported side by side, and what an import has to say goes to the log.
+    """Loads objects in the given order; meshes are imported in parallel, and notes of imports go to the log.
 
     Args:
       found: see `objects_at`.
       options: how meshes become objects.
-      on_error: is given what cannot be read or imported, and why; such an object is left out unless this raises.
-      progress: is told how many meshes are done.
+      on_error: called with each object that cannot be read or imported, and the error; the object is skipped unless
+        this raises.
+      progress: called with the number of finished meshes.
     """
     sources = {i: one.source for i, one in enumerate(found) if one.source}
     indices, objects = list(sources), dict[int, GraspObject]()
@@ -103,7 +118,9 @@ def load_each(
             _log.warning("%s: %s", obj.name, note)
         objects[indices[n]] = obj
         progress(done)
-    for i in sorted(set(range(len(found))) - set(sources)):
+    drawn = [i for i, one in enumerate(found) if not one.source and one.path.suffix != store.SUFFIX]
+    objects |= zip(drawn, parallel_map(ObjectAt.load, [found[i] for i in drawn]), strict=True)
+    for i in sorted(set(range(len(found))) - set(sources) - set(drawn)):
         try:
             objects[i] = found[i].load(options)
         except CongraspError as error:
@@ -130,10 +147,8 @@ def find_object(text: str, folder: str = "objects") -> GraspObject:
       CongraspError: there is no such object.
     """
     path = pathlib.Path(text)
-    if path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or path.is_dir():
+    if path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or path.is_dir() or _generated(path):
         return one_object(path)
-    if made := _generated(path):
-        return made
     catalogue = store.Catalogue(folder)
     if not catalogue.path(text).is_file():
         raise CongraspError(
@@ -143,7 +158,21 @@ def find_object(text: str, folder: str = "objects") -> GraspObject:
     return catalogue.get(text)
 
 
-def _generated(path: pathlib.Path) -> GraspObject | None:
-    """The object of the generator that FAMILY:SEED means; None for any other text."""
-    family, colon, seed = str(path).partition(":")
-    return generate(int(seed), family) if colon and seed.isdecimal() and len(seed) < 10 and not path.exists() else None
+def _generated(path: pathlib.Path) -> list[ObjectAt]:
+    """The objects of the generator that FAMILY:SEED or FAMILY:FIRST-LAST means; none for any other text.
+
+    Raises:
+      CongraspError: there is no such family, or the last seed comes before the first.
+    """
+    text = re.fullmatch(r"([^:]+):(\d{1,9})(?:-(\d{1,9}))?", str(path))
+    if not text or path.exists():
+        return []
+    first, last = int(text[2]), int(text[3] or text[2])
+    if last < first:
+        raise CongraspError(f"'{path}' ends before it begins.", f"Write {text[1]}:{last}-{first}.")
+    seeds = range(first, last + 1)
+    families = family_turns(len(seeds), first, (text[1],))
+    return [
+        ObjectAt(f"{family}_{seed}", pathlib.Path(f"{family}:{seed}"), None)
+        for family, seed in zip(families, seeds, strict=True)
+    ]

@@ -43,7 +43,7 @@ def covered(obj: GraspObject, *, use_affordance: bool = True) -> np.ndarray:
     if found is None:
         return np.zeros(len(obj.rest_poses), bool)
     avoid = obj.non_graspable_points if use_affordance else None
-    return np.asarray(within_reach(found, obj.points, obj.rest_poses, hand, avoid)[1].any(-1))
+    return np.asarray(within_reach(found, obj, obj.rest_poses, hand, avoid)[1].any(-1))
 
 
 def _candidates(obj: GraspObject) -> Iterator[GraspObject]:

@@ -55,7 +55,8 @@ def test_shares_of_the_rules_for_headings(bank):
     by_center = build_bank(HAND, task, OBJECTS, 0)
     found = heading_rules(bank, OBJECTS, by_center)
     assert found.kept + found.from_below + found.no_room == pytest.approx(1.0)
-    assert 0 < found.kept < found.kept_by_center <= 1 - found.from_below + 1e-9 and 0 <= found.moved <= 1
+    assert 0 < found.kept < found.kept_by_center <= 1 - heading_rules(by_center, OBJECTS).from_below + 1e-9
+    assert 0 <= found.moved <= 1 and 0 < found.opposed <= 1
     kept = sum(
         len(set(np.asarray(bank.heading_index)[n, 0, r]))
         for n, obj in enumerate(OBJECTS)
@@ -65,8 +66,17 @@ def test_shares_of_the_rules_for_headings(bank):
 
 
 def test_the_rules_are_said_in_one_sentence_each():
-    text = HeadingRules(kept=0.24, from_below=0.45, no_room=0.31, moved=0.4, kept_by_center=0.52).sentence("human")
-    for words in ("human hand: 24 %", "45 % dropped", "31 % because the table", "40 % of the kept", "52 % are kept"):
+    rules = HeadingRules(kept=0.24, from_below=0.45, no_room=0.31, moved=0.4, kept_by_center=0.52, opposed=0.86)
+    text = rules.sentence("human")
+    parts = (
+        "human hand: 24 %",
+        "45 % dropped",
+        "31 % because the table",
+        "40 % of the kept",
+        "52 % are kept",
+        "14 % of",
+    )
+    for words in parts:
         assert words in text
     assert "centre" not in HeadingRules(kept=0.24, from_below=0.45, no_room=0.31, moved=0.4).sentence("human")
 

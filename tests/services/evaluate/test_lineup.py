@@ -86,9 +86,9 @@ def test_a_method_that_does_not_learn_takes_any_policys_hand(saved):
 @pytest.mark.parametrize(
     ("texts", "words"),
     [
-        (["graspxl={ours}"], "is of the method 'ours', not 'graspxl'"),
+        (["graspxl={ours}"], "has the method 'ours', not 'graspxl'"),
         (["levitate={ours}"], "no method 'levitate'"),
-        (["{ours}", "{other}"], "Two policies are of the hand 'human' and the method 'ours'"),
+        (["{ours}", "{other}"], "Two policies have the hand 'human' and the method 'ours'"),
         (["{empty}"], "holds no policy.safetensors"),
         (["/nonexistent/policy.safetensors"], "cannot be read"),
     ],

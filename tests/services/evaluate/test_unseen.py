@@ -11,8 +11,10 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
 from congrasp.services.evaluate import exam, unseen
+from congrasp.services.evaluate import pools as of_objects
+from congrasp.services.evaluate.pools import Loaded, Pools, folder_pools, procedural_pools
 from congrasp.services.evaluate.scores import Sample
-from congrasp.services.evaluate.unseen import Loaded, Pools, evaluate_objects, folder_pools, procedural_pools
+from congrasp.services.evaluate.unseen import evaluate_objects
 from congrasp.services.train.command import untrained
 
 CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
@@ -58,7 +60,7 @@ def simulated(monkeypatch):
         return Sample(values, np.ones((total, 1, 2), np.float16), np.ones((total, 1, 3), np.float16))
 
     monkeypatch.setattr(unseen, "Episodes", Running)
-    monkeypatch.setattr(unseen, "build_bank", lambda hand, task, objects, seed: [obj.name for obj in objects])
+    monkeypatch.setattr(of_objects, "build_bank", lambda hand, task, objects, seed: [obj.name for obj in objects])
     monkeypatch.setattr(unseen, "plan_row", plan_row)
     monkeypatch.setattr(unseen, "batches", lambda hand, task, bank, plan, seed, size: plan.episodes)
     monkeypatch.setattr(unseen, "simulate", simulate)
@@ -144,9 +146,10 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(simulate
     def headings_of(task, obj, seed, given, scale, own):
         if obj.name == lost:
             raise CongraspError("no heading")
+        return {"weight": np.float32(1.0)}
 
-    monkeypatch.setattr(unseen, "build_bank", build_bank)
-    monkeypatch.setattr(unseen, "headings_of", headings_of)
+    monkeypatch.setattr(of_objects, "build_bank", build_bank)
+    monkeypatch.setattr(of_objects, "headings_of", headings_of)
     whole, *_ = evaluate_objects(POLICY, pools_of(OBJECTS[:3], OBJECTS[1:2]), 6, **SETTINGS)
     assert [obj["name"] for obj in whole.objects] == [OBJECTS[0].name, OBJECTS[2].name]
     assert (whole.covered, whole.pool) == (2, 4) and lost in caplog.text
@@ -155,7 +158,7 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(simulate
 
 
 def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch):
-    monkeypatch.setattr(unseen, "_MESHES", 2)
+    monkeypatch.setattr(of_objects, "_MESHES", 2)
     for obj in OBJECTS:
         Catalogue(tmp_path).add(obj)
     pools = folder_pools(tmp_path, "native")
@@ -166,7 +169,7 @@ def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch)
 
 
 def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
-    monkeypatch.setitem(unseen._MOST, False, 2)
+    monkeypatch.setitem(of_objects._MOST, False, 2)
     pools = procedural_pools(5, "native", "development")
     objects = [make().objects for make in pools.make]
     assert pools.size == 2 and [len(pool) for pool in objects] == [2, 2, 2]

@@ -10,9 +10,13 @@ import trimesh
 from PIL import Image
 
 from congrasp.actors.attempts import Outcome
+from congrasp.actors.physics.engine import ResetState
+from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Trace
 from congrasp.actors.stress import ASSESSED, SURVIVAL
+from congrasp.common import mirror
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.policy import bundle as bundles
@@ -68,7 +72,7 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     assert motion.constraints == ("heading", "affordance") and motion.about["attempts"] == found.attempts
     assert len(motion.time) == steps and motion.table.sum() == steps - 26  # gone with its last step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
-    np.testing.assert_array_equal(motion.surface_minus, minus[:256])
+    np.testing.assert_array_equal(motion.surface_avoid, minus[:256])
     # The hand came along the block's own z axis: from its start to its end the wrist moved mostly that way.
     way = motion.wrist_position[48] - motion.wrist_position[0]
     axis = np.asarray(rotate(motion.object_quaternion[0], np.array([0.0, 0.0, -1.0])))
@@ -80,6 +84,27 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
 
     again = grasper.grasp(block, request).motion
     np.testing.assert_array_equal(again.joint_position, motion.joint_position)
+
+
+def test_a_left_hand_with_its_own_model_does_what_the_mirrored_right_one_did(block, grasper, monkeypatch):
+    begun = []
+    initial = grasper._attempts._initial
+    monkeypatch.setattr(grasper._attempts, "_initial", lambda request: begun.append(initial(request)) or begun[-1])
+    monkeypatch.setattr(grasper, "_left", True)
+    found = grasper.grasp(block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}}))
+    arrays = {name: np.asarray(value) for name, value in found.episode.arrays.items()}
+    assert found.motion.hand == "human_left" and found.success
+    np.testing.assert_allclose(found.motion.goal["heading_direction"], [0, 0.6, -0.8], atol=1e-6)
+    np.testing.assert_allclose(found.motion.object_vertices, block.visual_vertices, atol=1e-6)
+    start = mirror.fields({name: np.asarray(x) for name, x in begun[-1][0].reset_state._asdict().items()})
+    chosen = np.linalg.norm(start["base_position"] - arrays["link_position"][0, 0], axis=-1).argmin()
+    physics = NativePhysics(get_hand("human:left"), grasper.task, [block], 1)
+    physics.start(ResetState(**{name: x[[chosen]] for name, x in start.items()}))
+    for step, target in enumerate(np.concatenate([arrays["u_target"], arrays["q_target"]], -1)):
+        _, state = physics.step(None, target[None], np.array([step < grasper.task.approach_steps]))
+    physics.close()
+    np.testing.assert_allclose(state.object_position[0], arrays["object_position"][-1], atol=0.01)
+    np.testing.assert_allclose(state.q[0], arrays["q"][-1], atol=0.1)
 
 
 def test_what_holds_comes_first_then_what_is_firm_clean_and_as_asked():
@@ -204,7 +229,7 @@ def test_what_is_not_held_is_told_by_the_exit_code(tmp_path, capsys, monkeypatch
     assert command(folder / "loose.stl", "--out", tmp_path / "out") == 1
     assert "not held" in capsys.readouterr().out
     assert command(tmp_path / "nothing.stl", "--out", tmp_path / "out") == 2
-    assert "There is no file or folder" in capsys.readouterr().err
+    assert "There is no file" in capsys.readouterr().err
     assert command(folder / "loose.stl", "--out", tmp_path / "out", "--heading", "up there", "--again") == 2
     assert "--heading is 'up there', not 3 numbers" in capsys.readouterr().err
 
@@ -227,7 +252,7 @@ def test_nothing_to_grasp(tmp_path):
     with pytest.raises(CongraspError, match="nothing to grasp"):
         command()
     for option, value in (("--approach", "-1"), ("--approach", "11"), ("--lift", "0.6"), ("--lift", "nan")):
-        with pytest.raises(CongraspError, match=f"{option} is .* It is from 0 to"):
+        with pytest.raises(CongraspError, match=f"{option} is .* It must be from 0 to"):
             command(tmp_path, option, value)
     with pytest.raises(CongraspError, match="--attempts is 0"):
         command(tmp_path, "--attempts", "0")

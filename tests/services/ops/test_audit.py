@@ -27,7 +27,7 @@ def run_dir(tmp_path):
     actor.write(actor="a", incarnation="1")
     for sequence, checksum in enumerate(CONTENT):
         actor.write(made=sequence, version=sequence, checksum=checksum)
-        actor.write(answer=sequence, outcome="accepted", life="x")
+        actor.write(answer=sequence, outcome="accepted", session_id="x")
     return tmp_path
 
 
@@ -38,7 +38,7 @@ def learner(run_dir, *lines):
 
 
 def life(name="x", version=0):
-    return {"life": name, "epoch": "e", "version": version, "max_staleness": 1, "kept": True, "taken": []}
+    return {"session_id": name, "run_id": "e", "version": version, "max_staleness": 1, "kept": True, "taken": []}
 
 
 def used(*sequences, version=None, checksum=None, lag=0, incarnation="1"):
@@ -54,9 +54,9 @@ def faults(run_dir):
 def test_a_pipe_in_the_folder_holds_nobody_up(run_dir):
     learner(run_dir, life(), used(0, 1))
     os.mkfifo(run_dir / AUDIT / "b.jsonl")
-    with pytest.raises(CongraspError, match=r"b\.jsonl is no regular file"):
+    with pytest.raises(CongraspError, match=r"b\.jsonl is not a regular file"):
         audit(run_dir)
-    with pytest.raises(CongraspError, match=r"b\.jsonl is no regular file"):
+    with pytest.raises(CongraspError, match=r"b\.jsonl is not a regular file"):
         Journal(run_dir / AUDIT / "b.jsonl")
 
 
@@ -75,7 +75,7 @@ def test_lost_duplicated_corrupted_and_unmatched(run_dir, capsys):
         {"version": 4, "used": [["a", "1", 77, 0, "c"]]}, {"end": [["a", "1", 5]]},
     )  # fmt: skip
     assert faults(run_dir) == {"lost": 1, "duplicated": 1, "corrupted": 1, "unmatched": 1, "waiting": 1}
-    assert "a/1/3: accepted, and never seen again" in audit(run_dir).faults
+    assert "a/1/3: accepted, but missing afterwards" in audit(run_dir).faults
     assert command(run_dir) == 1 and "a/1/3" in capsys.readouterr().out
 
 
@@ -119,7 +119,7 @@ def test_empty_and_malformed_journals_are_damage_and_no_traceback(run_dir, capsy
         path.write_bytes(content)
         assert faults(run_dir) == {"not in the journals": 6}
         assert command(run_dir) == (6 if content.endswith(b"\n") and content.strip(b"\n") else 7)
-    odd = ({"life": "x"}, {"used": 7, "version": 0}, {"used": [[1]], "version": 0}, {"end": [["a", "1", 10**30]]})
+    odd = ({"session_id": "x"}, {"used": 7, "version": 0}, {"used": [[1]], "version": 0}, {"end": [["a", "1", 10**30]]})
     path.write_text("".join(f"{json.dumps(line)}\n" for line in odd))
     (run_dir / AUDIT / "b.jsonl").write_text('{"actor": 5}\n{"made": [1]}\n{"answer": 0}\n')
     assert (faults(run_dir), audit(run_dir).damaged) == ({"not in the journals": 6}, 7)
@@ -145,7 +145,7 @@ def test_what_a_torn_line_told_is_no_surplus(run_dir):
     path.write_bytes(b"".join([*lines[:5], lines[5][:20]]))
     journal = Journal(path)
     journal._lost = 2
-    journal.write(answer=1, outcome="accepted", life="x", actor="a", incarnation="1")
+    journal.write(answer=1, outcome="accepted", session_id="x", actor="a", incarnation="1")
     report = audit(run_dir)
     assert (report.holes, report.damaged, report.faults) == (2, 0, [])
     assert report.counts["used, not in the journals"] == 4
@@ -198,9 +198,9 @@ def whole_run(folder):
         actor.write(**who)
         for sequence, checksum in enumerate(CONTENT[:4]):
             actor.write(**who, made=sequence, version=sequence, checksum=checksum)
-            actor.write(**who, answer=sequence, outcome="accepted", life="x" if incarnation == "1" else "y")
+            actor.write(**who, answer=sequence, outcome="accepted", session_id="x" if incarnation == "1" else "y")
             if incarnation == "1" and sequence >= 2:
-                actor.write(**who, answer=sequence, outcome="accepted", life="y")
+                actor.write(**who, answer=sequence, outcome="accepted", session_id="y")
     learner(
         folder, life(), used(0), used(1), used(2), used(3),
         life("y", version=2), used(2, version=5), used(3, version=6),

@@ -53,9 +53,9 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
     for key in (folder / "ca.key", made / "tls.key"):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    with pytest.raises(CongraspError, match=r"an authority already.*--force"):
+    with pytest.raises(CongraspError, match=r"already holds an authority.*--force"):
         create_authority(folder)
-    with pytest.raises(CongraspError, match=r"there already.*--force"):
+    with pytest.raises(CongraspError, match=r"exists already.*--force"):
         issue(folder, "actor", number=0)
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     issue(folder, "actor", number=0, force=True)
@@ -67,8 +67,8 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
 @pytest.mark.parametrize(
     ("role", "options", "words"),
     [
-        ("boss", {}, "no certificate role 'boss'"),
-        ("actor", {"hosts": ["gpu"]}, "names no hosts"),
+        ("boss", {}, "no role 'boss'"),
+        ("actor", {"hosts": ["gpu"]}, "cannot name hosts"),
         ("server", {"hosts": ["a b"]}, "neither a host name nor an address"),
         ("server", {"hosts": [""]}, "neither a host name nor an address"),
         ("server", {"hosts": ["../x"]}, "neither a host name nor an address"),
@@ -101,7 +101,7 @@ def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
     with pytest.raises(CongraspError, match="is not the key of"):
         find(other, "actor")
     (other / "tls.crt").write_text("nonsense")
-    with pytest.raises(CongraspError, match="is no certificate"):
+    with pytest.raises(CongraspError, match="is not a certificate"):
         find(other, "actor")
     (other / "tls.crt").write_bytes((folder / "ca.crt").read_bytes())
     with pytest.raises(CongraspError, match="for the role ca"):
@@ -136,7 +136,7 @@ def test_with_credentials_every_endpoint_is_tls(tmp_path):
     some = Credentials(tmp_path, "actor")
     assert secured("tcp/10.0.0.5:7447", some) == secured("tls/10.0.0.5:7447", some) == "tls/10.0.0.5:7447"
     assert secured("tcp/10.0.0.5:7447", None) == "tcp/10.0.0.5:7447"
-    with pytest.raises(CongraspError, match="does not go with certificates"):
+    with pytest.raises(CongraspError, match="cannot be used with certificates"):
         secured("udp/10.0.0.5:7447", some)
     with pytest.raises(CongraspError, match="needs certificates"):
         secured("tls/10.0.0.5:7447", None)

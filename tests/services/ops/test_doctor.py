@@ -86,14 +86,14 @@ CLOCK = {"time": lambda: 2e9, "sleep": lambda seconds: None, "strftime": lambda 
     [
         (
             "disk",
-            "0.1 GiB free: a run needs some 2 GiB",
+            "0.1 GiB free: a run needs about 2 GiB",
             lambda m: m.setattr(doctor.shutil, "disk_usage", lambda path: collections.namedtuple("U", "free")(10**8)),
         ),
         ("disk", "written at 0 MB/s: .*--run-dir", _slow),
         ("clock", "years behind; set it", lambda m: m.setattr(doctor.time, "time", lambda: 0.0)),
         ("clock", "jumped by", lambda m: m.setattr(doctor.time, "time", itertools.count(2_000_000_000, 5).__next__)),
         ("python", "3.10.4: 3.11, 3.12", lambda m: m.setattr(doctor.platform, "python_version", lambda: "3.10.4")),
-        ("jax", "NVIDIA GPU that it does not see", lambda m: m.setattr(doctor, "_NVIDIA", os.devnull)),
+        ("jax", "NVIDIA GPU is not found", lambda m: m.setattr(doctor, "_NVIDIA", os.devnull)),
         ("gpu", "install the NVIDIA driver", lambda m: m.setattr(doctor, "_NVIDIA", os.devnull)),
         ("jax", "RuntimeError: no such device", lambda m: m.setattr(jax, "devices", _broken)),
     ],

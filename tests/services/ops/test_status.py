@@ -56,7 +56,7 @@ def endpoint():
 def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
     assert status(connect=endpoint, run="r", json=True) == 0
     found = json.loads(capsys.readouterr().out)
-    assert (found["run"], found["version"], found["ledger"]["accepted"]) == ("r", 0, 1)
+    assert (found["run"], found["version"], found["counters"]["accepted"]) == ("r", 0, 1)
     assert [(role["role"], role["id"]) for role in found["roles"]] == [("actor", "worker-7"), ("learner", "0")]
     actor = found["roles"][0]
     assert (actor["rollouts"], actor["version"], actor["lag"]) == (1, 0, 0)
@@ -94,12 +94,12 @@ def test_counters_that_do_not_add_up_are_named(endpoint):
         found = ask(transport, "r")
     assert found["warnings"] == []
     lost = copy.deepcopy(found)
-    lost["ledger"]["accepted"] += 1
+    lost["counters"]["accepted"] += 1
     (words,) = warnings(lost)
-    assert words == "The counters do not add up: accepted 2 is not consumed 0 + dropped 0 + queued 1."
-    lost["ledger"]["queued"] += 1
+    assert words == "The counters are inconsistent: accepted 2 is not consumed 0 + dropped 0 + queued 1."
+    lost["counters"]["queued"] += 1
     (words,) = warnings(lost)
-    assert words == "2 rollouts are counted as queued; the queue holds 1."
+    assert words == "2 rollouts are counted as queued, but the queue holds 1."
 
 
 def test_watching_goes_on_until_it_is_interrupted(endpoint):
@@ -128,7 +128,7 @@ def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_marku
     console.print(tables({**found, "roles": [named] * 150}))
     text = console.file.getvalue()
     assert "[red]" in text and "\x1b" not in text and "refused" in text and len(text) < 50_000
-    assert f"{50 + found['unlisted']} more process(es)" in text
+    assert f"{50 + found['unlisted']} more live process(es)" in text
 
 
 def ask_with_tokens(endpoint, count):

@@ -252,7 +252,7 @@ def test_what_is_no_recording_is_refused(tmp_path: pathlib.Path) -> None:
     with pytest.raises(CongraspError, match=r"no file or folder .*absent\. Name a run"):
         log_files(tmp_path / "absent")
     (tmp_path / "file").write_text("")
-    with pytest.raises(CongraspError, match="cannot be made"):
+    with pytest.raises(CongraspError, match="cannot be created"):
         LogWriter(tmp_path / "file" / "logs", "log")
 
 

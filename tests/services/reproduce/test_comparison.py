@@ -15,14 +15,14 @@ from congrasp.services.reproduce.evaluation import Result
 from congrasp.services.reproduce.latex import escape, latex
 from congrasp.services.reproduce.layout import not_comparable, tables
 from congrasp.services.reproduce.page import summary
-from congrasp.services.reproduce.plan import Part, Policy, parts, policies
+from congrasp.services.reproduce.plan import Part, RequiredPolicy, parts, policies
 from tests.rows import row
 
 HANDS = ("human", "allegro", "sharpa")
 
 
 def result(source, *rows, hand="human", method="ours", table="single", data=None):
-    part = Part(Policy(hand, method), table, data and pathlib.Path(data))
+    part = Part(RequiredPolicy(hand, method), table, data and pathlib.Path(data))
     return Result(part, source, list(rows), {"pictures": [], "seconds": 1.0}, True)
 
 
@@ -70,12 +70,12 @@ def test_captured_rows_of_several_data_sets_each_have_a_cell():
 
 
 def test_reasons_say_what_is_missing():
-    absent = {Policy("human", "graspxl"): "its training failed"}
+    absent = {RequiredPolicy("human", "graspxl"): "its training failed"}
     cells = compare([result("hands", row("heading", 0.9, 0.8, 0.95))], absent, ("human",))
     (graspxl,) = find(cells, "objects", "heading", method="graspxl", group="small")
     assert graspxl.reason == "no policy of the method 'graspxl': its training failed"
     (allegro,) = find(cells, "hands", "pose", hand="allegro")
-    assert allegro.reason == "the hand 'allegro' was not asked for"
+    assert allegro.reason == "the hand 'allegro' was not requested"
     assert any("GraspXL" not in why and "graspxl" in what and "small objects" in what
                for what, why, _ in not_comparable(cells))  # fmt: skip
 

@@ -12,12 +12,12 @@ from congrasp.services.cli.main import load
 from congrasp.services.evaluate.lineup import read_entrant
 from congrasp.services.reproduce import evaluation, run
 from congrasp.services.reproduce.evaluation import Numbers, Result
-from congrasp.services.reproduce.plan import Policy
+from congrasp.services.reproduce.plan import RequiredPolicy
 from congrasp.services.train.command import untrained
 from tests.pages import Reader
 from tests.rows import row
 
-OURS = Policy("human", "ours")
+OURS = RequiredPolicy("human", "ours")
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,12 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, 
         assert cell["difference"] == pytest.approx(cell["ours"] - cell["paper"])
     assert len(first["not_comparable"]) == len(rates) - len(compared)
     page = Reader(text := (tmp_path / "reproduction.html").read_text())
-    assert not page.links and len(page.sources) == 2 and "--quick trains none" in text and failed in html.unescape(text)
+    assert (
+        not page.links
+        and len(page.sources) == 2
+        and "not trained with --quick" in text
+        and failed in html.unescape(text)
+    )
     assert (tmp_path / "tables.tex").read_text().count(r"\begin{tabular}") == 6
     assert not list((tmp_path / "tables").glob("*.pools"))
 
@@ -95,11 +100,11 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, 
     numbers = Numbers(3, 3, 6, "native", 0, 1.0)
     account = run.reproduce(request, numbers, lambda text, total: lambda done: None)
     what = {one.name: text for one, text in account.policies}
-    assert asked[:2] == [Policy("allegro", "ours"), Policy("human", "graspxl")]
+    assert asked[:2] == [RequiredPolicy("allegro", "ours"), RequiredPolicy("human", "graspxl")]
     assert asked[2:6] == ["human-ours-single", "human-pd-single", "human-ours-composed", "human-ours-noise"]
     assert what["human-ours"].startswith("policy.safetensors, version 0") and what["human-pd"] == "needs none"
     assert what["allegro-ours"] == what["human-graspxl"] == "none: it failed"
-    assert what["human-dgrasp"] == "none: it was not asked for"
+    assert what["human-dgrasp"] == "none: not requested"
     assert account.failures == ["it failed", "it failed"]
     assert (tmp_path / "reproduction.html").read_text().count("Half of the headings are kept.") == 1
 

@@ -9,12 +9,12 @@ import pytest
 
 from congrasp.services.cli import main
 from congrasp.services.reproduce import training
-from congrasp.services.reproduce.plan import Policy
+from congrasp.services.reproduce.plan import RequiredPolicy
 from congrasp.services.train import unattended
 from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import Child
 
-OURS, GRAPSXL, PHASES = (Policy("human", method) for method in ("ours", "graspxl", "two-phase"))
+OURS, GRAPSXL, PHASES = (RequiredPolicy("human", method) for method in ("ours", "graspxl", "two-phase"))
 FINISHES = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'policy.safetensors').touch()"
 FAILS = "print('compiling'); print('congrasp: error: The disk is full.'); raise SystemExit(2)"
 HANGS = "import time; print('update 3', flush=True); time.sleep(60)"
@@ -70,7 +70,7 @@ def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scr
     assert "--resume" not in graspxl and not (tmp_path / GRAPSXL.name / "config.json").exists()
 
 
-@pytest.mark.parametrize("policy", [OURS, GRAPSXL, Policy("allegro", "ours")], ids=lambda policy: policy.name)
+@pytest.mark.parametrize("policy", [OURS, GRAPSXL, RequiredPolicy("allegro", "ours")], ids=lambda policy: policy.name)
 def test_its_command_lines_are_those_of_train(policy):
     arguments = [*training.chosen(policy), "--environments", "4096"]
     train = main._parsed("train", main.load("train"), arguments)

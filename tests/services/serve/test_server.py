@@ -106,7 +106,7 @@ HEADING = {"position": np.zeros(3), "direction": np.array([0.0, 0.0, -1.0])}
     ("change", "error", "message"),
     [
         ({"constraints": {"levitation": {}}}, UnknownConstraintError, "no constraint 'levitation'"),
-        ({"constraints": {"fingers": {}}}, UnknownConstraintError, "does not know the constraint 'fingers'"),
+        ({"constraints": {"fingers": {}}}, UnknownConstraintError, "does not support the constraint 'fingers'"),
         ({"constraints": {"affordance": {}}}, RefusedError, "that guides the wrist. Add one of: heading, pose, traj"),
         ({"constraints": {"pose": {}}}, RefusedError, "lacks the field 'pose_q'"),
         ({"constraints": {"heading": HEADING | {"direction": np.array([0.0, 0.0, 2.0])}}}, RefusedError, "not 1"),

@@ -184,6 +184,22 @@ def test_what_no_page_asks_is_a_bad_request(tmp_path: pathlib.Path) -> None:
         session.close()
 
 
+def test_an_object_weighs_what_it_is_said_to(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+    def mass() -> float:
+        return json.loads(page.ask("GET", "/api/state")[1])["studio"]["object"]["mass_g"]
+
+    own = mass()
+    page.do("weigh", mass_g=500)
+    page.do("grasp")
+    assert page.wait()["error"] == "" and grasping.asked[-1][0].mass == 0.5 and mass() == 500
+    page.do("weigh", material="steel")
+    assert mass() not in (500, own)
+    code, found = page.ask("POST", "/api/do", json.dumps({"action": "weigh", "mass_g": 9e9}).encode())
+    assert code == 200 and "The mass is 9e+09 g" in json.loads(found)["error"]
+    page.do("weigh")
+    assert mass() == own
+
+
 def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasping, tmp_path: pathlib.Path) -> None:
     page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, avoid=True)
     page.do("grasp")
@@ -191,6 +207,7 @@ def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasp
     assert tuple(grasping.asked[-1][1].constraints) == ("heading", "affordance")
     motions = json.loads(page.ask("GET", "/api/state")[1])["motions"]
     assert motions[0]["held"] and motions[0]["steps"] == made_up.STEPS
+    assert motions[0]["asked"].endswith("from the side")
     played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])
     assert played.arrays["lane/affordance/met"].shape == (made_up.STEPS,)
     for kind in ("npz", "mcap"):
@@ -320,7 +337,7 @@ def test_a_busy_port_and_an_open_interface_are_refused_in_one_line(
     with pytest.raises(CongraspError, match="--port"):
         PageServer({}, {}, "127.0.0.1", page.port)
     for arguments, says in (
-        (["--host", "0.0.0.0"], "could be reached from other machines"),
+        (["--host", "0.0.0.0"], "would be reachable from other machines"),
         (["--policy", "a.safetensors", "--connect", "tcp/127.0.0.1:1"], "Give one of --policy and --connect"),
         (["--policy", "nowhere.safetensors"], "nowhere.safetensors"),
         (["--objects", "/nowhere"], "/nowhere"),

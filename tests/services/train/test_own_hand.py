@@ -118,7 +118,7 @@ def test_a_hand_that_fails_its_check_is_not_trained_unless_told_so(stages, hand,
     mended = dataclasses.replace(hand, object_scale=0.8)
     train_hand(request(mended, tmp_path / "out"), lambda text: None)
     assert ran[1] == "check" and len(ran) == 4
-    with pytest.raises(CongraspError, match="another hand, or of this one before it was changed"):
+    with pytest.raises(CongraspError, match="another hand, or of an earlier version of this one"):
         train_hand(request(hand, tmp_path / "out"), lambda text: None)
     does["findings"] = BAD
     train_hand(request(hand, tmp_path / "other", anyway=True), lambda text: None)
@@ -132,7 +132,7 @@ def test_a_policy_of_more_experience_stays(stages, hand, tmp_path):
     does["steps"], notes = 1000, []
     train_hand(request(hand, tmp_path / "short"), notes.append)
     assert own_policy_file("claw").read_bytes() == best.read_bytes()
-    assert "has seen more (100,000,000 steps) and stays" in "\n".join(notes)
+    assert "has more training (100,000,000 steps) and remains" in "\n".join(notes)
     # But one of the hand as it was before is replaced.
     (tmp_path / "hands" / "claw.json").write_text(hand_text(dataclasses.replace(hand, object_scale=0.8)))
     get_hand.cache_clear()

@@ -48,7 +48,7 @@ def test_one_that_dies_takes_the_others_with_it_and_all_come_back(supervise, tmp
         f"import pathlib, time\nwhile not pathlib.Path({str(tmp_path)!r}, 'again').exists(): time.sleep(0.05)"
     )
     notes = supervise([WAITS, waits_for_it], ["raise SystemExit(9)", writes])
-    assert notes == ["The rank-1 died (exit code 9); starting all ranks again."]
+    assert notes == ["The rank-1 died (exit code 9); restarting all ranks."]
 
 
 def test_bad_input_of_any_rank_ends_the_run_with_its_last_words(supervise):

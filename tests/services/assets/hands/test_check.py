@@ -104,7 +104,7 @@ def test_torques_that_are_too_weak_are_found_and_hold_nothing():
     weak = with_joints(CLAW, lambda j: dataclasses.replace(j, torque_limit=0.01 * j.torque_limit))
     lines, _ = verdicts(weak)
     assert lines["strength"].verdict == "failed" and "torque_limit" in lines["strength"].remedy
-    assert lines["cylinder"].verdict == "failed" and "mend what failed above first" in lines["cylinder"].remedy
+    assert lines["cylinder"].verdict == "failed" and "repair the failures above first" in lines["cylinder"].remedy
     assert {lines[name].verdict for name in ("palm", "joints", "opening", "open", "closed")} == {"passed"}
 
 

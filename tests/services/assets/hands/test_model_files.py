@@ -64,7 +64,7 @@ def test_thumb_tips_poses_and_frame_are_proposed(claw):
     np.testing.assert_allclose(frame.cross, (1.0, 0.0, 0.0), atol=0.1)
     words = "\n".join(describe(claw))
     assert "opposing_lower - opposing_upper" in words and "no torque limit" not in words
-    assert "'opposing_upper' is taken for the thumb" in words and "(--thumb)" in words
+    assert "'opposing_upper' is assumed to be the thumb" in words and "(--thumb)" in words
 
 
 def test_the_same_hand_as_mjcf_on_an_arm_is_the_same(claw):
@@ -140,9 +140,9 @@ def test_wrong_hand_files_are_one_line(claw, tmp_path):
     refused("format 2", format=2)
     refused("the thumb must be a link with a tip", thumb="palm")
     refused("first link must be the palm", links=links[1:])
-    refused("parent 'palm' of|does not come before", links=[links[0], links[2], links[1], *links[3:]])
+    refused("parent 'palm' of|must precede", links=[links[0], links[2], links[1], *links[3:]])
     refused("more than once", links=[*links, links[-1]])
-    refused("is no joint", open_pose={"elbow": 1.0})
+    refused("is not a joint", open_pose={"elbow": 1.0})
     refused("outside of its limits in the closed pose", closed_pose={"left_root": 3.0})
     refused("no hand", links=3)
     refused("'wings'|wings", wings=2)

@@ -1,0 +1,126 @@
+"""`congrasp dataset`: verified grasps of many objects, in shards."""
+
+import pathlib
+from typing import Annotated, Literal
+
+import tyro
+
+from congrasp.actors.physics import PhysicsName
+from congrasp.common.errors import CongraspError
+from congrasp.services.assets.objects.options import ImportOptions
+
+Verdict = Literal["all", "success", "held", "clean", "lifted", "pushed_weight", "pushed"]
+
+
+def dataset(
+    objects: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
+    out: pathlib.Path = pathlib.Path("dataset"),
+    per_object: int = 100,
+    constraints: tuple[str, ...] = (),
+    keep: tuple[Verdict, ...] = ("held",),
+    part: str = "1/1",
+    shard: int = 0,
+    policy: pathlib.Path | None = None,
+    hand: str = "human",
+    physics: PhysicsName = "auto",
+    batch: int = 0,
+    seed: int = 0,
+    licence: str = "Apache-2.0",
+    folder: str = "objects",
+    mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
+) -> int:
+    """Make a dataset of verified grasps: Parquet shards with a schema, and a card with counts and rates.
+
+    Every episode is simulated to its end: held for two seconds without the table, lifted by 15 cm, pushed. A second run
+    of the same command makes the shards that are missing. The same policy, objects, seed, engine and batch give the
+    same shards.
+
+    Args:
+      objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, names in --folder, or objects of the
+        generator as FAMILY:FIRST-LAST (mug:0-99, all:0-9999).
+      out: Folder of the dataset.
+      per_object: Episodes of each object, evenly over the constraints; what an object does not allow is left out.
+      constraints: Sets of constraints that are sampled, with + between those of a set, such as: heading
+        pose+trajectory. By default every one that the policy knows, and the paper's compositions.
+      keep: Which episodes are written: those with all of these outcomes (all keeps every one).
+      part: K/N makes every N-th shard from the K-th on. Different parts may run anywhere: copy their shards together,
+        and run the command once more for the card.
+      shard: Objects of a shard, at most; 0 chooses by --per-object.
+      policy: A policy file; by default the hand's that comes with the package.
+      hand: Hand whose pretrained policy is taken.
+      physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
+      batch: Worlds that run side by side; 0 chooses by the engine.
+      seed: Seed of constraints and episodes.
+      licence: Of the data, for the card (an SPDX name).
+      folder: Folder of objects, whose names can stand for files.
+      mesh: How meshes become objects.
+
+    Examples:
+      congrasp dataset meshes/ --out grasps --per-object 100
+      congrasp dataset all:0-9999 --out grasps --keep clean pushed --part 3/20
+    """
+    import hashlib
+
+    from congrasp.actors.physics import resolve_physics
+    from congrasp.common.policy import bundle as bundles
+    from congrasp.common.policy.pretrained import policy_file
+    from congrasp.common.task.constraints import require_known
+    from congrasp.services.cli.console import at_least, at_most, tracked
+    from congrasp.services.dataset.card import write_card
+    from congrasp.services.dataset.make import Recipe, make, pools_of, shard_objects
+    from congrasp.services.dataset.shards import Shards
+    from congrasp.services.evaluate.plan import ALIGNED
+    from congrasp.services.evaluate.pools import most_objects
+    from congrasp.services.evaluate.results import provenance
+    from congrasp.services.evaluate.scores import known_rows
+    from congrasp.services.grasp.jobs import find_objects
+
+    at_least(1, **{"per-object": per_object})
+    at_least(0, shard=shard, batch=batch)
+    turn, parts = _part(part)
+    found, errors = find_objects(objects, folder)
+    if errors or not found:
+        raise CongraspError(
+            errors[0].error if errors else "No objects were named.", "Name meshes, folders or mug:0-99."
+        )
+    file = policy_file(policy, hand)
+    bundle, engine = bundles.load(file), resolve_physics(physics)
+    at_most(most_objects(engine), "objects", shard=shard)
+    asked = tuple(dict.fromkeys(constraints)) or tuple(known_rows(("single", "composed"), bundle.task))
+    require_known([name for one in asked for name in one.removesuffix(ALIGNED).split("+")], bundle.task)
+    recipe = Recipe(
+        policy=bundle,
+        policy_sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
+        objects=found,
+        options=mesh,
+        per_object=per_object,
+        constraints=asked,
+        keep=tuple(name for name in dict.fromkeys(keep) if name != "all"),
+        shard=shard or shard_objects(per_object),
+        physics=engine,
+        seed=seed,
+        batch=batch,
+    )
+    pools = pools_of(recipe)
+    shards = Shards(out, len(pools.make))
+    finished = shards.finished(recipe.about)
+    wanted = [number for number in range(turn, shards.count, parts) if number not in finished]
+    with tracked() as track:
+        total = min(len(found), pools.size * len(wanted)) * per_object
+        make(recipe, shards, pools, wanted, track("Episodes", total))
+    card = write_card(shards, recipe.about, {"licence": licence, **provenance()})
+    episodes, kept = (sum(own[name] for own in card["counts"].values()) for name in ("episodes", "kept"))
+    made = card["shards"]["finished"]
+    print(f"{kept:,} of {episodes:,} episodes are kept, in {made} of {shards.count} shards in {out}.")
+    return 0
+
+
+def _part(text: str) -> tuple[int, int]:
+    """K - 1 and N of K/N."""
+    turn, slash, parts = text.partition("/")
+    if slash and turn.isdecimal() and parts.isdecimal() and 1 <= int(turn) <= int(parts):
+        return int(turn) - 1, int(parts)
+    raise CongraspError(f"--part is '{text}'.", "Write K/N with K from 1 to N: --part 3/20")
+
+
+COMMAND = dataset

@@ -1,0 +1,65 @@
+"""The policy of a right hand, for the left one; needs nothing but numpy."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Self
+
+from congrasp.common import mirror
+from congrasp.common.request import GraspRequest, Pose
+from congrasp.services.client.policy import Answer, Policy, State
+
+
+class LeftPolicy(Policy):
+    """A `Policy` for the left hand, whose states and targets are mirrored for a policy of the right one."""
+
+    def __init__(self, right: Policy):
+        """Takes over the connection.
+
+        Args:
+          right: the policy, in this process or of a server.
+        """
+        self._right = right
+
+    def reset(self, request: GraspRequest) -> None:
+        """See `Policy.reset`."""
+        self._right.reset(mirrored_request(request))
+
+    def act(self, state: State) -> Answer:
+        """See `Policy.act`."""
+        return _answer(self._right.act(mirror.fields(state)))
+
+    def act_each(self, states: Sequence[State]) -> list[Answer]:
+        """See `Policy.act_each`."""
+        return [_answer(answer) for answer in self._right.act_each([mirror.fields(state) for state in states])]
+
+    def close(self) -> None:
+        """See `Policy.close`."""
+        self._right.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def mirrored_request(request: GraspRequest) -> GraspRequest:
+    """The request for the mirror image of its object and hand."""
+    return dataclasses.replace(
+        request,
+        constraints={name: mirror.fields(own) for name, own in request.constraints.items()},
+        surface=None if request.surface is None else mirror.vector(request.surface),
+        wrist=request.wrist and _pose(request.wrist),
+        object_pose=request.object_pose and _pose(request.object_pose),
+    )
+
+
+def _answer(answer: Answer) -> Answer:
+    """The mirrored answer."""
+    return answer._replace(u_target=mirror.wrist(answer.u_target), action=mirror.wrist(answer.action))
+
+
+def _pose(pose: Pose) -> Pose:
+    """A mirrored pose."""
+    position, quaternion = pose
+    return mirror.vector(position), mirror.quaternion(quaternion)

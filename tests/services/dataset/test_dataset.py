@@ -1,0 +1,151 @@
+"""Datasets of grasps: the same shards whoever makes them, in whichever order, killed or not; and what they say."""
+
+import json
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import congrasp.services.cli.main as cli
+from congrasp.common import rotations
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects.procedural import generate
+from congrasp.services.assets.objects.named import objects_at
+from congrasp.services.dataset.card import CARD
+
+ROOT = pathlib.Path(__file__).resolve().parents[3]
+
+
+def arguments(out: pathlib.Path, *more: str) -> list[str]:
+    """Six episodes of each of three objects, a shard each."""
+    own = ["dataset", "box:1-3", "--out", str(out), "--per-object", "6", "--shard", "1"]
+    return [*own, "--constraints", "heading", "affordance", "--keep", "all", "--physics", "native", *more]
+
+
+def made(out: pathlib.Path, *more: str) -> dict:
+    """Makes a dataset in a process of its own, whose programs the next ones find compiled; returns its card."""
+    command = [sys.executable, "-m", "congrasp", *arguments(out, *more)]
+    subprocess.run(command, check=True, timeout=500, stdout=subprocess.DEVNULL)
+    return json.loads((out / CARD).read_text())
+
+
+def contents(folder: pathlib.Path) -> dict[str, bytes]:
+    """Bytes of the shards."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*.parquet"))}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> pathlib.Path:
+    """A dataset that was made at once."""
+    out = tmp_path_factory.mktemp("dataset")
+    made(out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def columns(whole) -> dict[str, np.ndarray]:
+    """Its grasps, by the loader of the documentation."""
+    page = (ROOT / "docs" / "datasets.md").read_text()
+    code = re.search(r"```python\n(.*?)```", page, re.S)
+    namespace: dict = {}
+    exec(code[1], namespace)
+    batches = [dict(batch) for batch in namespace["batches"](whole, size=4)]
+    assert max(len(batch["q"]) for batch in batches) <= 4
+    return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
+
+
+def test_a_killed_run_resumes_and_parts_make_the_same_shards(whole, tmp_path):
+    command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 300
+    while len(contents(tmp_path)) < 2 and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait(30)
+    killed = contents(tmp_path)
+    assert 2 <= len(killed) < 6, "it was killed between its first shard and its last"
+    (tmp_path / "grasps" / f".00002-of-00003.parquet.{process.pid}.tmp").write_bytes(b"half a shard")
+    first = sorted(tmp_path.rglob("*.parquet"))[0]
+    changed = first.stat().st_mtime_ns
+    made(tmp_path, "--part", "3/3")
+    card = made(tmp_path)
+    assert first.stat().st_mtime_ns == changed, "what was finished is not made again"
+    assert contents(tmp_path) == contents(whole)
+    assert card["counts"] == json.loads((whole / CARD).read_text())["counts"]
+    assert card["shards"] == {"finished": 3, "of": 3}
+
+
+def test_rows_say_what_was_requested_and_what_came_of_it(whole, columns):
+    card = json.loads((whole / CARD).read_text())
+    assert len(columns["object"]) == 18 and sorted(set(columns["object"])) == ["box_1", "box_2", "box_3"]
+    for asked in ("heading", "affordance"):
+        rows = columns["constraints"] == asked
+        assert sorted(columns["episode"][rows]) == sorted([0, 1, 2] * 3)
+        assert card["counts"][asked]["episodes"] == 9
+        assert card["counts"][asked]["held"] == columns["held"][rows].sum()
+        assert np.isnan(columns["goal_heading_direction"][rows]).all() == (asked != "heading")
+        assert np.isfinite(columns["affordance_ratio"][rows]).all() == (asked == "affordance")
+    assert (columns["held"] >= columns["lifted"]).all() and (columns["lifted"] >= columns["pushed"]).all()
+    assert columns["held"].any()
+    unit = np.linalg.norm(columns["goal_heading_direction"][columns["constraints"] == "heading"], axis=-1)
+    np.testing.assert_allclose(unit, 1.0, atol=1e-5)
+
+
+def test_poses_are_in_the_frame_of_the_object(columns):
+    """A held object has its surface at the hand: the wrist is as far from it as the hand is long, not metres."""
+    held = columns["held"]
+    assert np.linalg.norm(columns["wrist"][held, :3], axis=-1).max() < 0.35
+    assert (columns["object_pose"][held, 2] > 0).all()
+    start = columns["start_object"]
+    turned = rotations.rotate(jnp.asarray(start[:, 3:]), jnp.asarray(columns["start_wrist"][:, :3]))
+    assert (np.asarray(turned + start[:, :3])[:, 2] > 0).all(), "the wrist starts above the table"
+
+
+def test_objects_are_beside_their_grasps(whole):
+    table = pq.read_table(whole / "objects")
+    box = generate(2, "box")
+    row = table.column("object").to_pylist().index("box_2")
+    np.testing.assert_allclose(table.column("mass")[row].as_py(), box.mass, rtol=1e-6)
+    np.testing.assert_allclose(np.reshape(table.column("points")[row].as_py(), (512, 3)), box.points, atol=1e-6)
+
+
+def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tmp_path):
+    card = made(tmp_path, "--keep", "held", "clean", "--part", "1/3")
+    of_first = columns["object"] == "box_1"
+    wanted = of_first & columns["held"] & columns["clean"]
+    assert pq.read_table(tmp_path / "grasps").num_rows == wanted.sum()
+    counted = card["counts"].values()
+    assert sum(own["episodes"] for own in counted) == of_first.sum()
+    assert sum(own["kept"] for own in counted) == wanted.sum()
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("--seed", "1"), "another dataset: its seed is 0, not 1.*--out"),
+        (("--batch", "2"), "its batch is 4, not 2"),
+        (("--part", "4/3"), "--part is '4/3'"),
+        (("--constraints", "levitation"), "levitation"),
+        (("--shard", "100000"), "--shard"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_in_one_line(whole, more, words):
+    with pytest.raises(CongraspError, match=words) as error:
+        cli.run(arguments(whole, *more))
+    assert "\n" not in str(error.value)
+
+
+def test_a_range_of_the_generator_is_many_objects():
+    found = objects_at(pathlib.Path("all:5-7"))
+    assert [one.load().name for one in found] == [one.name for one in found] and len(found) == 3
+    assert len({one.digest() for one in found}) == 3
+    with pytest.raises(CongraspError, match="ends before it begins"):
+        objects_at(pathlib.Path("box:7-5"))
