@@ -37,7 +37,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 KEYS = Keys("chaos")
 T, B, D, A = 20, 16, 32, 4
 BATCH = 2
-_PATIENCE = 60.0  # seconds, on a machine that does much else
+_PATIENCE = 240.0  # seconds, on a machine that does much else
 
 
 def bundle(version, run_id):

@@ -9,11 +9,10 @@ import contextlib
 import itertools
 import secrets
 import threading
-import time
 from concurrent.futures import Future
 from typing import Any, NamedTuple, Self
 
-from congrasp.actors.process.uploads import Outcome, Uploads, backoff, check_timeout
+from congrasp.actors.process.uploads import Outcome, Patience, Uploads, backoff
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.io.journal import Journal
 from congrasp.common.transport.base import Transport
@@ -85,13 +84,13 @@ class ActorLink:
         self.incarnation = secrets.token_hex(4)
         self._transport = transport
         self._timeout = request_timeout
-        self._patience = patience
+        self._patience = Patience(patience)  # which the thread that follows announcements reads often
         self._info: RunInfo | None = None
         self._learner = (-1, "")  # version and session last reported by the learner
         self._held_session = ""
         self._finished = False
-        self._answered = time.monotonic()
-        self._wanted = secrets.token_hex(8)  # id of the next ticket, kept until it is granted
+        self._answered = self._patience.now()
+        self._wanted = secrets.token_hex(8)  # the next ticket's id, kept until it is granted
         self._sequence = itertools.count()
         self._journal = journal
         self._news = threading.Event()
@@ -102,7 +101,7 @@ class ActorLink:
             window=window,
             max_refusals=max_refusals,
             request_timeout=request_timeout,
-            patience=patience,
+            patience=self._patience,
             journal=journal,
         )
         self._closed = self._uploads.closed
@@ -117,7 +116,7 @@ class ActorLink:
         Raises:
           TransportError: the learner did not answer within `timeout` seconds.
         """
-        reply = self._ask(self.keys.config, {}, time.monotonic() + timeout)
+        reply = self._ask(self.keys.config, {}, self._patience.now() + timeout)
         config, run_id, schema = (str(reply.meta[name]) for name in ("config", "run_id", "schema"))
         self._info = RunInfo(config, run_id, schema, tuple(reply.meta["arrays"]))
         self._note(reply.meta)
@@ -133,7 +132,7 @@ class ActorLink:
           RunRestarted, RunFinished: see there.
           CongraspError: the learner refused too many rollouts, or has been silent for too long.
         """
-        deadline = time.monotonic() + timeout
+        deadline = self._patience.now() + timeout
         while True:
             self._check()
             self._news.clear()
@@ -142,14 +141,14 @@ class ActorLink:
             except RefusedError:
                 raise
             except TransportError as error:
-                check_timeout(self._answered, self._patience, error)
+                self._patience.check(self._answered, error)
                 return None
             self._note(reply.meta)
             self._check()
             if reply.meta["granted"]:
                 ticket, self._wanted = self._wanted, secrets.token_hex(8)
                 return Ticket(ticket, int(reply.meta["version"]))
-            delay = min(float(reply.meta["retry_after"]), deadline - time.monotonic())
+            delay = min(float(reply.meta["retry_after"]), deadline - self._patience.now())
             if delay <= 0:
                 return None
             self._news.wait(delay)
@@ -250,8 +249,8 @@ class ActorLink:
             raise CongraspError("The link is closed.")
 
     def _note(self, meta: Any) -> None:
-        """Records the learner's state, which comes with every reply and announcement."""
-        self._answered = time.monotonic()
+        """Takes in the learner's state, which comes with every answer and announcement."""
+        self._answered = self._patience.now()
         self._learner = int(meta["version"]), str(meta["session_id"])
         self._finished = bool(meta["finished"])
         if self._info and meta["run_id"] != self._info.run_id:
@@ -260,6 +259,7 @@ class ActorLink:
     def _follow(self) -> None:
         """Receives announcements in the background."""
         while not self._closed.is_set():
+            self._patience.now()
             received = self._announcements.receive(_POLL)
             if received is None:
                 self._closed.wait(0.01)  # a closed transport does not wait
@@ -272,13 +272,13 @@ class ActorLink:
         """Sends a request until there is a reply, which may be a refusal."""
         delays = backoff()
         while True:
-            rest = max(0.05, deadline - time.monotonic())
+            rest = max(0.05, deadline - self._patience.now())
             try:
                 return self._transport.query(key, Message(meta=meta), timeout=min(self._timeout, rest))
             except RefusedError:
                 raise
             except TransportError:
-                rest = deadline - time.monotonic()
+                rest = deadline - self._patience.now()
                 if rest <= 0 or self._closed.wait(min(next(delays), rest)):
                     raise
 

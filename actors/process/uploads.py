@@ -1,6 +1,8 @@
 """Rollouts in transit to the learner: each is sent until it has an outcome, across restarts of the learner."""
 
 import itertools
+import logging
+import math
 import queue
 import threading
 import time
@@ -16,7 +18,52 @@ from congrasp.common.wire.codec import Message
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 """Outcome of a rollout: `duplicate` if it had been accepted before, `stale` if it was too old."""
 _BACKOFF = (0.1, 0.5)  # first and longest delay between two attempts, s
-_SLOWEST = 100e3  # slowest link that is waited for, bytes/s
+_SLOWEST = 100e3  # bytes a second of a link that is waited for
+_LONGEST_TICK = 1.0  # s
+_NOTICED, _NOTICE_AGAIN = 5.0, 60.0  # seconds of silence of which a line is logged, and between two lines
+_log = logging.getLogger(__name__)
+
+
+class Patience:
+    """Limit of the learner's silence, in seconds for which this process ran.
+
+    Of a time in which it was frozen or starved, one second counts. It must be read more often than that to be right.
+
+    Attributes:
+      limit: seconds.
+    """
+
+    def __init__(self, limit: float):
+        """Begins to count."""
+        self.limit = limit
+        self._lock = threading.Lock()
+        self._seconds, self._read = 0.0, time.monotonic()
+        self._noticed = -math.inf
+
+    def now(self) -> float:
+        """The seconds until now."""
+        with self._lock:
+            now = time.monotonic()
+            self._seconds += min(now - self._read, _LONGEST_TICK)
+            self._read = now
+            return self._seconds
+
+    def check(self, answered: float, error: TransportError) -> None:
+        """Logs that there is no answer, once a minute, and raises `TransportError` when that has been so for too long.
+
+        Args:
+          answered: when there was one last.
+          error: what came instead of an answer.
+        """
+        now = self.now()
+        silence = now - answered
+        if silence > self.limit:
+            raise TransportError(
+                f"The learner has not answered for {self.limit:g} s: {error}", "Start the actor again later."
+            ) from None
+        if silence > _NOTICED and now - self._noticed > _NOTICE_AGAIN:
+            self._noticed = now
+            _log.warning("The learner does not answer; waiting for up to %g s: %s", self.limit, error)
 
 
 class _Upload(NamedTuple):
@@ -44,7 +91,7 @@ class Uploads:
         window: int,
         max_refusals: int,
         request_timeout: float,
-        patience: float,
+        patience: Patience,
         journal: Journal | None,
     ):
         """Starts the threads.
@@ -56,7 +103,7 @@ class Uploads:
           window: rollouts on their way at a time.
           max_refusals: rollouts refused in a row after which nothing more is sent.
           request_timeout: seconds that sending may take, and more by the rollout's size.
-          patience: seconds without any answer after which the learner is given up.
+          patience: after which the learner is given up.
           journal: where each answer is written down.
         """
         self.failure: CongraspError | None = None
@@ -116,10 +163,10 @@ class Uploads:
 
     def _deliver(self, message: Message) -> Outcome:
         """Sends one rollout until it has an outcome."""
-        answered = time.monotonic()
+        answered = self._patience.now()
         damaged = 0
-        # Repeating a query in transit would only fill a slow link; a dead link ends the query by itself.
-        timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience)
+        # To send again what is still on its way would only fill a slow link; a dead one ends the query by itself.
+        timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience.limit)
         delays = backoff()
         while not self.closed.is_set():
             delay = next(delays)
@@ -127,13 +174,13 @@ class Uploads:
                 reply = self._transport.query(self._key, message, timeout=timeout)
             except RefusedError as error:  # it arrived damaged, or the learner failed on it
                 damaged += 1
-                answered = time.monotonic()
+                answered = self._patience.now()
                 if damaged >= self._max_refusals:
                     return self._refused(str(error))
             except TransportError as error:
-                check_timeout(answered, self._patience, error)
+                self._patience.check(answered, error)
             else:
-                answered = time.monotonic()
+                answered = self._patience.now()
                 self._on_reply(reply.meta)
                 if self.failure:
                     raise self.failure
@@ -165,20 +212,6 @@ class Uploads:
                 "Start the actor with the learner's version of congrasp.",
             )
         return "refused"
-
-
-def check_timeout(answered: float, patience: float, error: TransportError) -> None:
-    """Raises `TransportError` if the learner's last answer was too long ago.
-
-    Args:
-      answered: when that was, on the monotonic clock.
-      patience: seconds after which it was too long ago.
-      error: what came instead of an answer.
-    """
-    if time.monotonic() - answered > patience:
-        raise TransportError(
-            f"The learner has not answered for {patience:g} s: {error}", "Start the actor again later."
-        ) from None
 
 
 def backoff() -> "itertools.chain[float]":

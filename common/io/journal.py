@@ -1,11 +1,13 @@
 """Append-only journals of JSON lines, for comparing afterwards what several processes did.
 
-Every line is one write to the operating system, so it survives the death of its process. It ends with the CRC-32 of the
-preceding text as the field `crc32`. Readers skip lines that were cut or changed, and count them.
+Every line is one write to the operating system, so that it survives the death of its process. It ends with the CRC-32
+of the line before, as the field `after`, and that of what comes before in its own, as the field `crc32`. A line that
+was cut or changed is left out when reading, and counted, and so are places where whole lines are missing.
 """
 
 import json
 import pathlib
+import re
 import threading
 import zlib
 from collections.abc import Callable
@@ -17,9 +19,10 @@ from congrasp.common.io.inputs import open_file
 AUDIT = "audit"
 """Folder of the journals in a run directory."""
 MAX_NUMBER = 1 << 53
-"""Journals hold no integers from here on, since JSON readers do not represent them exactly."""
-_CHECK = ', "crc32": "{:08x}"}}\n'
-_CHECK_BYTES = len(_CHECK.format(0))
+"""Integers from here on, which JSON readers do not keep exactly, are in no journal."""
+_CHECK = ', "crc32": "{}"}}\n'
+_CHECK_BYTES = len(_CHECK.format("00000000"))
+_END = re.compile(_CHECK.format("([0-9a-f]{8})").encode())
 _MAX_LINE = 1 << 22
 
 
@@ -40,7 +43,7 @@ class Journal:
         self._lock = threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._cut = _is_cut(path)
+            self._cut, self._after = _end_of(path)
             self._file = path.open("ab", buffering=0)
         except OSError as error:
             raise CongraspError(f"The journal {path} cannot be opened: {error.strerror}.") from None
@@ -50,14 +53,16 @@ class Journal:
         """Appends a line; lines that the disk refuses are counted in the next written one, as `lost`."""
         with self._lock:
             lost = {"lost": self._lost} if self._lost else {}
-            line = b"\n" * self._cut + _line({**entry, **lost})
+            text, check = _line({**entry, **lost, "after": self._after})
+            line = b"\n" * self._cut + text
             try:
                 self._cut = self._file.write(line) < len(line)
                 reason = "No space left" if self._cut else ""
             except OSError as error:
                 self._cut, reason = True, error.strerror or str(error)
             if reason and not self._refused:
-                self._warn(f"{self._path} could not be written ({reason}). Events meanwhile are missing from it.")
+                self._warn(f"{self._path} could not be written ({reason}); what happens meanwhile is not in it.")
+            self._after = self._after if reason else check
             self._refused = bool(reason)
             self._lost = self._lost + 1 if reason else 0
 
@@ -75,9 +80,11 @@ class JournalLines(NamedTuple):
     lost: int
     """Lines that are missing because the disk was full, or that were cut at the end."""
     damaged: int
-    """Lines that were changed after they were written."""
+    """Lines that are not what was written."""
+    missing: int
+    """Places where lines are missing that were there."""
     unchecked: int
-    """Lines before the first checksum: older versions of congrasp wrote none."""
+    """Lines of older versions of congrasp, which do not bear the checksum of the line before."""
 
     @property
     def intact(self) -> list[dict[str, Any]]:
@@ -96,8 +103,8 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
       CongraspError: the file cannot be read.
     """
     entries: list[dict[str, Any] | None] = []
-    lost = damaged = unchecked = run = 0
-    checked, cut = False, False
+    lost = damaged = missing = unchecked = run = 0
+    before, cut = "", False
     try:
         with open_file(path) as file:
             while line := file.readline(_MAX_LINE):
@@ -105,20 +112,24 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
                     continue
                 cut = not line.endswith(b"\n")
                 entry, check = _parse(line)
-                if entry is None or (checked and not check) or not is_entry(entry):
+                if entry is None or not is_entry(entry):
                     run += 1
                     entries.append(None)
                     continue
-                checked |= check
-                unchecked += not check
-                # The disk took a part of the first line that it refused: `lost` counts that line as well.
+                after = entry.pop("after", None)
+                unchecked += after is None
+                if after not in (None, before) and not run:
+                    missing += 1
+                    entries.append(None)
+                before = check
+                # The disk took a part of the first line that it refused: `lost` counts that one, too.
                 refused = min(number(entry.pop("lost", 0)), MAX_NUMBER)
                 lost, damaged, run = lost + refused, damaged + max(0, run - bool(refused)), 0
                 entries.append(entry)
     except OSError as error:
         raise CongraspError(f"The journal {path} cannot be read: {error.strerror}.") from None
     cut = cut and run > 0
-    return JournalLines(entries, lost + cut, damaged + run - cut, unchecked)
+    return JournalLines(entries, lost + cut, damaged + run - cut, missing + (not entries), unchecked)
 
 
 def number(value: Any) -> int:
@@ -143,30 +154,32 @@ def is_value(value: Any, kind: type) -> bool:
     return type(value) is kind and not (isinstance(value, int) and abs(value) >= MAX_NUMBER)
 
 
-def _is_cut(path: pathlib.Path) -> bool:
-    """True if a journal ends within a line: its writer was killed, or the disk took only a part of it."""
+def _end_of(path: pathlib.Path) -> tuple[bool, str]:
+    """Whether a journal ends within a line (its writer was killed in it, or the disk took a part of it), and the
+    checksum of its last line; empty if there is none."""
     if not path.exists():
-        return False
+        return False, ""
     with open_file(path) as file:
         size = file.seek(0, 2)
-        file.seek(max(0, size - 1))
-        return size > 0 and file.read() != b"\n"
+        file.seek(max(0, size - _CHECK_BYTES))
+        end = file.read()
+    found = _END.fullmatch(end)
+    return size > 0 and not end.endswith(b"\n"), found[1].decode() if found else ""
 
 
-def _line(entry: dict[str, Any]) -> bytes:
+def _line(entry: dict[str, Any]) -> tuple[bytes, str]:
+    """A line, and its checksum."""
     text = json.dumps(entry)[:-1]
-    return (text + _CHECK.format(zlib.crc32(text.encode()))).encode()
+    check = f"{zlib.crc32(text.encode()):08x}"
+    return (text + _CHECK.format(check)).encode(), check
 
 
-def _parse(line: bytes) -> tuple[dict[str, Any] | None, bool]:
-    """Returns a line's entry (None if it is invalid or its checksum differs) and whether it has a checksum."""
+def _parse(line: bytes) -> tuple[dict[str, Any] | None, str]:
+    """A line's entry, None if it is none or its checksum is another; and its checksum."""
+    check = f"{zlib.crc32(line[:-_CHECK_BYTES]):08x}"
     try:
         entry = json.loads(line)
     except (ValueError, RecursionError):
-        return None, False
-    if not isinstance(entry, dict):
-        return None, False
-    if entry.pop("crc32", None) is None:
-        return entry, False
-    check = _CHECK.format(zlib.crc32(line[:-_CHECK_BYTES])).encode()
-    return (entry if line.endswith(check) else None), True
+        return None, check
+    whole = isinstance(entry, dict) and entry.pop("crc32", None) and line.endswith(_CHECK.format(check).encode())
+    return (entry if whole else None), check

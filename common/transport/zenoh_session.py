@@ -31,13 +31,13 @@ _ATTEMPT = 1.0  # seconds of one attempt to connect; signals are handled between
 _CLOSE = 2.0  # deadline of closing, s; with thousands of tokens on a busy machine it takes more than one
 _REOPEN = 10.0  # deadline of reopening, s
 _ROOM_US: dict[Flow, int] = {"control": 10_000, "bulk": 50_000, "log": 10_000, "policy": 5_000}
-"""Microseconds that a reply waits for room in its reader's link; after that, all are dropped until there is room."""
-_ROOM_LONG_US = 200_000  # total wait for a chunk of a long reply
-_QUEUE = 8  # batches of 64 KiB queued on a link, so that an acknowledgement does not wait for a chunk of a long reply
-_ACCEPT_MS = 5000  # deadline for a connection to authenticate
-_PENDING = 4096  # connections that may be authenticating at a time
-_FILES = 16384  # open files of the process, if the system allows it: each connection is one
-_SESSIONS = 1000
+"""Microseconds that an answer waits for room in its reader's link; then all are dropped until there is some."""
+_ROOM_LONG_US = 200_000  # that a piece of a long answer waits in all
+_QUEUE = 8  # batches of 64 KiB that wait for a link: an acknowledgement finds room beside a piece of a long reply
+_ACCEPT_MS = 5000  # that a connection has until it has shown who it is
+_PENDING = 4096  # connections that may be at that, and no more than a quarter of the files that may be open
+_FILES = 16384  # that the process may have open, if the system allows it: each connection is one
+_SESSIONS = 1000  # and no more than a quarter of the files: Zenoh panics where there are none left
 _log = logging.getLogger(__name__)
 
 
@@ -46,6 +46,7 @@ def configuration(
 ) -> zenoh.Config:
     """Returns the Zenoh configuration of one flow's session."""
     longest = min(max_message, LONGEST.get(name, max_message))
+    files = _open_files() if listens else _FILES
     answers = {"id": "patience", "messages": ["query"], "key_exprs": ["**"], "flows": ["ingress"]}
     settings = {
         "mode": "peer" if listens else "client",
@@ -58,8 +59,8 @@ def configuration(
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,  # leaks in the receiver (zenoh #2787)
         "transport/unicast/accept_timeout": _ACCEPT_MS,
-        "transport/unicast/accept_pending": _PENDING,
-        "transport/unicast/max_sessions": _SESSIONS,
+        "transport/unicast/accept_pending": min(_PENDING, files // 4),
+        "transport/unicast/max_sessions": min(_SESSIONS, files // 4),
         "transport/link/tx/lease": _LEASE_MS[name],
         "transport/link/tx/queue/size/data": _QUEUE,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": _BLOCK_US[name],
@@ -79,12 +80,17 @@ def configuration(
     return config
 
 
-def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
-    """Opens a listening session; raises a CongraspError if its port is in use."""
+def _open_files() -> int:
+    """Files that this process may have open; raises the limit to `_FILES` where the system allows it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = _FILES if hard == resource.RLIM_INFINITY else min(hard, _FILES)
     if soft != resource.RLIM_INFINITY and soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+    return most
+
+
+def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
+    """A session that listens; a CongraspError if its port is in use."""
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

@@ -87,6 +87,7 @@ class ZenohTransport:
         wanted = [secured(one, credentials) for one in (connect or listen)]
         endpoints = {name: [shifted(one, i) for one in wanted] for i, name in enumerate(flows)}
         self._max_message, self._sender = max_message, secrets.token_bytes(8)
+        self._identity = str(credentials.identity) if credentials else ""
         self._counts: dict[str, int] = {}
         self._counts_lock = threading.Lock()
         self._outbox, self._pace, self._sessions = Outbox(), Pace(), Sessions()
@@ -189,7 +190,8 @@ class ZenohTransport:
             raise TransportError(f"No answer for {key} within {timeout:g} s.")
         if refused is not None:
             raise error_of(str(refused.encoding).partition(";")[2], message.decode(errors="replace"))
-        raise TransportError(f"No response for {key}.", "The process that serves it may have ended.")
+        revoked = f", or has revoked the certificate {self._identity}" if self._identity else ""
+        raise TransportError(f"No response for {key}.", f"The process that serves it may have ended{revoked}.")
 
     def publish(self, key: str, message: Message) -> None:
         """See `Transport.publish`; does nothing once closed, or while the sessions are being reopened."""

@@ -25,6 +25,7 @@ from jax.sharding import Mesh
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.learner.distributed.collectives import AXIS
+from congrasp.learner.distributed.relay import relay
 
 JOIN_SECONDS = 300.0
 """Deadline for all ranks to join, in seconds."""
@@ -149,7 +150,7 @@ class Ranks:
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         jax.config.update("jax_enable_preemption_service", False)  # it would take SIGTERM for itself
         jax.distributed.initialize(
-            coordinator,
+            f"127.0.0.1:{relay(host, int(port))}" if rank else coordinator,
             count,
             rank,
             local_device_ids=[0],

@@ -11,7 +11,7 @@ from congrasp.learner.hub.staleness import Owner
 
 _INCARNATIONS = 1024  # incarnations whose sequences are kept
 _WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another
-_GAP = 1 << 16  # most rollouts counted for one gap; limits actors with invented numbers
+_FAR = 1 << 10  # sequence numbers between the first that waits for an update and the next, of which a checkpoint tells
 
 
 @dataclasses.dataclass
@@ -23,7 +23,9 @@ class Sequences:
     refused: set[int] = dataclasses.field(default_factory=set)
     """Refused ones among them, if recent; the others were accepted."""
     skipped: int = 0
-    """Sequence numbers below `next` that never arrived."""
+    """Sequence numbers below `next` that never came, as far as they can have been made."""
+    granted: int = 0
+    """Tickets that it was given: it has made no more rollouts than these, and those of sessions before."""
     rollouts: int = 0
     """Number of accepted rollouts."""
     version: int = -1
@@ -41,7 +43,7 @@ class Sequences:
             self.refused.add(header.sequence)
         self.ahead.add(header.sequence)
         if len(self.ahead) > _WINDOW:
-            self.skipped += min(_GAP, min(self.ahead) - self.next)
+            self.skipped += self._made(min(self.ahead) - self.next)
             self.next = min(self.ahead)
         while self.next in self.ahead:
             self.ahead.remove(self.next)
@@ -53,7 +55,11 @@ class Sequences:
     def missing(self) -> int:
         """Number of undecided sequence numbers below the highest."""
         ahead = max(self.ahead, default=self.next - 1) + 1 - self.next - len(self.ahead)
-        return self.skipped + min(_GAP, ahead)
+        return self.skipped + self._made(ahead)
+
+    def _made(self, gap: int) -> int:
+        """So many of the sequence numbers in a gap can be of rollouts: an actor may make its numbers up."""
+        return max(0, min(gap, self.granted + _WINDOW - self.skipped))
 
 
 class SequenceTable:
@@ -88,7 +94,7 @@ class SequenceTable:
         rows = []
         for owner, known in self._known.items():
             queued = {sequence for of, sequence in waiting if of == owner}
-            start = min(queued | {known.next})
+            start = max(min(queued | {known.next}), known.next - _FAR)  # an actor may make its numbers up
             decided = set(range(start, known.next)) | known.ahead
             rows.append([*owner, start, sorted(decided - queued), sorted(known.refused), known.skipped])
         return {"forgotten_missing": self._forgotten_missing, "sequences": rows}
@@ -97,4 +103,4 @@ class SequenceTable:
         """Restores the result of `durable`."""
         self._forgotten_missing = durable["forgotten_missing"]
         for actor, incarnation, start, ahead, refused, skipped in durable["sequences"]:
-            self._known[actor, incarnation] = Sequences(start, set(ahead), set(refused), skipped)
+            self._known[actor, incarnation] = Sequences(start, set(ahead), set(refused), skipped, skipped)

@@ -291,6 +291,9 @@ class LearnerHub:
             return Message(meta=self._state())
         may = self._bundle is not None and not self._finished
         ticket = self._staleness.grant(owner, ticket_id) if may else None
+        if ticket is not None:
+            with self._changed:
+                self._sequences.of(owner).granted += 1
         return Message(meta={**self._state(), "granted": ticket is not None, "retry_after": _RETRY_SECONDS})
 
     def _on_weights(self, key: str, request: Message) -> Message:

@@ -9,8 +9,8 @@ import tyro
 def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tuple[pathlib.Path, ...] = ()) -> int:
     """Compares the journals of a run's actors and of its learner: was every accepted rollout used once, and unchanged?
 
-    Exits with 1 if a rollout was lost, else with 5 if there is a surplus (one was used twice, or no actor made it),
-    else with 6 if a rollout or a journal is damaged.
+    Exits with 1 if a rollout was lost, else with 5 if there is a surplus (one was used twice, or nobody made it), else
+    with 6 if a rollout or a journal is damaged, else with 7 if something cannot be judged, for lines are missing.
 
     Args:
       run_dir: Directory of the run.
@@ -23,7 +23,7 @@ def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tupl
     from rich.console import Console
     from rich.table import Table
 
-    from congrasp.services.ops.audit import FAULTS, audit
+    from congrasp.services.ops.audit import EXIT_CODES, FAULTS, UNJUDGED, audit
 
     report = audit(run_dir, journals)
     console = Console()
@@ -33,11 +33,16 @@ def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tupl
         table.add_row(name, str(value), FAULTS.get(name, ""), style=style)
     table.add_section()
     table.add_row("damaged lines", str(report.damaged), "damage", style="bold red" if report.damaged else "")
-    table.add_row("lines without a checksum", str(report.unchecked), "unchecked" if report.unchecked else "")
+    table.add_row("lines of older versions", str(report.unchecked), "unchecked" if report.unchecked else "")
     console.print(table)
     console.print(f"Lag: mean {report.lag_mean:.2f}, maximum {report.lag_max} of {report.max_staleness} versions.")
     if report.holes:
         console.print(f"{report.holes} line(s) are missing in the journals: the disk was full, or their end was cut.")
+    if report.missing:
+        console.print(f"Lines are missing at {report.missing} place(s) of the journals: they were emptied or cut.")
+    if report.exit_code == EXIT_CODES["unjudged"]:
+        count, accepted = report.counts.get(UNJUDGED, 0), report.counts.get("accepted", 0)
+        console.print(f"The run cannot be judged: {count} of {accepted} accepted rollouts are {UNJUDGED}.")
     for line in report.faults[:20]:
         console.print(line)
     return report.exit_code

@@ -4,8 +4,9 @@ Actors record what they sent, with a checksum, and every reply; the learner reco
 the start of the update, what it dropped, and where its sessions began and ended. Neither reads the other's journal, and
 this module does not use the code that decided.
 
-The content of missing or damaged lines is unknown: rollouts they may concern are not faults, but counted as not in the
-journals.
+What a journal's missing or damaged lines told cannot be known: what they may have been about is no fault, but counted
+as not in the journals, and reported as unjudged. A journal whose last lines were cut off looks like that of a process
+that was killed then.
 """
 
 import collections
@@ -22,8 +23,10 @@ Identity = tuple[str, str, int]
 """Actor, incarnation and sequence number."""
 FAULTS = {"lost": "loss", "duplicated": "surplus", "corrupted": "damage", "unmatched": "surplus"}
 """Faults of rollouts, and their kinds."""
-EXIT_CODES = {"loss": 1, "surplus": 5, "damage": 6}
-"""Exit codes of `congrasp audit` by the most serious kind of finding; 2 to 4 are those of errors."""
+EXIT_CODES = {"loss": 1, "surplus": 5, "damage": 6, "unjudged": 7}
+"""What `congrasp audit` exits with, by the gravest kind of what it found; 2 to 4 are those of errors."""
+UNJUDGED = "not in the journals"
+"""Outcome of accepted rollouts of which nothing can be said."""
 
 
 class Made(NamedTuple):
@@ -48,15 +51,19 @@ class Report(NamedTuple):
     holes: int
     """Lines missing from the journals because of a full disk, or cut at the end."""
     damaged: int
-    """Lines of the journals that were changed."""
+    """Lines of the journals that are not what was written."""
+    missing: int
+    """Places in the journals where lines are missing that were there, and journals without a line."""
     unchecked: int
-    """Lines without a checksum, of older versions of congrasp: damage to them may look like any fault."""
+    """Lines of older versions of congrasp, between which missing ones do not show."""
 
     @property
     def exit_code(self) -> int:
         """0 without findings, else that of the most serious kind."""
         damaged = self.damaged or self.counts.get("damaged on disk")
         kinds = {FAULTS[name] for name in FAULTS if self.counts[name]} | ({"damage"} if damaged else set())
+        if self.missing or self.counts.get(UNJUDGED) or not self.counts["made"]:
+            kinds.add("unjudged")
         return next((code for kind, code in EXIT_CODES.items() if kind in kinds), 0)
 
 
@@ -88,7 +95,7 @@ def audit(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
         )
     notes = [read_journal(path, _is_entry) for path in actors]
     books = [read_uses(path) for path in learners]
-    gaps = _Gaps(*(any(each.lost or each.damaged for each in group) for group in (notes, books)))
+    gaps = _Gaps(*(any(each.lost or each.damaged or each.missing for each in group) for group in (notes, books)))
     return _compare(_made(notes), _outcomes(book.intact for book in books), gaps, [*notes, *books])
 
 
@@ -226,7 +233,7 @@ def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals
         counts["accepted"] += 1
         outcome = _outcome(identity, rollout, found)
         if outcome == "lost" and any(gaps):
-            outcome = "not in the journals"
+            outcome = UNJUDGED
         if outcome == "lost":
             fault("lost", identity, "accepted, but missing afterwards")
         else:
@@ -240,6 +247,7 @@ def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals
         max((session.max_staleness for book in found.books for session in book), default=0),
         sum(journal.lost for journal in journals),
         sum(journal.damaged for journal in journals),
+        sum(journal.missing for journal in journals),
         sum(journal.unchecked for journal in journals),
     )
 
@@ -261,7 +269,7 @@ def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
         if not after:
             return "waiting" if last.waiting is None or identity in last.waiting else "lost"
         return _without_trace(identity, rollout.version, last, after[0], undone=identity in found.undone)
-    return "not in the journals"
+    return UNJUDGED
 
 
 def _without_trace(identity: Identity, version: int, last: _Session, after: _Session, *, undone: bool) -> str:

@@ -1,6 +1,7 @@
 """The policy as one compiled function from a batch of flat queries to joint targets."""
 
 import itertools
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -47,10 +48,16 @@ class PolicyFunction:
         alone = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
         self._compiled = jax.jit(self._infer, compiler_options=alone)
 
-    def warm_up(self, weights: InferenceParameters, sizes: Sequence[int] = BATCH_SIZES) -> None:
-        """Compiles batches of these sizes."""
+    def warm_up(self, weights: InferenceParameters, sizes: Sequence[int] = BATCH_SIZES) -> dict[int, float]:
+        """Compiles batches of these sizes; returns the seconds that one of each takes from then on."""
+        seconds = {}
         for size in sizes:
-            jax.block_until_ready(self._compiled(weights, np.zeros((size, self.layout.size), np.float32)))
+            batch = np.zeros((size, self.layout.size), np.float32)
+            for _ in range(2):
+                began = time.perf_counter()
+                jax.block_until_ready(self._compiled(weights, batch))
+                seconds[size] = time.perf_counter() - began
+        return seconds
 
     def __call__(self, weights: InferenceParameters, queries: Sequence[Query]) -> list[Inference | Exception]:
         """Answers queries of at most `BATCH_SIZES[-1]` states; an invalid query gets an error."""

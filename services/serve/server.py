@@ -82,7 +82,7 @@ class PolicyServer:
         self._on_answer, self._on_batch = on_answer, on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
-        self._function.warm_up(self._held.inference_parameters)
+        self._seconds = self._function.warm_up(self._held.inference_parameters)
         self._answered = 0
         self._trouble = ""
         self._closed = threading.Event()
@@ -103,7 +103,11 @@ class PolicyServer:
         self._follower.start()
 
     def health(self) -> dict[str, Any]:
-        """Returns readiness, version, hand, queue, and the reason why a newer policy was refused, as JSON."""
+        """Readiness, version, hand, queue, and why a newer policy was refused, as JSON.
+
+        The server takes no more than `queue_limit` queries that wait, `peer_limit` of one peer, and answers no more
+        than `states_per_second`, as measured at its start.
+        """
         held = self._held
         return {
             "ready": True,
@@ -113,6 +117,9 @@ class PolicyServer:
             "surface_points": held.bundle.task.surface_points,
             "trajectory_points": held.bundle.task.trajectory_points,
             "queue": len(self._batcher),
+            "queue_limit": DEPTH,
+            "peer_limit": SHARE,
+            "states_per_second": round(max(size / seconds for size, seconds in self._seconds.items())),
             "answered": self._answered,
             "trouble": self._trouble,
         }

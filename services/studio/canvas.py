@@ -59,7 +59,7 @@ class Canvas:
         def brushed(places: np.ndarray, before: np.ndarray) -> np.ndarray:
             """Painted state of some places after a stroke."""
             squared = ((places[:, None] - strokes[None]) ** 2).sum(-1).min(-1, initial=np.inf)
-            return np.where(squared <= radius**2, avoid, before)
+            return np.where(squared <= radius**2, bool(avoid), before)
 
         self._set(brushed(self._obj.points, self.avoid), brushed(self.vertices, self.paint.shown))
 

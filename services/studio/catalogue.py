@@ -9,6 +9,9 @@ from typing import Any, Protocol
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.objects.sizes import UNIT_NAMES, guessed_unit, sizes_by_unit
+from congrasp.services.studio.server import BadRequest
+
+_LONGEST_NAME = 255  # bytes, of Linux
 
 
 class Importer(Protocol):
@@ -96,9 +99,12 @@ class Uploads:
         """A mesh's file as it comes, whose unit is guessed.
 
         Raises:
+          BadRequest: no file can have the name.
           CongraspError: it is empty or cannot be read, or in no unit a hand could grasp it.
         """
         name = pathlib.PurePosixPath(name.replace("\\", "/")).name or "mesh"
+        if name == ".." or not name.isprintable() or len(name.encode()) > _LONGEST_NAME:
+            raise BadRequest(f"{ascii(name)[:60]} is no name of a file.")
         if not body:
             raise CongraspError(f"{name} is empty (0 bytes).", "Export or download it again.")
         path = pathlib.Path(tempfile.mkdtemp(dir=self._folder)) / name

@@ -1,5 +1,6 @@
 """Serves a studio over HTTP to browsers on this machine: files, JSON, and messages of arrays."""
 
+import contextlib
 import http.server
 import json
 import pathlib
@@ -9,7 +10,7 @@ import urllib.parse
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.ops.logs import log
 
@@ -24,6 +25,11 @@ _TYPES = {
 }
 _POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
 _TIMEOUT = 30.0  # seconds that a request may take to arrive
+_DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes of a refused body, so that the refusal arrives before the end does
+
+
+class BadRequest(CongraspError):
+    """A request that no page sends."""
 
 
 class Download(NamedTuple):
@@ -100,10 +106,10 @@ class PageServer:
         A site can have its name point to this machine, so the name that was asked for must be this machine's own.
         """
         host = request.headers.get("Host", "")
-        origin = request.headers.get("Origin")
+        origin, site = request.headers.get("Origin"), request.headers.get("Sec-Fetch-Site")
         names = {f"{name}:{self.port}" for name in ("127.0.0.1", "localhost", "[::1]")}
-        own = self.host not in ("127.0.0.1", "localhost", "::1") or host in names
-        return own and origin in (None, f"http://{host}")
+        own = host in names if self.host in ("127.0.0.1", "localhost", "::1") else bool(host.strip())
+        return own and origin in (None, f"http://{host}") and site in (None, "none", "same-origin")
 
 
 class _Server(http.server.ThreadingHTTPServer):
@@ -139,24 +145,24 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._file("index.html" if path == "/" else path.removeprefix("/static/"))
 
     def do_POST(self) -> None:
-        """Answers by a route."""
+        """Answers by a route; a request is refused by its headers, before its body is read."""
         path, query = self._route()
-        given = self.headers.get("Content-Length") or ""
-        length = int(given) if given.isdecimal() and len(given) < 20 else -1
-        if not 0 <= length <= MOST_BYTES:
-            self.close_connection = True
-            message = "The request has no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
-            self._send(413, "application/json", json.dumps({"error": message}).encode())
-            return
-        body = self.rfile.read(length)
         # What a form of another site can send has none of these types.
         kind = (self.headers.get("Content-Type") or "").partition(";")[0]
+        given = self.headers.get("Content-Length") or ""
+        length = int(given) if given.isdecimal() and len(given) < 20 else -1
         if self._refused(kind not in ("application/json", "application/octet-stream")):
-            return
-        if path in self.routes[1]:
-            self._answer(lambda: self.routes[1][path](query, body))
-        else:
+            self._drain(length)
+        elif not 0 <= length <= MOST_BYTES:
+            message = "The request has no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
+            self._send(413, "application/json", json.dumps({"error": message}).encode())
+            self._drain(length)
+        elif path not in self.routes[1]:
             self._send(404, "application/json", b'{"error": "There is nothing of this name."}')
+            self._drain(length)
+        else:
+            body = self.rfile.read(length)
+            self._answer(lambda: self.routes[1][path](query, body))
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not logged."""
@@ -173,6 +179,13 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self._send(403, "application/json", b'{"error": "This page answers only to itself."}')
         return True
 
+    def _drain(self, length: int) -> None:
+        """Ends the connection of a request that was answered without its body."""
+        self.close_connection = True
+        self.connection.settimeout(_DRAIN_SECONDS)
+        with contextlib.suppress(OSError):
+            self.rfile.read(min(max(0, length), _DRAINED))
+
     def _file(self, name: str) -> None:
         """Sends a file of the page."""
         file = STATIC / name
@@ -185,7 +198,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Sends what `work` returns, or its error."""
         try:
             found = work()
-        except (CongraspError, TransportError) as error:
+        except BadRequest as error:
+            self._send(400, "application/json", json.dumps({"error": str(error)}).encode())
+            return
+        except CongraspError as error:
             self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
             return
         except Exception as error:  # whatever a page asks for, the server continues

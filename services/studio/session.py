@@ -2,6 +2,7 @@
 
 import functools
 import json
+import math
 import pathlib
 import tempfile
 import threading
@@ -12,7 +13,7 @@ import numpy as np
 
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
+from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
@@ -28,7 +29,7 @@ from congrasp.services.studio.jobs import Jobs, Progress
 from congrasp.services.studio.lanes import for_page
 from congrasp.services.studio.motions import Motions
 from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.server import Download, Get, Picture, Post
+from congrasp.services.studio.server import BadRequest, Download, Get, Picture, Post
 from congrasp.services.studio.state import Studio
 from congrasp.services.studio.thumbnails import Thumbnails
 from congrasp.services.studio.training import TrainingWindow
@@ -39,6 +40,8 @@ _OWN_WEIGHT = {"mass_g": 0.0, "material": ""}
 """The object weighs what it came with."""
 _DRAWING = "drawing"
 """Kinds of results of a job that are a picture or a video instead of a motion."""
+_LATEST = 1e10
+"""Seconds since 1970 beyond which nothing was recorded."""
 
 
 class Grasping(Protocol):
@@ -89,7 +92,7 @@ class Session:
         self.gets: dict[str, Get] = {
             "/api/state": lambda query: self.state(),
             "/api/job": lambda query: self._jobs.state(),
-            "/api/hand": lambda query: hand_message(query.get("name", self._hand)),
+            "/api/hand": lambda query: self.hand(query.get("name", "")),
             "/api/object": lambda query: self.mesh(),
             "/api/rest": lambda query: self.rest_picture(query.get("index", "")),
             "/api/paint": lambda query: Message({"avoid": self._studio.canvas.paint.shown}, {}),
@@ -129,6 +132,12 @@ class Session:
                 "drawn": DRAWN,
                 "job": self._jobs.state(),
             }
+
+    def hand(self, name: str) -> Message:
+        """The studio's hand, or another that a motion may name (see `hand_message`)."""
+        with self._lock:
+            own = self._studio.hand
+        return hand_message(own if name == own.name else known_hand(name))
 
     def mesh(self) -> Message:
         """The object's mesh that is painted on."""
@@ -176,7 +185,9 @@ class Session:
         try:
             when, around = float(time), float(seconds)
         except ValueError:
-            raise CongraspError("A search for episodes needs two numbers: time and seconds.") from None
+            when = around = math.nan
+        if not (0.0 <= when < _LATEST and math.isfinite(around)):
+            raise BadRequest("A search for episodes needs two finite numbers: time and seconds.")
         reach, episodes = self._recordings.around(when, min(max(around, 0.1), 3600.0))
         return {"seconds": reach, "episodes": episodes}
 
@@ -316,9 +327,8 @@ class Session:
         self._jobs.start(f"drawing the {kind}", work)
 
 
-def hand_message(name: str) -> Message:
+def hand_message(hand: Hand) -> Message:
     """A hand's skin (see `common.hands.skin`), and its links' names."""
-    hand = get_hand(name)
     skin = skin_of(hand)
     links, weights = skin.influences()
     arrays = {
@@ -330,7 +340,7 @@ def hand_message(name: str) -> Message:
         "skin_origins": skin.origins.astype(np.float32),
         "skin_colours": skin_colours(skin),
     }
-    return Message(arrays, {"hand": name, "links": [link.name for link in hand.links]})
+    return Message(arrays, {"hand": hand.name, "links": [link.name for link in hand.links]})
 
 
 def json_object(body: bytes) -> dict[str, Any]:

@@ -6,13 +6,14 @@ import time
 import numpy as np
 import pytest
 
+from congrasp.actors.process import uploads
 from congrasp.actors.process.link import ActorLink, RunFinished, RunRestarted, Ticket
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
+from tests.waits import eventually
 
-pytestmark = pytest.mark.timeout(30)
 KEYS = Keys("test")
 TICKET = Ticket("t", 0)
 
@@ -71,7 +72,7 @@ def ends():
 
     def make(**options):
         transport = MemoryTransport(hub)
-        link = ActorLink(transport, "test", "a", **{"request_timeout": 2.0, **options})
+        link = ActorLink(transport, "test", "a", **{"request_timeout": 20.0, **options})
         made.append((transport, link))
         return link
 
@@ -79,15 +80,6 @@ def ends():
     for transport, link in made:
         link.close()
         transport.close()
-
-
-def eventually(look):
-    """What `look` returns, once that is something."""
-    deadline = time.monotonic() + 10.0
-    while not (seen := look()):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    return seen
 
 
 def rollout(value=0.0):
@@ -108,9 +100,9 @@ def test_identity_is_added_and_counts(ends):
     learner, link = Learner(hub), make()
     with pytest.raises(CongraspError, match="no configuration"):
         link.upload(rollout(), TICKET)
-    link.config(5)
+    link.config(60)
     for n in range(3):
-        assert link.upload(rollout(n), Ticket(f"t{n}", 0)).result(5) == "accepted"
+        assert link.upload(rollout(n), Ticket(f"t{n}", 0)).result(60) == "accepted"
     other = make()
     assert other.incarnation != link.incarnation
     for n, message in enumerate(learner.received):
@@ -123,12 +115,12 @@ def test_tickets_are_waited_for_and_asked_for_under_one_id(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
     learner.granted = False
-    link.config(5)
+    link.config(60)
     assert link.acquire_ticket(0.2) is None
     assert len(learner.tickets) >= 2
     learner.granted = True
     learner.state["version"] = 7
-    first, second = link.acquire_ticket(5), link.acquire_ticket(5)
+    first, second = link.acquire_ticket(60), link.acquire_ticket(5)
     assert first.version == 7 and first.id != second.id
     assert {meta["ticket"] for meta in learner.tickets} == {first.id, second.id}
     link.give_back(second)
@@ -141,7 +133,7 @@ def test_an_announcement_ends_the_wait_for_a_ticket(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
     learner.reply = lambda **meta: Message(meta={**learner.state, "retry_after": 20.0, **meta})
-    link.config(5)
+    link.config(60)
     learner.granted = False
 
     def move_on():
@@ -155,7 +147,7 @@ def test_an_announcement_ends_the_wait_for_a_ticket(ends):
 def test_weights_are_pulled_only_when_there_are_others(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
-    link.config(5)
+    link.config(60)
     assert link.weights(-1).meta["version"] == 0
     for _ in range(5):
         assert link.weights(0) is None
@@ -165,7 +157,7 @@ def test_weights_are_pulled_only_when_there_are_others(ends):
     assert link.weights(1) is None and learner.pulls == 2
     learner.state["version"] = 2  # its announcement is lost; a ticket tells as well
     assert link.weights(1) is None
-    link.acquire_ticket(5)
+    link.acquire_ticket(60)
     assert link.weights(1).meta["version"] == 2
     learner.announce(version=1, session_id="2")  # it resumed from a checkpoint
     assert eventually(lambda: link.weights(2)).meta["version"] == 1
@@ -177,23 +169,23 @@ def test_weights_are_pulled_only_when_there_are_others(ends):
 def test_rollout_is_sent_under_one_identity_until_it_is_answered(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
-    link.config(5)
+    link.config(60)
     learner.outcomes = ["retry", RuntimeError("bug"), "retry", "duplicate"]
-    assert link.upload(rollout(), TICKET).result(10) == "duplicate"
+    assert link.upload(rollout(), TICKET).result(60) == "duplicate"
     assert len({id(message) for message in learner.received}) == 1 and len(learner.received) == 4
 
 
 def test_rollout_survives_a_restart_of_the_learner(ends):
     hub, make = ends
     first, link = Learner(hub), make()
-    link.config(5)
+    link.config(60)
     first.transport.close()
     outcome = link.upload(rollout(5), TICKET)
     assert link.acquire_ticket(0.2) is None and link.weights(-1) is None
     time.sleep(0.3)
     assert not outcome.done()
     second = Learner(hub, session_id="2")
-    assert outcome.result(10) == "accepted"
+    assert outcome.result(60) == "accepted"
     assert second.received[0].meta["sequence"] == 0
     assert link.weights(0).meta["version"] == 0  # the number is the same, the learner is not
 
@@ -201,16 +193,16 @@ def test_rollout_survives_a_restart_of_the_learner(ends):
 def test_another_training_is_told_to_the_caller_who_starts_over(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
-    link.config(5)
+    link.config(60)
     learner.state["run_id"] = "f"
     outcome = link.upload(rollout(), TICKET)
     with pytest.raises(RunRestarted, match="run id f after e"):
-        outcome.result(5)
+        outcome.result(60)
     for use in (lambda: link.upload(rollout(), TICKET), lambda: link.acquire_ticket(1), lambda: link.weights(0)):
         with pytest.raises(RunRestarted):
             use()
-    assert link.config(5).run_id == "f"
-    assert link.upload(rollout(), TICKET).result(5) == "accepted"
+    assert link.config(60).run_id == "f"
+    assert link.upload(rollout(), TICKET).result(60) == "accepted"
     assert [message.meta["sequence"] for message in learner.received] == [0, 1]
 
 
@@ -218,7 +210,7 @@ def test_another_training_is_told_to_the_caller_who_starts_over(ends):
 def test_another_training_is_noticed_by_every_way(ends, by):
     hub, make = ends
     learner, link = Learner(hub), make()
-    link.config(5)
+    link.config(60)
     if by == "announcement":
         learner.announce(run_id="f")
     learner.state["run_id"] = "f"
@@ -229,16 +221,16 @@ def test_another_training_is_noticed_by_every_way(ends, by):
 def test_finished_run_is_told_to_the_caller(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
-    link.config(5)
+    link.config(60)
     learner.state["finished"] = True
     with pytest.raises(RunFinished):
-        link.acquire_ticket(5)
+        link.acquire_ticket(60)
 
 
 def test_uploads_overlap_with_the_caller_up_to_the_window(ends):
     hub, make = ends
     learner, link = Learner(hub), make(window=2)
-    link.config(5)
+    link.config(60)
     gate = threading.Event()
     learner.outcomes = [lambda: gate.wait(10) and "accepted"]
     outcomes = [link.upload(rollout(n), TICKET) for n in range(2)]  # both return at once
@@ -249,16 +241,16 @@ def test_uploads_overlap_with_the_caller_up_to_the_window(ends):
     assert link.flush(0.05) is False
     gate.set()
     third.join(5)
-    assert link.flush(5) is True
+    assert link.flush(60) is True
     assert [outcome.result(0) for outcome in outcomes] == ["accepted"] * 3
 
 
 def test_refusals_in_a_row_stop_the_actor_with_a_reason(ends):
     hub, make = ends
     learner, link = Learner(hub), make(max_refusals=3)
-    link.config(5)
+    link.config(60)
     learner.outcomes = ["refused", "refused", "stale", "refused", "refused", "refused"]
-    assert [link.upload(rollout(), TICKET).result(5) for _ in range(6)][2:4] == ["stale", "refused"]
+    assert [link.upload(rollout(), TICKET).result(60) for _ in range(6)][2:4] == ["stale", "refused"]
     for use in (lambda: link.upload(rollout(), TICKET), lambda: link.acquire_ticket(1), lambda: link.weights(0)):
         with pytest.raises(CongraspError, match="refused 3 rollouts in a row: because"):
             use()
@@ -268,11 +260,11 @@ def test_refusals_in_a_row_stop_the_actor_with_a_reason(ends):
 def test_message_that_always_arrives_damaged_is_not_sent_for_ever(ends):
     hub, make = ends
     learner, link = Learner(hub), make(max_refusals=2)
-    link.config(5)
+    link.config(60)
     learner.outcomes = [CongraspError("The message's data do not match their checksum.")]
-    assert link.upload(rollout(), TICKET).result(10) == "refused"
+    assert link.upload(rollout(), TICKET).result(60) == "refused"
     assert len(learner.received) == 2
-    assert link.upload(rollout(), TICKET).result(10) == "refused"
+    assert link.upload(rollout(), TICKET).result(60) == "refused"
     with pytest.raises(CongraspError, match=r"refused 2 rollouts in a row: .*checksum"):
         link.upload(rollout(), TICKET)
 
@@ -280,21 +272,51 @@ def test_message_that_always_arrives_damaged_is_not_sent_for_ever(ends):
 def test_silent_learner_is_given_up(ends):
     hub, make = ends
     learner, link = Learner(hub), make(patience=0.3)
-    link.config(5)
+    link.config(60)
     learner.transport.close()
     with pytest.raises(TransportError, match=r"not answered for 0\.3 s"):
-        link.upload(rollout(), TICKET).result(10)
+        link.upload(rollout(), TICKET).result(60)
     with pytest.raises(TransportError, match=r"not answered for 0\.3 s"):
-        link.acquire_ticket(5)
+        link.acquire_ticket(60)
+
+
+def test_one_line_is_logged_while_a_learner_does_not_answer(ends, monkeypatch, caplog):
+    monkeypatch.setattr(uploads, "_NOTICED", 0.2)
+    hub, make = ends
+    learner, link = Learner(hub), make(patience=20.0)
+    link.config(60)
+    learner.transport.close()
+    outcome = link.upload(rollout(), TICKET)
+    for _ in range(3):
+        assert link.acquire_ticket(0.3) is None
+    Learner(hub, session_id="2")
+    assert outcome.result(60) == "accepted" and link.acquire_ticket(60)
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert line.startswith("The learner does not answer; waiting for up to 20 s: No response for ")
+
+
+def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(ends, monkeypatch):
+    hub, make = ends
+    learner, link = Learner(hub), make(patience=5.0)
+    link.config(60)
+    learner.transport.close()
+    outcome = link.upload(rollout(), TICKET)
+    assert link.acquire_ticket(0.2) is None
+    running = time.monotonic
+    monkeypatch.setattr(time, "monotonic", lambda: running() + 60.0)  # what a process sees that was stopped
+    assert link.acquire_ticket(0.2) is None
+    assert not outcome.done()
+    Learner(hub, session_id="2")
+    assert outcome.result(60) == "accepted" and link.acquire_ticket(60)
 
 
 def test_learner_that_talks_nonsense_ends_the_link(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
-    link.config(5)
+    link.config(60)
     learner.reply = lambda **meta: Message(meta={"hello": 1})
     with pytest.raises(CongraspError, match="is not valid"):
-        link.upload(rollout(), TICKET).result(5)
+        link.upload(rollout(), TICKET).result(60)
     with pytest.raises(CongraspError, match="is not valid"):
         link.acquire_ticket(1)
 
@@ -302,12 +324,12 @@ def test_learner_that_talks_nonsense_ends_the_link(ends):
 def test_closing_gives_up_what_is_on_its_way(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
-    link.config(5)
+    link.config(60)
     learner.outcomes = ["retry"]
     outcome = link.upload(rollout(), TICKET)
     link.close()
     with pytest.raises(TransportError, match="closed before"):
-        outcome.result(5)
+        outcome.result(60)
     assert link.flush(1)
     with pytest.raises(CongraspError, match="closed"):
         link.upload(rollout(), TICKET)

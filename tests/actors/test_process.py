@@ -155,7 +155,6 @@ def test_steps_in_which_the_physics_left_contacts_out_are_counted():
     assert process.buffer_occupancy(occupancy) == {"overflow": 2.0, "contacts_peak": 1.25, "rows_peak": 1.5}
 
 
-@pytest.mark.timeout(60)
 def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(heard):
     episodes = np.tile(np.arange(len(FIELDS), dtype=np.float32), (B, 1))
     episodes[0, FIELDS.index("episode/heading_rad")] = np.nan
@@ -173,7 +172,6 @@ def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(he
     validate(logs["episode"], EPISODE)
 
 
-@pytest.mark.timeout(60)
 def test_objects_change_as_often_as_the_run_says(heard, monkeypatch):
     monkeypatch.setattr(InventedWorker, "pools", [])
     episodes = invented(np.zeros((B, len(FIELDS)), np.float32))
@@ -183,7 +181,6 @@ def test_objects_change_as_often_as_the_run_says(heard, monkeypatch):
     assert InventedWorker.pools[0] == ["box_0", "mug_0"]
 
 
-@pytest.mark.timeout(60)
 def test_objects_that_fall_are_drawn_more_often_where_the_run_says_so(heard, monkeypatch):
     monkeypatch.setattr(InventedWorker, "weights", [])
     episodes = np.zeros((B, len(FIELDS)), np.float32)

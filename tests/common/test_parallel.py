@@ -25,7 +25,6 @@ def test_results_are_those_of_map(count, monkeypatch):
     assert parallel.parallel_map(operator.sub, range(count), [1] * count) == [i - 1 for i in range(count)]
 
 
-@pytest.mark.timeout(60)
 def test_workers_end_with_a_killed_parent(tmp_path):
     if len(psutil.Process().cpu_affinity()) < 2:
         pytest.skip("one core: nothing is spread")

@@ -13,22 +13,16 @@ import numpy as np
 import pytest
 
 from congrasp.common.errors import CongraspError, OverloadedError, RefusedError, TransportError
+from congrasp.common.transport import zenoh_session
 from congrasp.common.transport.keys import Keys, check_name, flow, matches, parse_alive
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, encode
 from tests.socket_transport import SocketListener, SocketTransport
+from tests.waits import eventually
 
-pytestmark = pytest.mark.timeout(60)
 KEYS = Keys("test")
-
-
-def wait_for(condition, timeout=5.0):
-    deadline = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.01)
 
 
 @pytest.fixture(params=["memory", "zenoh", "from outside"])
@@ -42,7 +36,7 @@ def pair(request, tmp_path):
         ends = ZenohTransport(listen=[endpoint]), ZenohTransport(connect=[endpoint])
     else:
         path = str(tmp_path / "s")
-        ends = SocketListener(path), SocketTransport(path, 5.0)
+        ends = SocketListener(path), SocketTransport(path, 60.0)
     yield ends
     for end in ends:
         end.close()
@@ -91,7 +85,7 @@ def test_query_is_answered_with_its_arrays(pair):
     server.serve(KEYS.act, lambda key, m: Message({"y": m.arrays["x"] * 2}, {"key": key, **m.meta}))
     for index in range(20):
         x = np.arange(index, dtype=np.float32)
-        reply = client.query(KEYS.act, Message({"x": x}, {"n": index}), timeout=5)
+        reply = client.query(KEYS.act, Message({"x": x}, {"n": index}), timeout=60)
         np.testing.assert_array_equal(reply.arrays["y"], 2 * x)
         assert reply.meta == {"key": KEYS.act, "n": index}
 
@@ -99,8 +93,8 @@ def test_query_is_answered_with_its_arrays(pair):
 def test_both_ends_can_serve(pair):
     server, client = pair
     client.serve(KEYS.act, lambda key, m: Message(meta={"from": "client"}))
-    wait_for(lambda: _answers(server, KEYS.act))
-    assert server.query(KEYS.act, Message(), timeout=5).meta == {"from": "client"}
+    eventually(lambda: _answers(server, KEYS.act))
+    assert server.query(KEYS.act, Message(), timeout=60).meta == {"from": "client"}
 
 
 def _answers(transport, key):
@@ -122,12 +116,12 @@ def test_errors_travel_in_words(pair):
 
     server.serve(KEYS.act, handler)
     with pytest.raises(RefusedError, match=r"^The hand is unknown\. Choose another\.$"):
-        client.query(KEYS.act, Message(meta={"bug": False}), timeout=5)
+        client.query(KEYS.act, Message(meta={"bug": False}), timeout=60)
     with pytest.raises(RefusedError, match="ValueError") as caught:
-        client.query(KEYS.act, Message(meta={"bug": True}), timeout=5)
+        client.query(KEYS.act, Message(meta={"bug": True}), timeout=60)
     assert "secret" not in str(caught.value) and type(caught.value) is RefusedError
     with pytest.raises(OverloadedError, match=r"^Ask later\.$"):
-        client.query(KEYS.act, Message(meta={"bug": False, "busy": True}), timeout=5)
+        client.query(KEYS.act, Message(meta={"bug": False, "busy": True}), timeout=60)
 
 
 def test_silence_has_a_deadline(pair):
@@ -140,21 +134,21 @@ def test_silence_has_a_deadline(pair):
     assert not isinstance(caught.value, RefusedError)
     assert 0.25 < time.monotonic() - start < 15
     with pytest.raises(TransportError, match="No response"):
-        client.query(KEYS.health, Message(), timeout=5)
+        client.query(KEYS.health, Message(), timeout=60)
     release.set()
 
 
 def test_workers_answer_at_the_same_time(pair):
     server, client = pair
     together = threading.Barrier(3)
-    server.serve(KEYS.act, lambda key, m: Message(meta={"n": together.wait(10)}), workers=3)
+    server.serve(KEYS.act, lambda key, m: Message(meta={"n": together.wait(60)}), workers=3)
     seen = []
-    ask = lambda: seen.append(client.query(KEYS.act, Message(), timeout=10).meta["n"])  # noqa: E731
+    ask = lambda: seen.append(client.query(KEYS.act, Message(), timeout=60).meta["n"])  # noqa: E731
     threads = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(15)
+        thread.join(60)
     assert sorted(seen) == [0, 1, 2]
 
 
@@ -179,10 +173,10 @@ def test_query_after_the_server_closed_fails_at_once(pair):
     waiting = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
     for thread in waiting:
         thread.start()
-    assert entered.wait(5)
+    assert entered.wait(60)
     server.close()
     for thread in waiting:
-        thread.join(10)
+        thread.join(60)
     assert not any(thread.is_alive() for thread in waiting)
     assert len(failures) >= 2  # one may have been in the handler, whose answer still counts
     with pytest.raises(TransportError):
@@ -206,14 +200,14 @@ def test_closing_waits_for_handlers_that_still_work(pair):
 
     def ask():
         with contextlib.suppress(CongraspError):  # its answer may come too late for the closing server
-            client.query(KEYS.act, Message(), timeout=5)
+            client.query(KEYS.act, Message(), timeout=60)
 
     asker = threading.Thread(target=ask, daemon=True)
     asker.start()
-    assert began.wait(5)
+    assert began.wait(60)
     server.close()
     assert ended.is_set()
-    asker.join(10)
+    asker.join(60)
 
 
 def test_subscription_keeps_the_newest_and_counts_the_rest(pair):
@@ -227,18 +221,18 @@ def test_subscription_keeps_the_newest_and_counts_the_rest(pair):
         sent += 1
         return subscription.receive(0.05)
 
-    wait_for(arrived)
+    eventually(arrived)
     server.publish(KEYS.log("metrics", "learner", "0"), Message(meta={"n": -1}))
     last = None
     while last != -1:
-        found = subscription.receive(15)
+        found = subscription.receive(60)
         assert found is not None
         last = found[1].meta["n"]
     dropped = subscription.dropped
     for n in range(10):
         server.publish(KEYS.log("event", "learner", "0"), Message({"x": np.zeros(3)}, {"n": n}))
-    wait_for(lambda: subscription.dropped - dropped == 6)
-    received = [subscription.receive(1.0) for _ in range(4)]
+    eventually(lambda: subscription.dropped - dropped == 6)
+    received = [subscription.receive(60) for _ in range(4)]
     assert [message.meta["n"] for _, message in received] == [6, 7, 8, 9]
     assert {key for key, _ in received} == {KEYS.log("event", "learner", "0")}
     assert subscription.receive(0.05) is None
@@ -259,11 +253,11 @@ def test_tokens_show_who_is_there(pair):
     seen = []
     client.declare_alive(early)
     server.watch_alive(KEYS.everyone, lambda key, alive: seen.append((key, alive)))
-    wait_for(lambda: (early, True) in seen)
+    eventually(lambda: (early, True) in seen)
     client.declare_alive(late)
-    wait_for(lambda: (late, True) in seen)
+    eventually(lambda: (late, True) in seen)
     client.close()
-    wait_for(lambda: (early, False) in seen and (late, False) in seen)
+    eventually(lambda: (early, False) in seen and (late, False) in seen)
 
 
 def test_memory_copies_nothing():
@@ -271,7 +265,7 @@ def test_memory_copies_nothing():
     server, client = MemoryTransport(hub), MemoryTransport(hub)
     server.serve(KEYS.act, lambda key, message: message)
     message = Message({"x": object()})
-    assert client.query(KEYS.act, message, timeout=5) is message
+    assert client.query(KEYS.act, message, timeout=60) is message
     server.close()
     client.close()
 
@@ -324,9 +318,9 @@ def test_flows_decide_the_ports():
         ZenohTransport(connect=[f"tcp/127.0.0.1:{base}"], flows=["policy"]) as client,
     ):
         server.serve(KEYS.act, lambda key, message: message)
-        assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=5).meta == {"n": 1}
+        assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=60).meta == {"n": 1}
         with pytest.raises(TransportError, match="no flow"):
-            client.query(KEYS.rollout("a"), Message(), timeout=5)
+            client.query(KEYS.rollout("a"), Message(), timeout=60)
 
 
 def test_damaged_and_oversized_messages_are_refused():
@@ -339,12 +333,12 @@ def test_damaged_and_oversized_messages_are_refused():
         session = client._session(KEYS.act)
         whole = encode(Message({"x": np.zeros(8)}))
         for payload in (b"", whole[:-1], b"\xff" * 8 + whole[8:], whole[:-1] + b"\x01"):
-            reply = next(iter(session.get(KEYS.act, payload=payload, timeout=5.0)))
+            reply = next(iter(session.get(KEYS.act, payload=payload, timeout=60)))
             assert reply.err is not None and b"message" in reply.err.payload.to_bytes().lower()
         assert len(damaged) == 4 and "checksum" in damaged[3]
         # Zenoh drops what is longer than the receiver takes, and the link goes on.
         assert not [r for r in session.get(KEYS.act, payload=bytes(2 << 20), timeout=0.5) if r.ok]
-        assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=5).meta == {"n": 1}
+        assert client.query(KEYS.act, Message(meta={"n": 1}), timeout=60).meta == {"n": 1}
         with pytest.raises(CongraspError, match="the limit is 1048576"):
             server.publish(KEYS.log("rollout", "actor", "a"), Message({"x": np.zeros(1 << 20)}))
         assert isinstance(session, zenoh.Session)
@@ -362,8 +356,8 @@ def test_peer_that_comes_back_is_found_again():
         with ZenohTransport(listen=[endpoint]) as server:
             server.serve(KEYS.act, lambda key, message: message)
             server.watch_alive(KEYS.everyone, lambda key, alive: seen.append(alive))
-            wait_for(lambda: _answers(client, KEYS.act))
-            wait_for(lambda: seen == [True])
+            eventually(lambda: _answers(client, KEYS.act))
+            eventually(lambda: seen == [True])
 
 
 BUSY_PROCESS = """
@@ -379,11 +373,11 @@ BUSY_PROCESS = """
     client.declare_alive(keys.alive("actor", "a", "01"))
     subscription = server.subscribe(keys.logs, depth=1)
     client.publish(keys.log("event", "actor", "a"), Message())
-    client.query(keys.act, Message(), timeout=5)
+    client.query(keys.act, Message(), timeout=60)
     def ask():
         while True:
             with contextlib.suppress(Exception):
-                client.query(keys.act, Message(), timeout=5)
+                client.query(keys.act, Message(), timeout=60)
     for _ in range(3):
         threading.Thread(target=ask, daemon=True).start()
     print("ready", flush=True)
@@ -422,5 +416,13 @@ def test_admission_sends_requests_away_unread(pair):
         lambda key, request: Message(meta={"read": True}),
         admission=lambda key: Message(meta={"later": key}) if key.endswith("/b") else None,
     )
-    assert client.query(KEYS.ticket("a"), Message(), timeout=5).meta == {"read": True}
-    assert client.query(KEYS.ticket("b"), Message(), timeout=5).meta == {"later": KEYS.ticket("b")}
+    assert client.query(KEYS.ticket("a"), Message(), timeout=60).meta == {"read": True}
+    assert client.query(KEYS.ticket("b"), Message(), timeout=60).meta == {"later": KEYS.ticket("b")}
+
+
+def test_a_listener_leaves_files_free_for_its_threads_whatever_the_limit_is(monkeypatch):
+    """Zenoh panics in a process that has no file left."""
+    monkeypatch.setattr(zenoh_session.resource, "getrlimit", lambda kind: (1024, 1024))
+    settings = zenoh_session.configuration("policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None)
+    taken = [int(settings.get_json(f"transport/unicast/{name}")) for name in ("accept_pending", "max_sessions")]
+    assert taken == [256, 256]

@@ -5,7 +5,6 @@ import pathlib
 import shutil
 import subprocess
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from congrasp.services.ops.audit import audit
 from congrasp.services.record.reader import read_metrics
 from congrasp.services.record.recorder import Recorder
 from tests.learner.test_process import CONFIG, MadeUpActor
+from tests.waits import eventually
 
 
 @pytest.fixture
@@ -44,13 +44,6 @@ def fill(place: pathlib.Path) -> pathlib.Path:
     return filler
 
 
-def eventually(look):
-    deadline = time.monotonic() + 30.0
-    while not look():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
 def publish_noise(transport):
     """More metrics than fit into what is left of a page."""
     noise = {str(i): value for i, value in enumerate(np.random.default_rng().normal(size=500))}
@@ -58,7 +51,6 @@ def publish_noise(transport):
     transport.publish(Keys(CONFIG.name).log("metrics", "test", "0"), Message(meta=meta))
 
 
-@pytest.mark.timeout(120)
 def test_training_goes_on_over_a_full_disk(disk, tmp_path):
     config = dataclasses.replace(CONFIG, updates=12, checkpoint_every=2)
     run_dir = disk / "run"
@@ -117,7 +109,6 @@ def test_a_journal_says_how_many_lines_a_full_disk_cost_it(disk):
     assert (journal_lines.lost, journal_lines.damaged) == (400 - len(before), 0)
 
 
-@pytest.mark.timeout(120)
 def test_a_run_that_cannot_leave_its_last_checkpoint_says_so(disk):
     config = dataclasses.replace(CONFIG, updates=3, checkpoint_every=2)
     create_run(disk / "run", config)

@@ -23,7 +23,6 @@ from congrasp.learner.hub.staleness import StalenessManager
 from tests.benchmarks.attacks import attacked, throttled
 from tests.cluster import A, B, D, T, bundle, rollout
 
-pytestmark = pytest.mark.timeout(120)
 KEYS = Keys("r")
 ANSWER = Message({"q_target": np.zeros(5_000, np.float32)})
 

@@ -9,8 +9,6 @@ import pytest
 from tests.attackers import ATTACKS
 from tests.cluster import ROOT, Cluster
 
-pytestmark = pytest.mark.timeout(120)
-
 
 @pytest.fixture
 def cluster(tmp_path):

@@ -7,6 +7,7 @@ import dataclasses
 import pathlib
 import sys
 import threading
+import time
 import zlib
 
 from congrasp.common.config import NetworkConfig, PPOConfig, RunConfig
@@ -27,9 +28,15 @@ CONFIG = RunConfig(
 )
 
 
+def end_slowly(text: str) -> None:
+    """Ends the process as on a busy machine, where JAX has the time to abort it before."""
+    time.sleep(1.0)
+    end_process(text)
+
+
 def main() -> None:
     rank, count, port, run_dir, goal, mode = sys.argv[1:]
-    ranks = Ranks.join(int(rank), int(count), f"127.0.0.1:{port}")
+    ranks = Ranks.join(int(rank), int(count), f"127.0.0.1:{port}", end_slowly)
     broker = MemoryHub()
     actor = MadeUpActor(MemoryTransport(broker), f"actor-{rank}", seed=int(rank))
     with MemoryTransport(broker) as transport:

@@ -75,7 +75,6 @@ class ToyActor(threading.Thread):
             self.outcomes.append(link.upload(Message(arrays, meta), ticket))
 
 
-@pytest.mark.timeout(120)
 def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypatch):
     """Wire check, warm-up, updates, checkpoint, resume and publication follow from its four members alone."""
     monkeypatch.setitem(ALGORITHMS, "a2c", A2C)
@@ -134,7 +133,6 @@ jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4)
 """
 
 
-@pytest.mark.timeout(120)
 def test_its_batch_is_divided_between_two_devices():
     environment = {
         **os.environ,

@@ -161,7 +161,6 @@ np.testing.assert_allclose(two.observation.mean, one.observation.mean, atol=1e-5
 """
 
 
-@pytest.mark.timeout(120)
 def test_its_batch_is_divided_between_two_devices(teacher):
     environment = {
         **os.environ,

@@ -50,7 +50,6 @@ def learn(run_dir, hub, config=CONFIG, stop_event=None, **options) -> PolicyBund
         return run_learner(run_dir, config, transport, stop_event=stop_event or threading.Event(), **options)
 
 
-@pytest.mark.timeout(120)
 def test_a_run_from_beginning_to_end(tmp_path, hub):
     create_run(tmp_path, CONFIG)
     logs = MemoryTransport(hub).subscribe(Keys("t").logs, depth=1000)
@@ -87,7 +86,6 @@ def test_a_run_from_beginning_to_end(tmp_path, hub):
     assert any("complete after 3 updates" in meta["text"] for meta in kinds["event"])
 
 
-@pytest.mark.timeout(120)
 def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
     create_run(tmp_path, CONFIG)
     actor = MadeUpActor(MemoryTransport(hub))
@@ -106,7 +104,6 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
     assert actor.versions == sorted(actor.versions)
 
 
-@pytest.mark.timeout(120)
 def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub):
     """As where they stay on a device: `audit=False`."""
     create_run(tmp_path, CONFIG)
@@ -177,7 +174,6 @@ def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path):
     assert actor.versions == sorted(actor.versions) and actor.versions[-1] > first[-1][1]
 
 
-@pytest.mark.timeout(120)
 def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(tmp_path, hub):
     """The newest checkpoint is damaged, the link gone and the version zeroed: it goes on from the one before."""
     create_run(tmp_path, CONFIG)
@@ -207,7 +203,6 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     assert (tmp_path / "policy.safetensors.aside").read_bytes() == policy
 
 
-@pytest.mark.timeout(120)
 def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a_row(tmp_path, hub, monkeypatch):
     config = dataclasses.replace(CONFIG, updates=20)
     create_run(tmp_path, config)
@@ -224,7 +219,6 @@ def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a
     assert not kept & {0, 1}
 
 
-@pytest.mark.timeout(120)
 def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(tmp_path, hub, monkeypatch):
     config = dataclasses.replace(CONFIG, updates=8)
     create_run(tmp_path, config)
@@ -247,7 +241,6 @@ def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(tmp_path,
     assert np.isfinite(last.value.mean) and abs(last.value.mean) < 100
 
 
-@pytest.mark.timeout(120)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_dead_thread_ends_the_run_and_leaves_a_checkpoint(tmp_path, hub):
     create_run(tmp_path, CONFIG)
@@ -269,7 +262,6 @@ def _started(thread: threading.Thread):
     yield
 
 
-@pytest.mark.timeout(120)
 def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub):
     config = dataclasses.replace(CONFIG, updates=20, collapse_patience=3)
     create_run(tmp_path, config)
@@ -282,7 +274,6 @@ def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub):
     assert events[-1][0] == "fatal" and (tmp_path / "checkpoints" / "latest").exists()
 
 
-@pytest.mark.timeout(120)
 def test_training_goes_on_from_a_given_policy(tmp_path, hub):
     create_run(tmp_path / "one", CONFIG)
     stopped = threading.Event()

@@ -23,7 +23,6 @@ from congrasp.services.record.scene import EPISODE_SCHEMA
 from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
 
-pytestmark = pytest.mark.timeout(60)
 BVH = """HIERARCHY
 ROOT Hips
 {

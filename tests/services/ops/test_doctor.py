@@ -131,7 +131,6 @@ def test_certificates_are_looked_at(tmp_path):
     assert actor.fine and not observer.fine and "issue --force" in observer.text
 
 
-@pytest.mark.timeout(60)
 def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as server:

@@ -19,7 +19,6 @@ from congrasp.services.record.entries import Converter
 from congrasp.services.record.live import LiveServer
 from tests.episodes import episode
 
-pytestmark = pytest.mark.timeout(120)
 KEYS = Keys("r")
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 

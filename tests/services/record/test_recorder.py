@@ -32,21 +32,14 @@ from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
 from tests.recordings import is_complete
+from tests.waits import eventually
 
 KEYS = Keys("r")
 METRICS = KEYS.log("metrics", "learner", "0")
-pytestmark = pytest.mark.timeout(90)
 
 
 def metrics(update: int) -> Message:
     return Message({}, {"time": time.time(), "update": update, "values": {"kl": 0.1}})
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -145,11 +138,11 @@ def test_a_full_disk_stops_the_recording_alone(
     monkeypatch.setattr(LogWriter, "flush", flush_or_fail)
     with Recorder(transport, "r", tmp_path, warn=said.append, sinks=[Sink()]) as recorder:
         transport.publish(METRICS, metrics(0))
-        wait_for(lambda: bool(recorder.files) and len(list(read_records(recorder.files[0]))) == 1)
+        eventually(lambda: bool(recorder.files) and len(list(read_records(recorder.files[0]))) == 1)
         full = True
-        wait_for(lambda: bool(recorder.error))
+        eventually(lambda: bool(recorder.error))
         transport.publish(METRICS, metrics(1))
-        wait_for(lambda: len(seen) == 2)
+        eventually(lambda: len(seen) == 2)
     assert said == [recorder.error]
     assert "No space left on device" in recorder.error and "\n" not in recorder.error
     np.testing.assert_array_equal(read_metrics(tmp_path)["learner/0/kl"][0], [0])
@@ -179,7 +172,7 @@ def publish_until(transport: ZenohTransport, done: Callable[[], bool]) -> int:
         update += 1
         return done()
 
-    wait_for(step, 60.0)
+    eventually(step)
     return update
 
 
@@ -194,7 +187,7 @@ def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path: pathlib.Path)
         try:
             publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
             transport.publish(KEYS.log("episode", "actor", "a0"), episode())
-            wait_for(lambda: bool(list(read_episodes(tmp_path / "out"))))
+            eventually(lambda: bool(list(read_episodes(tmp_path / "out"))))
             process.send_signal(signal.SIGINT)
             out, errors = process.communicate(timeout=10)
         finally:
@@ -258,7 +251,7 @@ def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:
                 transport.publish(rollouts, big)
             process.send_signal(signal.SIGCONT)
             small = Message({"x": np.zeros(1, np.float32)}, {"actor": "a"})  # by which a gap shows
-            wait_for(lambda: transport.publish(rollouts, small) or min(sizes(), default=big_size) < big_size)
+            eventually(lambda: transport.publish(rollouts, small) or min(sizes(), default=big_size) < big_size)
             process.send_signal(signal.SIGINT)
             _, errors = process.communicate(timeout=10)
         finally:

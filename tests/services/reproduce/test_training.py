@@ -39,7 +39,6 @@ def scripts(monkeypatch):
     assert all(child.process.poll() is not None for child in started)
 
 
-@pytest.mark.timeout(60)
 def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tmp_path):
     chosen, started = scripts
     chosen |= {OURS.name: FAILS, GRAPSXL.name: HANGS, PHASES.name: FINISHES}
@@ -56,7 +55,6 @@ def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tm
     assert not any("--resume" in child.arguments for child in started)
 
 
-@pytest.mark.timeout(60)
 def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scripts, tmp_path):
     chosen, started = scripts
     chosen |= {OURS.name: FINISHES.replace("p.mkdir(); ", ""), GRAPSXL.name: FINISHES}

@@ -5,7 +5,6 @@ import contextlib
 import dataclasses
 import pathlib
 import threading
-import time
 import types
 from unittest import mock
 
@@ -34,10 +33,11 @@ from congrasp.services.ops.metrics import ServerMetrics, exposed
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.requests import Query
-from congrasp.services.serve.server import DEPTH, PolicyServer, follow_file, follow_run
+from congrasp.services.serve.server import DEPTH, SHARE, PolicyServer, follow_file, follow_run
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
 from tests.services.ops.test_metrics import scrape
+from tests.waits import eventually
 
 pytestmark = pytest.mark.timeout(300)
 _QUICKSTART = get_preset("quickstart")
@@ -70,7 +70,9 @@ def test_answers_are_targets_within_limits_and_continue_from_the_last(served):
     with PolicyClient(endpoint) as client:
         client.reset(episode.request)
         first, second = (client.act(episode.state) for _ in range(2))
-        assert client.health()["ready"] and client.health()["hand"] == "human"
+        health = client.health()
+        assert health["ready"] and health["hand"] == "human"
+        assert (health["queue_limit"], health["peer_limit"]) == (DEPTH, SHARE) and health["states_per_second"] > 100
     assert first.q_target.shape == (20,) and first.u_target.shape == (6,) and first.action.shape == (26,)
     assert first.version == 0 and first.active == ("The heading guides the wrist.",)
     # Targets integrate the action on the previous targets: q_tgt = q_tgt_prev + 0.1 a, within the limits.
@@ -167,9 +169,7 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
         try:
             for version in range(1, 101):
                 bundles.save(dataclasses.replace(policy, version=version), path)
-                deadline = time.monotonic() + 60
-                while watcher.health()["version"] != version:
-                    assert time.monotonic() < deadline, watcher.health()
+                eventually(lambda version=version: watcher.health()["version"] == version, 0.0)
         finally:
             swapped.set()
         for versions in asked:
@@ -260,10 +260,7 @@ def test_too_many_queries_are_refused_at_once_and_the_others_answered(served, me
         asked = [pool.submit(ask, clients[0])]
         assert entered.acquire(timeout=60)
         asked += [pool.submit(ask, client) for client in clients[1:-1]]
-        deadline = time.monotonic() + 60
-        while clients[-1].health()["queue"] < DEPTH:
-            assert time.monotonic() < deadline, "the queue never filled"
-            time.sleep(0.01)
+        eventually(lambda: clients[-1].health()["queue"] >= DEPTH)
         with pytest.raises(OverloadedError, match="Overloaded"):
             ask(clients[-1])
         assert metrics.outcomes["overloaded"] == 1
@@ -282,10 +279,7 @@ def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(serve
         ):
             policy = untrained(dataclasses.replace(CONFIG, task=other))
             bundles.save(dataclasses.replace(policy, version=99), path)
-            deadline = time.monotonic() + 60
-            while words not in client.health()["trouble"]:
-                assert time.monotonic() < deadline, client.health()
-                time.sleep(0.05)
+            eventually(lambda words=words: words in client.health()["trouble"])
             assert client.health()["version"] == version
 
 

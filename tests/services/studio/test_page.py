@@ -4,7 +4,7 @@ import io
 import json
 import pathlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from congrasp.services.studio.training import TrainingWindow
 from tests import studio as made_up
 from tests.episodes import older
 from tests.studio import BEGIN, DIP
+from tests.waits import eventually
 
 pytestmark = pytest.mark.timeout(240)
 REFERENCE = pathlib.Path(__file__).with_name("first_picture.png")
@@ -67,14 +68,6 @@ def opened(page: Any, site: Site) -> Any:
     page.goto(site.server.url)
     page.wait_for_selector("body[data-first-picture]")
     return page
-
-
-def eventually(what: Callable[[], Any], seconds: float = 60.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (found := what()):
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.02)
-    return found
 
 
 def picture(page: Any) -> np.ndarray:

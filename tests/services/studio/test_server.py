@@ -4,8 +4,10 @@ import http.client
 import io
 import json
 import pathlib
+import socket
 import threading
 import time
+import urllib.parse
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,6 +22,7 @@ from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
 from congrasp.services.studio import files
 from congrasp.services.studio.catalogue import Uploads
+from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
 from tests import studio as made_up
@@ -46,9 +49,7 @@ class Page:
         return json.loads(found)
 
     def wait(self) -> dict[str, Any]:
-        deadline = time.monotonic() + 30
         while (job := json.loads(self.ask("GET", "/api/job")[1]))["running"]:
-            assert time.monotonic() < deadline
             time.sleep(0.02)
         return job
 
@@ -80,6 +81,9 @@ def test_other_sites_are_turned_away(page: Page) -> None:
     body = json.dumps({"action": "fill", "avoid": True}).encode()
     assert page.ask("POST", "/api/do", body, Content_Type="text/plain")[0] == 403
     assert page.ask("POST", "/api/do", body, Origin="http://evil.example")[0] == 403
+    for site in ("cross-site", "same-site"):
+        assert page.ask("GET", "/api/state", Sec_Fetch_Site=site)[0] == 403
+    assert page.ask("GET", "/api/state", Sec_Fetch_Site="same-origin")[0] == 200
     assert (
         page.ask("GET", "/api/state", Host=f"localhost:{page.port}", Origin=f"http://localhost:{page.port}")[0] == 200
     )
@@ -116,6 +120,68 @@ def test_wrong_requests_are_answered_with_a_message(page: Page, body: bytes, say
 def test_too_much_or_of_no_length_is_refused_before_it_is_read(page: Page) -> None:
     for length in (str(1 << 40), "-5", "many", "9" * 5000):
         assert page.ask("POST", "/api/upload?name=a.stl", b"", Content_Length=length)[0] == 413
+
+
+@pytest.mark.parametrize(
+    ("header", "code"),
+    [
+        ("Origin: http://evil.example", 403),
+        ("Sec-Fetch-Site: cross-site", 403),
+        ("Content-Type: text/plain", 403),
+        ("Host: evil.example", 403),
+        ("X-Nothing: else", 404),
+    ],
+)
+def test_a_refused_request_is_answered_before_its_body_comes(page: Page, header: str, code: int) -> None:
+    right = f"Host: 127.0.0.1:{page.port}", "Content-Type: application/json", f"Content-Length: {128 << 20}"
+    lines = [line for line in right if line.partition(":")[0] not in header] + [header]
+    with socket.create_connection(("127.0.0.1", page.port), timeout=10) as connection:
+        connection.sendall("\r\n".join(["POST /api/none HTTP/1.1", *lines, "", ""]).encode())
+        assert connection.recv(1 << 16).startswith(f"HTTP/1.1 {code} ".encode())
+
+
+@pytest.mark.parametrize("host", ["", "Host:\r\n", "Host:  \r\n"])
+def test_a_request_for_no_host_is_refused_on_every_interface(host: str) -> None:
+    server = PageServer({"/api/state": lambda query: {}}, {}, "0.0.0.0", 0)
+    try:
+        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
+            connection.sendall(f"GET /api/state HTTP/1.1\r\n{host}\r\n".encode())
+            assert connection.recv(1 << 16).startswith(b"HTTP/1.1 403 ")
+    finally:
+        server.close()
+
+
+def test_hands_are_known_by_name_and_no_file_is_opened(page: Page, tmp_path: pathlib.Path) -> None:
+    file = pathlib.Path(__file__).parents[2] / "hands" / "claw.json"
+    assert b"skin_points" in page.ask("GET", "/api/hand?name=allegro")[1]
+    assert b"skin_points" in page.ask("GET", "/api/hand?name=human")[1]
+    assert b"no hand that a message can name" in page.ask("GET", f"/api/hand?name={file}")[1]
+    text = urllib.parse.quote(file.read_text())
+    assert b"skin_points" in page.ask("GET", f"/api/hand?name={text}")[1]  # as a motion of it does
+
+
+def test_paint_of_no_colour_leaves_the_studio_working(page: Page) -> None:
+    found = page.ask("POST", "/api/do", b'{"action": "paint", "points": [[0, 0, 0]], "radius": 0.01, "avoid": NaN}')
+    assert found[0] == 200 and page.ask("GET", "/api/state")[0] == 200
+    page.do("fill", avoid=False)
+
+
+def test_what_no_page_asks_is_a_bad_request(tmp_path: pathlib.Path) -> None:
+    made_up.record(tmp_path, [(made_up.BEGIN, 1)])
+    session = made_up.session(recordings=Recordings(tmp_path))
+    server = PageServer(session.gets, session.posts, "127.0.0.1", 0)
+    page = Page(server.port)
+    try:
+        for name in ("..", "a/..", "a%00.stl", "a%0A.stl", "a" * 300, "%F0%9F%8D%90" * 64):
+            code, found = page.ask("POST", f"/api/upload?name={name}", b"solid")
+            assert (code, "is no name of a file" in json.loads(found)["error"]) == (400, True), name
+        for time_ in ("nan", "inf", "-inf", "1e300", "-1"):
+            assert page.ask("GET", f"/api/episodes?time={time_}&seconds=1")[0] == 400, time_
+        assert page.ask("GET", f"/api/episodes?time={made_up.BEGIN}&seconds=nan")[0] == 400
+        assert len(json.loads(page.ask("GET", f"/api/episodes?time={made_up.BEGIN}&seconds=1")[1])["episodes"]) == 1
+    finally:
+        server.close()
+        session.close()
 
 
 def test_an_object_weighs_what_it_is_said_to(page: Page, grasping: made_up.MadeUpGrasping) -> None:
