@@ -28,7 +28,7 @@ def body() -> trimesh.Trimesh:
             (0, 0),
             _arc(RADIUS - foot, foot, foot, quarter - np.pi / 2),
             (RADIUS, 0.5 * HEIGHT),
-            (RADIUS, HEIGHT - BAND_WIDTH - 1e-4),
+            (RADIUS, HEIGHT - BAND_WIDTH - 0.004),
             (RADIUS, HEIGHT - BAND_WIDTH),
             _arc(RADIUS - WALL / 2, HEIGHT - WALL / 2, WALL / 2, lip),
             (inner, floor + foot),
