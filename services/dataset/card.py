@@ -96,5 +96,5 @@ Columns, with shapes, units and frames, are in `card.json` and in the schema of 
 
 
 def _kept(keep: list[str]) -> str:
-    """Which episodes are in the files."""
+    """Sentence on the episodes that are in the files."""
     return f"The files hold those that are {' and '.join(keep)}." if keep else "The files hold all of them."

@@ -58,7 +58,7 @@ class Recipe:
     objects: Sequence[ObjectAt]
     """Of different names."""
     options: ImportOptions
-    """How meshes become objects."""
+    """Options of the import of meshes."""
     per_object: int
     """Episodes of each object, evenly over the constraints."""
     constraints: tuple[str, ...]
@@ -87,7 +87,7 @@ class Recipe:
 
     @functools.cached_property
     def about(self) -> dict[str, Any]:
-        """What every shard says of the dataset, as JSON has it; equal for datasets with equal contents."""
+        """Description of the dataset in every shard, as JSON; equal for datasets with equal contents."""
         contents = json.dumps(
             [dataclasses.asdict(dataclasses.replace(self.options, cache_dir="")), [at.digest() for at in self.objects]]
         )

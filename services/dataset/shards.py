@@ -32,7 +32,7 @@ class Shards(NamedTuple):
             write_atomically(self.file(kind, number), buffer.getvalue())
 
     def finished(self, about: Mapping[str, Any]) -> dict[int, dict[str, Any]]:
-        """What the finished shards say of themselves, by their numbers.
+        """Returns the descriptions of the finished shards by their numbers.
 
         Raises:
           CongraspError: the folder holds a shard of another dataset than `about` describes, or a damaged one.
@@ -51,7 +51,7 @@ class Shards(NamedTuple):
 
 
 def _said(path: pathlib.Path) -> dict[str, Any]:
-    """What a shard's metadata say."""
+    """Returns the description in a shard's metadata."""
     try:
         said = json.loads(pq.read_schema(path).metadata[b"congrasp"])
     except (OSError, ValueError, LookupError, TypeError) as error:
