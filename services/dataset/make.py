@@ -142,7 +142,8 @@ def make(
     with contextlib.ExitStack() as stack:
         running: Episodes | None = None
         for pool in stack.enter_context(one_ahead(prepared(hand, task, pools, recipe.seed, wanted, True))):
-            columns, counts = grasp_columns(hand, task), {}
+            columns = grasp_columns(hand, task)
+            counts: dict[str, collections.Counter[str]] = {}
             rows = [{column.name: np.zeros((0, *column.shape), column.kind) for column in columns}]
             if pool.bank is not None:
                 if running is None:
