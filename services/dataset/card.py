@@ -30,7 +30,7 @@ def write_card(shards: Shards, about: Mapping[str, Any], facts: Mapping[str, Any
     card = {
         **about,
         **facts,
-        "shards": {"finished": len(found), "of": shards.count},
+        "shards": {"finished": len(found), "of": shards.total},
         "left_out": sorted(name for said in found.values() for name in said["left_out"]),
         "counts": counts,
         "columns": {kind: _columns(shards, kind, found) for kind in ("grasps", "objects")},

@@ -17,12 +17,12 @@ class Shards(NamedTuple):
     """Places of the shards of one dataset."""
 
     folder: pathlib.Path
-    count: int
+    total: int
     """N, of the whole dataset, whichever of them are here."""
 
     def file(self, kind: str, number: int) -> pathlib.Path:
         """Place of a shard of `grasps` or of `objects`."""
-        return self.folder / kind / f"{number:05d}-of-{self.count:05d}.parquet"
+        return self.folder / kind / f"{number:05d}-of-{self.total:05d}.parquet"
 
     def write(self, number: int, grasps: pa.Table, objects: pa.Table) -> None:
         """Writes a shard; that of the grasps comes last, so that where it is everything is."""
