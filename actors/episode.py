@@ -63,7 +63,7 @@ def episode_message(
         **{f"goal/{name}": value for name, value in goal.flat().items()},
         **{f"active/{name}": value for name, value in goal.active.items()},
         "surface_points": surface.points,
-        "surface_minus": surface.avoid,
+        "surface_avoid": surface.avoid,
         **_geometry(obj),
     }
     return Message(

@@ -2,7 +2,7 @@
 
     import congrasp
 
-    found = congrasp.grasp("mug.obj", heading="0 0 -1", fingers="thumb index")   # a motion for an object
+    found = congrasp.grasp("mug:7", heading="above")                             # or "mug.obj": a motion for an object
     congrasp.save_motion("mug.npz", found.motion)
 
     with congrasp.PolicyClient("tcp/127.0.0.1:7457") as policy:                  # or congrasp.load_policy()

@@ -13,6 +13,7 @@ import trimesh
 RADIUS, HEIGHT, WALL = 0.040, 0.095, 0.004
 HANDLE_RADIUS, REACH, HALF = 0.0055, 0.032, 0.030
 """Of the handle: thickness, how far it stands out, and half of its height."""
+BAND_WIDTH = 0.016
 SECTIONS, SIDES, STEPS = 48, 12, 32
 GLAZE, BAND, INSIDE = (38, 84, 124), (239, 160, 75), (244, 238, 226)
 """Colours outside, around the rim, and inside."""
@@ -27,7 +28,8 @@ def body() -> trimesh.Trimesh:
             (0, 0),
             _arc(RADIUS - foot, foot, foot, quarter - np.pi / 2),
             (RADIUS, 0.5 * HEIGHT),
-            (RADIUS, HEIGHT - 0.014),
+            (RADIUS, HEIGHT - BAND_WIDTH - 1e-4),
+            (RADIUS, HEIGHT - BAND_WIDTH),
             _arc(RADIUS - WALL / 2, HEIGHT - WALL / 2, WALL / 2, lip),
             (inner, floor + foot),
             _arc(inner - foot, floor + foot, foot, -quarter),
@@ -36,9 +38,9 @@ def body() -> trimesh.Trimesh:
     )
     mesh = trimesh.creation.revolve(profile, sections=SECTIONS)
     x, y, z = mesh.vertices.T
-    outside = np.hypot(x, y) > RADIUS - WALL / 2 - 1e-6
-    colours = np.where((outside & (z > HEIGHT - 0.015))[:, None], BAND, np.where(outside[:, None], GLAZE, INSIDE))
-    colours[(z < 1e-4)] = GLAZE
+    inside = (np.hypot(x, y) < RADIUS - WALL / 2 - 1e-6) & (z > 0.0049)
+    band = ~inside & (z > HEIGHT - BAND_WIDTH - 1e-6)
+    colours = np.where(inside[:, None], INSIDE, np.where(band[:, None], BAND, GLAZE))
     mesh.visual.vertex_colors = colours.astype(np.uint8)
     return mesh
 

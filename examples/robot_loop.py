@@ -30,6 +30,7 @@ from congrasp.common.objects.pool import scale_objects
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.transport.ports import local_url
+from congrasp.services.ops.logs import announced
 from congrasp.services.serve.load import example_episode, wait_until_ready
 
 BUFFER = 0.01
@@ -198,7 +199,8 @@ def run(arguments: Arguments) -> dict[str, object]:
     server, kills = Server(policy), 0
     try:
         client = congrasp.PolicyClient(server.url, hand=hand.name, timeout=0.2, wait=180.0)
-        wait_until_ready(client)
+        with announced("Waiting for the policy server, which compiles"):
+            wait_until_ready(client)
         period = task.control_dt
         with congrasp.Guard(
             client, limits, hand.q_open, period=period, wait=0.6 * period, fallback=arguments.fallback

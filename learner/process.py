@@ -361,7 +361,7 @@ class _Learner:
         self._hub.publish_weights(self.bundle().to_message(), self.version)
         if self._ranks.rank:
             return
-        meta = {"version": self.version, "epoch": self._run_id, "schema": self._spec.schema}
+        meta = {"version": self.version, "run_id": self._run_id, "schema": self._spec.schema}
         self._log("version", {**meta, "update": self._state.version, "transitions": self._state.transitions})
 
     def _skip_lost_versions(self, version: int, newest: int) -> int:

@@ -46,7 +46,7 @@ def send_nonsense(transport: Transport, keys: Keys) -> None:
         name = f"{IDENTITY}.{number % 50}"
         arrays = RolloutForm(20, 16, 32, 4, half=True).zeros()
         arrays["reward" if number % 2 else "made/up"] = np.full((20, 16), np.nan, np.float32)
-        meta = {"actor": name, "incarnation": "1", "sequence": number, "version": 0, "epoch": "e", "schema": "s"}
+        meta = {"actor": name, "incarnation": "1", "sequence": number, "version": 0, "run_id": "e", "schema": "s"}
         _ask(transport, keys.rollout(name), Message(arrays, {**meta, "steps": 320, "ticket": "t"}))
 
 

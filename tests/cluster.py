@@ -40,11 +40,11 @@ BATCH = 2
 _PATIENCE = 60.0  # seconds, on a machine that does much else
 
 
-def bundle(version, epoch):
+def bundle(version, run_id):
     arrays = {f"{kind}/{name}": np.zeros(shape) for kind, shape in (("observation", D), ("value", ()))
               for name in ("mean", "m2")}  # fmt: skip
     arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": np.zeros(1000, np.float32)}
-    meta = {"version": version, "epoch": epoch, "schema": "s", "hand": "human", "layout": [], "action_size": A}
+    meta = {"version": version, "run_id": run_id, "schema": "s", "hand": "human", "layout": [], "action_size": A}
     return Message(arrays, {**meta, "format": 1})
 
 
@@ -60,7 +60,7 @@ def rollout(steps, value, version):
 # --- the two roles ---
 
 
-def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0, write_ahead=True):
+def run_learner(folder, endpoint, *, run_id="e", steps=T, every=1, pause=0.0, write_ahead=True):
     """Consumes batches and checkpoints after `every` updates, until it is told to stop (SIGTERM) or killed."""
     path = folder / "checkpoint"
     saved = json.loads(path.read_text()) if path.exists() else {"durable": None, "history": [], "version": 0}
@@ -72,13 +72,13 @@ def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0, wri
     signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
     with urls.listen(endpoint, "learner") as transport:
         hub = LearnerHub(
-            transport, run="chaos", config_json="{}", run_id=epoch, schema="s",
+            transport, run="chaos", config_json="{}", run_id=run_id, schema="s",
             form=RolloutForm(steps, B, D, A, half=True), staleness=StalenessManager(1, BATCH),
             durable=saved["durable"], audit=AuditLog(folder, "0"),
             log=WriteAheadLog(folder / FOLDER / "0", 1, write=write_ahead),
         )  # fmt: skip
         save(published, version)
-        hub.publish_weights(bundle(version, epoch), version)
+        hub.publish_weights(bundle(version, run_id), version)
         print("ready", flush=True)
         updates = 0
         while not stopped:
@@ -93,7 +93,7 @@ def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0, wri
             time.sleep(pause)
             version, updates = version + 1, updates + 1
             save(published, version)
-            hub.publish_weights(bundle(version, epoch), version)
+            hub.publish_weights(bundle(version, run_id), version)
             if updates % every == 0:
                 durable = hub.durable()
                 save(path, {"durable": durable, "history": history, "version": version})
@@ -101,7 +101,7 @@ def run_learner(folder, endpoint, *, epoch="e", steps=T, every=1, pause=0.0, wri
         hub.finish()
         time.sleep(0.5)  # actors hear of it; what is on its way still comes in
         hub.close()
-        save(folder / "final", {"history": history, "ledger": hub.status()["ledger"], "version": version})
+        save(folder / "final", {"history": history, "counters": hub.status()["counters"], "version": version})
 
 
 def save(path, content):

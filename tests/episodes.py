@@ -84,7 +84,7 @@ def episode(
         "visual_vertices": np.asarray(mesh.vertices, np.float32),
         "visual_faces": np.asarray(mesh.faces, np.int32),
         "surface_points": points,
-        "surface_minus": points[:, 2] > HEIGHT / 4,
+        "surface_avoid": points[:, 2] > HEIGHT / 4,
     }
     meta = {
         "hand": "human",

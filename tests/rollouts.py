@@ -18,7 +18,9 @@ def random_arrays(form: RolloutForm, seed: int = 0) -> dict[str, np.ndarray]:
     }
 
 
-def rollout(actor: str = "a", incarnation: str = "1", sequence: int = 0, version: int = 0, epoch: str = "e") -> Message:
+def rollout(
+    actor: str = "a", incarnation: str = "1", sequence: int = 0, version: int = 0, run_id: str = "e"
+) -> Message:
     """A rollout in which one episode ended."""
     arrays = {**random_arrays(FORM, sequence), "episode/success": np.ones(1, np.float32)}
     meta = {
@@ -26,18 +28,18 @@ def rollout(actor: str = "a", incarnation: str = "1", sequence: int = 0, version
         "incarnation": incarnation,
         "sequence": sequence,
         "version": version,
-        "epoch": epoch,
+        "run_id": run_id,
         "schema": SCHEMA,
         "steps": FORM.steps * FORM.worlds,
     }
     return Message(arrays, meta)
 
 
-def bundle(version: int, epoch: str = "e") -> Message:
+def bundle(version: int, run_id: str = "e") -> Message:
     """A policy bundle with one array."""
     meta = {
         "version": version,
-        "epoch": epoch,
+        "run_id": run_id,
         "schema": SCHEMA,
         "hand": "human",
         "layout": [],

@@ -79,9 +79,9 @@ def status(actors: int, version: int = 12) -> dict[str, Any]:
     ]  # fmt: skip
     ledger = {"granted": 3, "running": 1, "redeemed": 2, "returned": 0, "expired": 0}
     return {
-        "run": "made-up", "version": version, "epoch": "e", "finished": False, "roles": roles, "warnings": [],
+        "run": "made-up", "version": version, "run_id": "e", "finished": False, "roles": roles, "warnings": [],
         "rates": {"rollouts_per_second": 50.0, "steps_per_second": 123456.0},
-        "queue": {"length": 1, "limit": 4}, "ledger": ledger,
+        "queue": {"length": 1, "limit": 4}, "counters": ledger,
     }  # fmt: skip
 
 

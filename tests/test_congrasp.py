@@ -1,8 +1,10 @@
 """The public face: every name is there, is imported when it is used, and the client needs numpy and zenoh alone."""
 
 import inspect
+import re
 import subprocess
 import sys
+import textwrap
 
 import numpy as np
 import pytest
@@ -65,3 +67,10 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
     assert congrasp.load_motion(str(tmp_path / "block.npz")).object == "block"
     with pytest.raises(congrasp.UnknownConstraintError, match="does not support the constraint 'fingers'"):
         congrasp.grasp(mesh, fingers="thumb index", attempts=4, policy=paper_policy)
+
+
+def test_the_first_example_of_grasp_runs_on_the_policy_that_comes_with_congrasp(capsys: pytest.CaptureFixture) -> None:
+    assert congrasp.grasp.__doc__ is not None
+    example = congrasp.grasp.__doc__.partition("Example:")[2].partition("Args:")[0]
+    exec(textwrap.dedent(example.strip("\n")), {})
+    assert re.fullmatch(r"True [1-8] of 8 attempts hold it\n", capsys.readouterr().out)

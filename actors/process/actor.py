@@ -303,9 +303,9 @@ class _Since(NamedTuple):
     """Times of one rollout, on the monotonic clock."""
 
     asked: float
-    """When the actor requested a ticket."""
+    """Time at which the actor requested a ticket."""
     granted: float
-    """When it received one and continued with the newest weights."""
+    """Time at which it received one and continued with the newest weights."""
 
 
 def buffer_occupancy(occupancy: np.ndarray) -> dict[str, float]:

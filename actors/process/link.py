@@ -118,7 +118,7 @@ class ActorLink:
           TransportError: the learner did not answer within `timeout` seconds.
         """
         reply = self._ask(self.keys.config, {}, time.monotonic() + timeout)
-        config, run_id, schema = (str(reply.meta[name]) for name in ("config", "epoch", "schema"))
+        config, run_id, schema = (str(reply.meta[name]) for name in ("config", "run_id", "schema"))
         self._info = RunInfo(config, run_id, schema, tuple(reply.meta["arrays"]))
         self._note(reply.meta)
         self._uploads.start_over()
@@ -175,7 +175,7 @@ class ActorLink:
         if newer_than >= 0 and (newer_than, self._held_session) == self._learner:
             return None
         session = self._learner[1]
-        request = Message(meta={"newer_than": newer_than, "life": self._held_session})
+        request = Message(meta={"newer_than": newer_than, "session_id": self._held_session})
         try:
             reply = self._transport.query(self._weights_key, request, timeout=self._timeout)
         except TransportError:
@@ -184,8 +184,8 @@ class ActorLink:
             self._note(reply.meta)
             self._check()
             return None
-        if self._info and reply.meta.get("epoch") != self._info.run_id:
-            self._uploads.failure = _restarted(self._info.run_id, reply.meta.get("epoch"))
+        if self._info and reply.meta.get("run_id") != self._info.run_id:
+            self._uploads.failure = _restarted(self._info.run_id, reply.meta.get("run_id"))
         self._check()
         self._held_session = session
         return reply
@@ -214,7 +214,7 @@ class ActorLink:
             **rollout.meta,
             **self._identity(ticket.id),
             "sequence": next(self._sequence),
-            "epoch": self._info.run_id,
+            "run_id": self._info.run_id,
         }
         message = SharedMessage(rollout.arrays, meta)
         if self._journal is not None:
@@ -252,10 +252,10 @@ class ActorLink:
     def _note(self, meta: Any) -> None:
         """Records the learner's state, which comes with every reply and announcement."""
         self._answered = time.monotonic()
-        self._learner = int(meta["version"]), str(meta["life"])
+        self._learner = int(meta["version"]), str(meta["session_id"])
         self._finished = bool(meta["finished"])
-        if self._info and meta["epoch"] != self._info.run_id:
-            self._uploads.failure = _restarted(self._info.run_id, meta["epoch"])
+        if self._info and meta["run_id"] != self._info.run_id:
+            self._uploads.failure = _restarted(self._info.run_id, meta["run_id"])
 
     def _follow(self) -> None:
         """Receives announcements in the background."""

@@ -140,7 +140,11 @@ class Uploads:
                 outcome = reply.meta["outcome"]
                 if outcome != "retry" and self._journal is not None:
                     who = {name: message.meta[name] for name in ("actor", "incarnation")}
-                    answer = {"answer": message.meta["sequence"], "outcome": outcome, "life": reply.meta["life"]}
+                    answer = {
+                        "answer": message.meta["sequence"],
+                        "outcome": outcome,
+                        "session_id": reply.meta["session_id"],
+                    }
                     self._journal.write(**who, **answer)
                 if outcome == "refused":
                     return self._refused(str(reply.meta["why"]))

@@ -113,20 +113,26 @@ def _palm(skeleton: Skeleton) -> list[Cone]:
     """Cones of metacarpals, wrist and the ball of the thumb."""
     mine = skeleton.capsule_link == 0
     metacarpals, radii = skeleton.capsules[mine], skeleton.radii[mine]
-    thumb, *others = (_of_link(skeleton, chain[0]) for chain in skeleton.chains())
-    root = metacarpals[:, 0].mean(0)
-    back = root - np.mean([start for start, _ in others], 0)
-    back = _WRIST * _unit(back)
+    thumb = _of_link(skeleton, skeleton.chains()[0][0])
+    centres, widest, back = wrist_circles(skeleton)
     palm = []
-    for (start, end), radius in zip(metacarpals, radii, strict=True):
+    for (start, end), radius, wide, last in zip(metacarpals, radii, centres, widest, strict=True):
         palm.append(Cone(start, end, (radius, radius), (0,)))
-        wide = root + _WIDTH * (start - root)
-        palm.append(Cone(wide - 0.2 * back, wide + back, (1.1 * radius, 1.3 * radius), (0,)))
+        palm.append(Cone(wide - 0.2 * _WRIST * back, wide + _WRIST * back, (1.1 * radius, last), (0,)))
     start, end = min(metacarpals, key=lambda ends: float(np.linalg.norm(ends.mean(0) - thumb[1])))
     for near, far, first, last in _BALL:
         along = start + near * (end - start), thumb[0] + far * (thumb[1] - thumb[0])
         palm.append(Cone(*along, (first, last), (0, skeleton.chains()[0][0])))
     return palm
+
+
+def wrist_circles(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres (n, 3) and radii (n,) of circles that a wrist's end is about, and the unit direction (3,) to its back."""
+    mine = skeleton.capsule_link == 0
+    starts = skeleton.capsules[mine, 0]
+    root = starts.mean(0)
+    knuckles = [_of_link(skeleton, chain[0])[0] for chain in skeleton.chains()[1:]]
+    return root + _WIDTH * (starts - root), 1.3 * skeleton.radii[mine], _unit(root - np.mean(knuckles, 0))
 
 
 def _of_link(skeleton: Skeleton, link: int) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 import trimesh
 
 from congrasp.common import mirror
+from congrasp.common.hands.dress import nails, sleeve
 from congrasp.common.hands.flesh import Surface, flesh
 from congrasp.common.hands.left import right_name
 from congrasp.common.hands.meshes import Meshes, own_meshes
@@ -19,6 +20,8 @@ from congrasp.common.hands.spec import Hand, Link, link_origin
 
 HUMAN_HANDS = ("human", "mano")
 """Names of hands with flesh."""
+MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
+"""What a surface is made of."""
 _LARGEST = 0.5  # m
 _SECTIONS = 20  # bevel of a housing
 _BEVEL = 0.45  # length of a housing's ends, in radii
@@ -38,10 +41,13 @@ class Skin(NamedTuple):
     """(V, L) float32, at most four nonzero for each point; rows sum to one."""
     origins: np.ndarray
     """(L, 3) origins of the links' frames, whose axes are parallel to the wrist's."""
-    flesh: bool
-    """True for a human hand."""
-    joint: np.ndarray
-    """(V,) bool: part of a robot's joint, drawn darker by viewers."""
+    material: np.ndarray
+    """(V,) int, of each point: its index in `MATERIALS`. The points of a triangle have the same."""
+
+    def parts(self) -> dict[str, np.ndarray]:
+        """Faces (n, 3) of each material that there is."""
+        of_face = self.material[self.faces[:, 0]]
+        return {name: self.faces[of_face == i] for i, name in enumerate(MATERIALS) if (of_face == i).any()}
 
     def influences(self) -> tuple[np.ndarray, np.ndarray]:
         """Links (V, 4) int with the greatest weights of each point, and the weights (V, 4); link 0 if unused."""
@@ -77,20 +83,23 @@ def skin_on(skeleton: Skeleton) -> Skin:
         own = _mirrored(skeleton, ("origins", "capsules", "anchors"))
         skin = skin_on(skeleton._replace(hand=right, axes=mirror.axial(skeleton.axes), **own))
         return skin._replace(faces=skin.faces[:, ::-1].copy(), **_mirrored(skin, ("points", "normals", "origins")))
-    human = skeleton.hand in HUMAN_HANDS and _anatomical(skeleton)
-    if human:
-        surface = flesh(skeleton)
-        joint = np.zeros(len(surface.points), bool)
+    if skeleton.hand in HUMAN_HANDS and _anatomical(skeleton):
+        kinds = ("flesh", flesh(skeleton)), ("sleeve", sleeve(skeleton)), *(("nail", nail) for nail in nails(skeleton))
+        material = np.concatenate([np.full(len(part.points), MATERIALS.index(kind)) for kind, part in kinds])
+        firsts = np.cumsum([0, *(len(part.points) for _, part in kinds)])
+        faces = [part.faces + first for (_, part), first in zip(kinds, firsts, strict=False)]
+        points, normals, weights = (np.concatenate([part[k] for _, part in kinds]) for k in (0, 1, 3))
+        surface = Surface(points, normals, np.concatenate(faces), weights)
     else:
         surface, joint = _housings(skeleton)
+        material = np.where(joint, MATERIALS.index("joint"), MATERIALS.index("link"))
     return Skin(
         surface.points.astype(np.float32),
         surface.normals.astype(np.float32),
         surface.faces.astype(np.int32),
         surface.weights.astype(np.float32),
         skeleton.origins,
-        human,
-        joint,
+        material,
     )
 
 
@@ -115,8 +124,7 @@ def skin_of_meshes(hand: Hand, meshes: Meshes) -> Skin:
         faces=np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]).astype(np.int32),
         weights=np.eye(len(parts), dtype=np.float32)[np.repeat(np.arange(len(parts)), counts)],
         origins=np.array([link_origin(link) for link in hand.links]),
-        flesh=False,
-        joint=np.zeros(sum(counts), bool),
+        material=np.full(sum(counts), MATERIALS.index("link")),
     )
 
 

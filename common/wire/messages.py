@@ -47,14 +47,14 @@ ROLLOUT = MessageSpec(
         "incarnation": str,
         "sequence": int,
         "version": int,
-        "epoch": str,
+        "run_id": str,
         "schema": str,
         "steps": int,
     },
 )
 """Actor to learner: T control steps of B worlds, D observation and A action sizes, P inputs of the critic and S of a
-teacher, E finished episodes. Of the per-step arrays it holds those that the run's algorithm learns from. `epoch` is the
-run's id."""
+teacher, E finished episodes. Of the per-step arrays it holds those that the run's algorithm learns from. `run_id` is
+the run's id."""
 
 BUNDLE = MessageSpec(
     "bundle",
@@ -71,7 +71,7 @@ BUNDLE = MessageSpec(
         "value/m2": ArraySpec(REAL, ()),
         "value/count": ArraySpec(REAL, ()),
     },
-    {"version": int, "epoch": str, "schema": str, "hand": str, "layout": list, "action_size": int, "format": int},
+    {"version": int, "run_id": str, "schema": str, "hand": str, "layout": list, "action_size": int, "format": int},
 )
 """Learner to all: weights and normalisers of one version."""
 
@@ -103,7 +103,7 @@ EPISODE = MessageSpec(
         "colour_points": ArraySpec(REAL, ("P", 3), optional=True),
         "colour_values": ArraySpec(("uint8",), ("P", 3), optional=True),
         "surface_points": ArraySpec(REAL, ("N", 3)),
-        "surface_minus": ArraySpec(("bool",), ("N",)),
+        "surface_avoid": ArraySpec(("bool",), ("N",)),
     },
     {"hand": str, "object": str, "control_dt": float, "version": int, "actor": str, "success": bool, "metrics": dict},
 )
@@ -112,9 +112,9 @@ EPISODE = MessageSpec(
 METRICS = MessageSpec("metrics", meta={"time": (int, float), "values": dict})
 EVENT = MessageSpec("event", meta={"time": (int, float), "level": str, "text": str})
 TICKET = MessageSpec("ticket request", meta={"actor": str, "incarnation": str, "ticket": str})
-ANNOUNCEMENT = MessageSpec("announcement", meta={"version": int, "epoch": str, "life": str})
-"""Learner to all: a new version is available. `epoch` is the run's id, which changes when training starts from scratch;
-`life` is the session's id, which changes each time the learner's process starts."""
+ANNOUNCEMENT = MessageSpec("announcement", meta={"version": int, "run_id": str, "session_id": str})
+"""Learner to all: a new version is available. `run_id` changes when training starts from scratch, `session_id` each
+time that the learner's process starts."""
 
 
 def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int]:
@@ -194,7 +194,7 @@ class RolloutHeader(NamedTuple):
     version: int
     """Version of the behaviour policy."""
     run_id: str
-    """Id of the run; the metadata entry `epoch`."""
+    """Id of the run; the metadata entry `run_id`."""
     schema: str
     steps: int
     """T*B."""

@@ -85,8 +85,8 @@ class _Link:
 class Ranks:
     """This process among the learner's ranks; by default the only one.
 
-    They agree in rounds. Each posts an entry, and all are given the list of entries, in rank order, once all are there,
-    or at once when somebody posts an urgent one (the entries that are missing are None then).
+    They agree in rounds. Each posts an entry, and all receive the list of entries, in rank order, once all are posted,
+    or at once after an urgent one (missing entries are then None).
 
     Attributes:
       rank: number of this process.
@@ -274,7 +274,7 @@ class Ranks:
                 link.send(Message(meta={"lost": what}))
         if self.rank == 0:
             time.sleep(_RELAY_SECONDS)
-        self._on_lost(f"{what.rstrip('.')}. Rank {self.rank} cannot go on alone: start all ranks with --resume.")
+        self._on_lost(f"{what.rstrip('.')}. Rank {self.rank} cannot continue alone: start all ranks with --resume.")
 
     def _beat(self) -> None:
         while not self._leaving.wait(_HEARTBEAT_SECONDS):

@@ -145,7 +145,7 @@ class LearnerHub:
           version: version of the bundle; one more than the last, except after a resume.
         """
         validate_bundle(bundle, schema=self._schema)
-        if (bundle.meta["version"], bundle.meta["epoch"]) != (version, self.run_id):
+        if (bundle.meta["version"], bundle.meta["run_id"]) != (version, self.run_id):
             raise CongraspError(f"The bundle is not version {version} of run id {self.run_id}.")
         with self._changed:
             self._bundle = SharedMessage(bundle.arrays, bundle.meta)
@@ -196,7 +196,7 @@ class LearnerHub:
                 "unlisted": self._members.unlisted,
                 "rates": _rates([steps for *_, steps in self._arrivals], span),
                 "queue": {"length": len(self._queue), "limit": self._limit},
-                "ledger": self._staleness.counters()
+                "counters": self._staleness.counters()
                 | {
                     "missing": self._sequences.missing,
                     "turned_away": self._rate_limit.turned_away + self._admission.turned_away,
@@ -274,7 +274,7 @@ class LearnerHub:
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1
-        return {"version": version, "epoch": self.run_id, "life": self.session_id, "finished": self._finished}
+        return {"version": version, "run_id": self.run_id, "session_id": self.session_id, "finished": self._finished}
 
     def _on_config(self, key: str, request: Message) -> Message:
         arrays = list(self._form.arrays)
@@ -295,7 +295,7 @@ class LearnerHub:
 
     def _on_weights(self, key: str, request: Message) -> Message:
         bundle, state = self._bundle, self._state()
-        known = request.meta.get("newer_than"), request.meta.get("life", self.session_id)
+        known = request.meta.get("newer_than"), request.meta.get("session_id", self.session_id)
         if bundle is None or known == (bundle.meta["version"], self.session_id):
             return Message(meta=state)
         return bundle

@@ -1,8 +1,8 @@
 """Rate limit of useless work by a token bucket for each actor's certificate, and exponential backoff of offenders.
 
 A request that helps training is free: a granted ticket, an accepted rollout. All others (denied, refused, stale,
-duplicate) cost tokens by size. An actor without tokens is told to retry later before its request is decoded, so that a
-flood costs the learner little and other actors nothing.
+duplicate) cost tokens by size. An actor without tokens gets the reply to retry later before its request is decoded, so
+that a flood costs the learner little and other actors nothing.
 """
 
 import collections

@@ -49,7 +49,9 @@ class AuditLog:
         Returns:
           The number of rollouts lost by undoing updates.
         """
-        self._journal.write(life=session_id, epoch=run_id, version=version, max_staleness=max_staleness, kept=kept)
+        self._journal.write(
+            session_id=session_id, run_id=run_id, version=version, max_staleness=max_staleness, kept=kept
+        )
         return len(replay(read_uses(self._path).intact)[1])
 
     def recovered(self, taken: Sequence[Identity], stale: Sequence[Identity], damaged: Sequence[Identity]) -> None:
@@ -91,8 +93,8 @@ def read_uses(path: pathlib.Path) -> JournalLines:
 
 def _is_entry(entry: dict[str, Any]) -> bool:
     """True if a line is a valid entry of an `AuditLog`."""
-    if "life" in entry:
-        return has_fields(entry, life=str, epoch=str, version=int, max_staleness=int)
+    if "session_id" in entry:
+        return has_fields(entry, session_id=str, run_id=str, version=int, max_staleness=int)
     if "used" in entry:
         return has_fields(entry, version=int) and is_rows(entry["used"], str, str, int, int, str)
     rows = [entry[name] for name in _ROWS if name in entry]
@@ -112,7 +114,7 @@ def replay(entries: Iterable[dict[str, Any]]) -> tuple[list[Used], list[Used]]:
     standing: list[tuple[int, Used]] = []
     undone: list[Used] = []
     for entry in entries:
-        if "life" in entry:
+        if "session_id" in entry:
             undone += [use for version, use in standing if version >= entry["version"]]
             standing = [(version, use) for version, use in standing if version < entry["version"]]
         for row in entry.get("used", ()):

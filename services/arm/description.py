@@ -1,4 +1,4 @@
-"""The file of an arm: its joints, limits and flange, without the gripper that it may come with."""
+"""File of an arm: its joints, limits and flange, without a gripper."""
 
 import dataclasses
 import pathlib
@@ -11,7 +11,7 @@ from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.services.assets.hands.compile import robot_spec
 
 SPEED = 3.14
-"""rad/s (m/s of slides), the limit of joints whose file has none: MJCF files never have one."""
+"""Default speed limit of joints, rad/s (m/s of slides); MJCF files never have one."""
 _SITES = ("attachment_site", "flange", "tool0", "ee_site")
 _KINDS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
@@ -22,7 +22,7 @@ class Arm:
 
     name: str
     spec: mujoco.MjSpec
-    """Its bodies and joints without a gripper, in the frame of its base."""
+    """Bodies and joints without a gripper, in the frame of the base."""
     joints: tuple[str, ...]
     """N names, base first."""
     lower: np.ndarray
@@ -34,15 +34,15 @@ class Arm:
     flange: str
     """Name of the body that carries the hand."""
     position: np.ndarray
-    """(3,) m, the flange's frame in that body's."""
+    """(3,) position of the flange in that body's frame, m."""
     quaternion: np.ndarray
-    """(4,) w x y z, the same."""
+    """(4,) w x y z, orientation of the flange in that body's frame."""
     postures: np.ndarray
     """(P, N) postures in the file's keyframes."""
 
 
 def arm_file(name: str) -> pathlib.Path:
-    """The path itself, or the file of a robot that `mujoco-menagerie` fetches.
+    """Returns the path itself, or the file of a robot fetched by `mujoco-menagerie`.
 
     Raises:
       CongraspError: there is neither such a file nor such a robot, or it cannot be fetched.
@@ -57,7 +57,7 @@ def arm_file(name: str) -> pathlib.Path:
     names = mujoco_menagerie.names()
     found = [name] if name in names else [other for other in names if name in other.split("_")]
     if len(found) != 1:
-        remedy = f"Name one of {', '.join(found)}." if found else "Name an MJCF or URDF file."
+        remedy = f"Name one of {', '.join(found)}." if found else "Pass an MJCF or URDF file."
         raise CongraspError(f"MuJoCo Menagerie has {len(found)} robots called '{name}'.", remedy)
     robot = mujoco_menagerie.get(found[0])
     try:
@@ -65,12 +65,12 @@ def arm_file(name: str) -> pathlib.Path:
     except (mujoco_menagerie.MenagerieError, OSError):
         raise CongraspError(
             f"'{found[0]}' of MuJoCo Menagerie could not be downloaded.",
-            "Connect to the internet, or name an MJCF or URDF file.",
+            "Connect to the internet, or pass an MJCF or URDF file.",
         ) from None
 
 
 def _bare_entry(names: tuple[str, ...]) -> str:
-    """The entry of a robot without scene, hand and MJX variant, as far as there is one."""
+    """Entry of a robot without scene, hand and MJX variant, if there is one."""
     return min(names, key=lambda name: ("scene" in name, "mjx" in name, "nohand" not in name, len(name)))
 
 
@@ -79,8 +79,8 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
 
     Args:
       path: MJCF or URDF.
-      flange: site or body that carries the hand; found by itself where empty.
-      speed: speed limits of the joints, one or N numbers; those of the file where empty.
+      flange: site or body that carries the hand; detected if empty.
+      speed: speed limits of the joints, one or N numbers; those of the file if empty.
 
     Raises:
       CongraspError: the file cannot be read, or has no such flange, or joints that are neither hinges nor slides.
@@ -97,7 +97,7 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
     if not joints or any(model.jnt_type[j] not in _KINDS for j in joints):
         raise CongraspError(
             f"{path} has no chain of hinges and slides from its base to '{model.body(body).name}'.",
-            "Name the arm's last body or site with --flange.",
+            "Pass the arm's last body or site with --flange.",
         )
     names = tuple(model.joint(j).name for j in joints)
     limited = model.jnt_limited[joints].astype(bool)
@@ -168,7 +168,7 @@ def _last_body(model: mujoco.MjModel) -> tuple[int, np.ndarray, np.ndarray]:
 
 
 def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
-    """Removes whatever moves beyond the flange, and all that is not kinematics."""
+    """Removes all movable parts beyond the flange, and everything but kinematics."""
     for group in (spec.keys, spec.sensors, spec.actuators, spec.equalities, spec.tendons, spec.excludes, spec.pairs):
         for element in list(group):
             spec.delete(element)

@@ -1,4 +1,4 @@
-"""The files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
+"""Files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
 
 import json
 import pathlib
@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.hands.geometry import geom_mesh
+from congrasp.services.viz.episode import episode_shapes
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.render import episode_shapes
 from congrasp.services.viz.scene import Shape
 from congrasp.services.viz.shapes import fit, shape_points
 from congrasp.services.viz.sheets import save_png
@@ -58,17 +58,17 @@ def save_picture(path: pathlib.Path, motion: "ArmMotion", episode: Message, step
     """Draws the whole robot with object and table at a control step of its episode, as PNG."""
     base = motion.world_base
     arm = _arm_shapes(motion, step)
-    scene = [shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "cylinder"]
+    scene = [shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "table"]
     points = np.concatenate([shape_points(shape) for shape in (*arm, *scene)])
     low, high = points.min(0), points.max(0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high[:2] - low[:2])) / 2 + 0.1
-    table = Shape("cylinder", (radius, 0.01), _GREY, np.array([*middle[:2], -0.01]), shine=0.0, shadow=False)
+    table = Shape("table", (1.6 * radius, 0.0), _GREY, np.array([*middle[:2], 0.0]), shine=0.0, shadow=False)
     camera = fit(points, base.rotation.apply(_AHEAD), _SIZE[0] / _SIZE[1])
     save_png(path, render_scene([*arm, *scene, table], camera, _SIZE))
 
 
 def _arm_shapes(motion: "ArmMotion", step: int) -> list[Shape]:
-    """What the arm's file draws of it at a control step, in the world."""
+    """Visual shapes of the arm's file at a control step, in the world frame."""
     robot, scene, base = motion.robot, motion.scene, motion.world_base
     data = mujoco.MjData(robot.model)
     q = robot.model.qpos0.copy()

@@ -1,4 +1,4 @@
-"""Options of the arm, apart from the modules that use them, so that the command line starts at once."""
+"""Options of the arm, separate from the modules that use them, so that the command line starts quickly."""
 
 import dataclasses
 

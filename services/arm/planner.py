@@ -37,7 +37,7 @@ class ArmMotion:
     hand_joints: tuple[str, ...]
     """F names."""
     hand_target: np.ndarray
-    """(T, F) rad, what the finger servos aim at."""
+    """(T, F) targets of the finger servos, rad."""
     scene: Path
 
     def facts(self) -> dict[str, Any]:
@@ -55,7 +55,7 @@ class ArmMotion:
         }
 
     def note(self) -> str:
-        """How near the arm is to its limits, in words."""
+        """Describes the arm's distance from its limits."""
         facts = self.facts()
         off = f"{facts['arm_error_mm']:.1f} mm and {facts['arm_error_deg']:.1f}°"
         speed = f"{facts['arm_speed_joint']} at {100 * facts['arm_speed_share']:.0f}% of its speed limit at most"
@@ -63,7 +63,7 @@ class ArmMotion:
 
 
 class ArmPlanner:
-    """An arm with a hand that follows one grasp motion after another."""
+    """Plans the joints of an arm with a hand along grasp motions."""
 
     def __init__(self, options: ArmOptions, hand: Hand, seed: int = 0):
         """Reads the arm.
@@ -71,10 +71,10 @@ class ArmPlanner:
         Args:
           options: file, base, flange, mount and speeds.
           hand: the hand that it carries.
-          seed: draws postures to start from.
+          seed: seed of the initial postures.
 
         Raises:
-          CongraspError: the arm cannot be read, or an option is not what it must be.
+          CongraspError: the arm cannot be read, or an option is not valid.
         """
         file = arm_file(options.arm)
         self._arm = load_arm(file, options.flange, options.arm_speed)
@@ -95,11 +95,11 @@ class ArmPlanner:
 
     @property
     def side(self) -> float:
-        """The side of the object on which the base stands, rad from the world's x axis."""
+        """Side of the object on which the base is, rad from the x axis of the world frame."""
         return float(np.arctan2(self._base.position[1], self._base.position[0]))
 
     def plan(self, obj: GraspObject, motion: GraspMotion) -> ArmMotion:
-        """The joints along a motion.
+        """Computes the joints along a motion.
 
         Raises:
           Infeasible: the arm cannot follow it.
@@ -118,7 +118,7 @@ class ArmPlanner:
 
 
 def _path(motion: GraspMotion, base: Pose) -> Path:
-    """Wrist, object and table of a motion in the frame of a base that stands in the world."""
+    """Wrist, object and table of a motion in the frame of a base that is fixed in the world."""
     back = base.rotation.inv()
     wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)
     turned = back * Rotation.from_quat(motion.object_quaternion, scalar_first=True)
@@ -134,10 +134,10 @@ def _path(motion: GraspMotion, base: Pose) -> Path:
 
 
 def _numbers(option: str, text: str, form: str) -> list[float]:
-    """The numbers of an option, as many as its form has words.
+    """Parses the numbers of an option, as many as its form has words.
 
     Raises:
-      CongraspError: it has others.
+      CongraspError: the text does not match the form.
     """
     try:
         found = [float(word) for word in text.replace(",", " ").split()]

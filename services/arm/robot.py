@@ -20,7 +20,7 @@ _NEIGHBOURS = 3  # joints between two bodies, below which their housings may ove
 
 
 class Infeasible(Exception):
-    """The arm cannot follow a path; its text names the limit that forbids it."""
+    """The arm cannot follow a path; the message names the violated limit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,9 +41,9 @@ class Robot:
     joints: np.ndarray
     """(N,) addresses of the arm's joints in `qpos`; they have the same ones in `qvel`."""
     fingers: np.ndarray
-    """(F,) those of the hand's."""
+    """(F,) addresses of the hand's joints."""
     palm: str
-    """Name of the body whose frame is the wrist's."""
+    """Name of the body with the wrist frame."""
 
     def place(self, data: mujoco.MjData, q: np.ndarray, position: np.ndarray, quaternion: np.ndarray, height: float):
         """Moves everything in `data`: joints (Q,), the object's pose in the base's frame, the table's height (m)."""
@@ -54,7 +54,7 @@ class Robot:
         mujoco.mj_kinematics(self.model, data)
 
     def collision(self, data: mujoco.MjData) -> str:
-        """The pair of bodies that overlap, in words; empty where none do."""
+        """Describes the pair of overlapping bodies; empty if there is none."""
         mujoco.mj_collision(self.model, data)
         deep = np.flatnonzero(data.contact.dist < 0.0)
         if not len(deep):
@@ -62,14 +62,14 @@ class Robot:
         return " with ".join(sorted((self._called(int(g)) for g in data.contact.geom[deep[0]]), key=_scene_last))
 
     def _called(self, geom: int) -> str:
-        """The body of a geom, in words."""
+        """Describes the body of a geom."""
         name = self.model.body(self.model.geom_bodyid[geom]).name
         if name in (_TABLE, _OBJECT):
             return {_TABLE: "the table", _OBJECT: "the object"}[name]
         return "the hand" if name.startswith(_HAND) else "the base" if name == "world" else name
 
     def drawn(self) -> list[int]:
-        """Geoms of the arm that a picture shows: visual ones, or those that collide of a body without any."""
+        """Geoms of the arm for pictures: visual ones, or collision geoms of a body without any."""
         own = [self.model.body(i).name for i in self.model.geom_bodyid]
         geoms = [g for g, name in enumerate(own) if name not in (_TABLE, _OBJECT) and not name.startswith(_HAND)]
         visual = {self.model.geom_bodyid[g] for g in geoms if not self.model.geom_contype[g]}
@@ -77,7 +77,7 @@ class Robot:
 
 
 def _scene_last(name: str) -> bool:
-    """True of table and object."""
+    """True for table and object."""
     return name in ("the table", "the object")
 
 
@@ -95,7 +95,7 @@ def build_robot(arm: Arm, hand: Hand, mount: Pose, obj: GraspObject) -> Robot:
     Args:
       arm: the arm.
       hand: the hand.
-      mount: of the wrist frame in the flange's.
+      mount: pose of the wrist frame in the flange's.
       obj: the object; the model's is moved like the table, by mocap.
     """
     spec = arm.spec.copy()
@@ -132,7 +132,7 @@ def build_robot(arm: Arm, hand: Hand, mount: Pose, obj: GraspObject) -> Robot:
 
 
 def _hand_spec(hand: Hand, degrees: bool) -> mujoco.MjSpec:
-    """The hand's bodies and finger joints alone, in the angles of the model that it becomes a part of."""
+    """Returns only the hand's bodies and finger joints, in the angle unit of the parent model."""
     spec = mujoco.MjSpec()
     add_hand(spec, hand)
     for group in (spec.actuators, spec.equalities, spec.tendons, spec.excludes):
@@ -148,7 +148,7 @@ def _hand_spec(hand: Hand, degrees: bool) -> mujoco.MjSpec:
 
 
 def _depths(spec: mujoco.MjSpec, arm: Arm) -> dict[str, int]:
-    """How many joints are between the base and each body."""
+    """Number of joints between the base and each body."""
     found = {"world": 0}
     for body in spec.bodies:
         if body.name != "world":

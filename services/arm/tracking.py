@@ -1,4 +1,4 @@
-"""Inverse kinematics along a path of the wrist: from several starts, within the limits of the joints."""
+"""Inverse kinematics along a path of the wrist, from several starts, within the joint limits."""
 
 import dataclasses
 
@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from congrasp.services.arm.robot import Infeasible, Robot
 
 ACCELERATION = 60.0
-"""rad/s^2 (m/s^2 of slides), the limit of every joint's acceleration."""
+"""Limit of every joint's acceleration, rad/s^2 (m/s^2 of slides)."""
 POSITION, ANGLE = 0.005, float(np.radians(2.0))
-"""m and rad by which the wrist may be off its path."""
+"""Tolerance of the wrist's deviation from its path, m and rad."""
 _STARTS, _TRACKED = 24, 5  # random postures to start from, distinct solutions that are followed
-_SMOOTHING = 0.02  # s, standard deviation of the filter that takes the tremor of contacts from the path
+_SMOOTHING = 0.02  # standard deviation of the filter that removes contact tremor from the path, s
 _ITERATIONS = 80  # from each
 _POSTURE, _PULL = 2e-3, 0.02  # weight of the middle of the ranges against 1 m, share of the way to it in a step
 _SAME = 0.05  # rad between two postures, below which they count as one
@@ -45,7 +45,7 @@ class Path:
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """An arm that follows a path."""
+    """Joints of an arm along a path."""
 
     q: np.ndarray
     """(T, N) rad."""
@@ -60,12 +60,12 @@ class Track:
 
 
 def follow(robot: Robot, path: Path, rng: np.random.Generator) -> Track:
-    """The joints along a path, from the start that has most room to the ends of the ranges.
+    """Computes the joints along a path, from the start with the greatest distance to the joint limits.
 
     Args:
       robot: arm, hand and scene.
-      path: of the wrist.
-      rng: draws postures to start from.
+      path: path of the wrist.
+      rng: generator of the initial postures.
 
     Raises:
       Infeasible: no start leads to the path's end.
@@ -82,7 +82,7 @@ def follow(robot: Robot, path: Path, rng: np.random.Generator) -> Track:
 
 
 def _smooth(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(T, 3) and (T, 4) the wrist's path without the tremor of contacts."""
+    """Path of the wrist (T, 3) and (T, 4) without contact tremor."""
     quaternion = path.rotation.as_quat(scalar_first=True)
     same = np.sum(quaternion[1:] * quaternion[:-1], -1) >= 0
     quaternion[1:] *= np.cumprod(np.where(same, 1.0, -1.0))[:, None]
@@ -119,27 +119,27 @@ class _Solver:
         self.finger_range[:, model.jnt_qposadr[fingers]] = low[fingers], high[fingers]
 
     def whole(self, q: np.ndarray, t: int) -> np.ndarray:
-        """(Q,) of the model with arm joints (N,) and the fingers of step t."""
+        """Positions (Q,) of the model for arm joints (N,) and the fingers of step t."""
         full = self.robot.model.qpos0.copy()
         full[self.robot.joints], full[self.robot.fingers] = q, self.path.q[t]
         return np.clip(full, *self.finger_range)
 
     def aim(self, t: int) -> None:
-        """Makes the pose of step t the wrist's target."""
+        """Sets the pose of step t as the wrist's target."""
         position, quaternion = self.target
         self.wrist.set_target(mink.SE3.from_rotation_and_translation(mink.SO3(quaternion[t]), position[t]))
 
     def errors(self, position: np.ndarray, turn: Rotation) -> tuple[float, float]:
-        """m and rad of the wrist from a pose."""
+        """Deviation of the wrist from a pose, m and rad."""
         data = self.configuration.data
         now = Rotation.from_matrix(data.xmat[self.body].reshape(3, 3))
         return float(np.linalg.norm(data.xpos[self.body] - position)), float((now.inv() * turn).magnitude())
 
     def starts(self, rng: np.random.Generator) -> list[np.ndarray]:
-        """Distinct postures (N,) at the path's first pose that touch nothing, most room to the ends first.
+        """Distinct postures (N,) at the path's first pose without collisions, those farthest from limits first.
 
         Raises:
-          Infeasible: there is none.
+          Infeasible: there is no such posture.
         """
         arm = self.robot.arm
         random = rng.uniform(self.lower, self.upper, (_STARTS, len(self.lower)))
@@ -162,7 +162,7 @@ class _Solver:
         return [q for _, q in sorted(found, key=lambda pair: -pair[0])]
 
     def _solved(self, seed: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
-        """Arm joints (N,) at the path's first pose from a posture, and what they are off by."""
+        """Arm joints (N,) at the path's first pose from a posture, and their errors."""
         self.configuration.update(self.whole(seed, 0))
         self.aim(0)
         settled = 0
@@ -178,7 +178,7 @@ class _Solver:
         return self.configuration.q[self.robot.joints].copy(), self.errors(position, turn)
 
     def track(self, start: np.ndarray) -> tuple[int, str, Track | None]:
-        """Follows the path from a posture: steps that it could, the limit that ended them, the track if none did."""
+        """Follows the path from a posture; returns the number of steps, the violated limit, and a complete track."""
         path, robot = self.path, self.robot
         q = np.zeros((len(path.position), len(start)))
         q[0] = start
@@ -210,24 +210,24 @@ class _Solver:
         return len(q), "", Track(q, float(worst[0]), float(worst[1]), shares, acceleration)
 
     def _ends(self, q: np.ndarray) -> str:
-        """The joint at the end of its range, in words; empty where none is."""
+        """Describes the joint at the end of its range; empty if there is none."""
         room = np.minimum(q - self.robot.arm.lower, self.robot.arm.upper - q)
         joint = int(room.argmin())
         return f"the range of {self.robot.arm.joints[joint]}" if room[joint] < _AT_END else ""
 
     def _fast(self, velocity: np.ndarray) -> str:
-        """The joint at its speed limit, in words; empty where none is."""
+        """Describes the joint at its speed limit; empty if there is none."""
         shares = np.abs(velocity[self.robot.joints]) / self.robot.arm.speed
         joint = int(shares.argmax())
         return f"the speed of {self.robot.arm.joints[joint]}" if shares[joint] > 0.99 else ""
 
     def _slack(self, t: int) -> str:
-        """The path's acceleration where the arm is where it should be on the smooth path, else the reach."""
+        """Violated limit: the path's acceleration if the arm is on the smooth path, else the reach."""
         off = np.linalg.norm(self.configuration.data.xpos[self.body] - self.target[0][t])
         return "the acceleration of the wrist" if off < POSITION / 2 else "the reach"
 
     def _collision(self, q: np.ndarray, t: int) -> str:
-        """What touches what at step t, in words; empty where nothing does."""
+        """Describes the collision at step t; empty if there is none."""
         path, data = self.path, self.scene
         self.robot.place(data, self.whole(q, t), path.object_position[t], path.object_quaternion[t], path.table[t])
         touching = self.robot.collision(data)

@@ -28,7 +28,7 @@ _LEAST_UPDATES = 3
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """What one number of ranks achieved."""
+    """Result of one number of ranks."""
 
     ranks: int
     updates: int

@@ -22,19 +22,19 @@ def actor(
     watch: Watched = Watch(),  # noqa: B008
     certs: pathlib.Path | None = None,
 ) -> int:
-    """One actor that works for a learner, on this machine or another; it may come and go while the learner trains.
+    """Run one actor for a learner on this or another machine; actors may join and leave during training.
 
     Args:
       connect: The learner's endpoint, such as tcp/10.0.0.5:7447.
       run: Name of the run.
       id: Name of this actor, unique in the run; host name and process number by default.
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
-      threads: Threads of the native engine; 0 takes all cores.
+      threads: Threads of the native engine; 0 uses all cores.
       patience: Seconds without a learner after which the actor gives up.
-      audit: Journal of every rollout and the learner's answer to it, for 'congrasp audit'; nothing is written without.
-      references: File by which the next start goes on with the policy's own grasps as reference poses.
-      watch: How it is watched.
-      certs: Folder of an actor's certificate (congrasp certs), whose number its name on the wire begins with.
+      audit: Journal of every rollout and the learner's reply, for 'congrasp audit'; none by default.
+      references: File that preserves the reference poses from the policy's grasps for the next start.
+      watch: Monitoring.
+      certs: Folder of an actor's certificate (congrasp certs), whose number is the prefix of its name on the wire.
 
     Examples:
       congrasp actor --connect tcp/127.0.0.1:7447 --run human

@@ -7,10 +7,10 @@ import tyro
 
 
 def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tuple[pathlib.Path, ...] = ()) -> int:
-    """Compares the journals of a run's actors and of its learner: was every accepted rollout used once, and whole?
+    """Compares the journals of a run's actors and of its learner: was every accepted rollout used once, and unchanged?
 
-    Exits with 1 if a rollout was lost, else with 5 if there is a surplus (one was used twice, or nobody made it), else
-    with 6 if a rollout or a journal is damaged.
+    Exits with 1 if a rollout was lost, else with 5 if there is a surplus (one was used twice, or no actor made it),
+    else with 6 if a rollout or a journal is damaged.
 
     Args:
       run_dir: Directory of the run.
@@ -35,7 +35,7 @@ def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tupl
     table.add_row("damaged lines", str(report.damaged), "damage", style="bold red" if report.damaged else "")
     table.add_row("lines without a checksum", str(report.unchecked), "unchecked" if report.unchecked else "")
     console.print(table)
-    console.print(f"Lag: mean {report.lag_mean:.2f}, at most {report.lag_max} of {report.max_staleness} versions.")
+    console.print(f"Lag: mean {report.lag_mean:.2f}, maximum {report.lag_max} of {report.max_staleness} versions.")
     if report.holes:
         console.print(f"{report.holes} line(s) are missing in the journals: the disk was full, or their end was cut.")
     for line in report.faults[:20]:

@@ -6,15 +6,15 @@ from congrasp.actors.physics import PhysicsName
 
 
 def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines: tuple[str, ...] = ()) -> int:
-    """Actors' control steps a second beside the bare engine's, for each engine that the machine has.
+    """Measure the control steps per second of actors and of the bare engine, for each engine of the machine.
 
-    The bare `native` engine goes through the states that the actor has just gone through, with nothing but `mj_step`.
+    The bare `native` engine repeats the actor's states with nothing but `mj_step`.
 
     Args:
-      environments: Environments that run side by side.
-      threads: Threads of the native engine; 0 takes all cores.
+      environments: Number of parallel environments.
+      threads: Threads of the native engine; 0 uses all cores.
       repeats: Measurements of each, alternating; medians and their ratio are printed, and the ratio of the best.
-      engines: Engines to measure; those that the machine is made for if none is named.
+      engines: Engines to measure; by default those that suit the machine.
 
     Examples:
       congrasp bench physics
@@ -28,13 +28,13 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
 
 
 def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
-    """Latency of a policy server in a process of its own that serves an untrained policy, over the loopback interface.
+    """Measure the latency of a policy server in a separate process, with an untrained policy, over loopback.
 
-    The clients take their share of the machine; the server's own processor time for an answer is printed beside.
+    The clients also use the machine; the server's processor time per answer is printed as well.
 
     Args:
-      repeat: Queries in all.
-      concurrency: Clients at the same time.
+      repeat: Total number of queries.
+      concurrency: Number of concurrent clients.
       states: States in one query, up to 64; each gets an answer.
 
     Examples:
@@ -57,10 +57,10 @@ def scaling(
     deadline: float = 600.0,
     out: pathlib.Path = pathlib.Path("scaling.json"),
 ) -> int:
-    """Trained steps a second of several learner ranks beside one: weak scaling, every rank with a batch of its own.
+    """Measure trained steps per second of several learner ranks relative to one: weak scaling, a batch per rank.
 
     Starts real processes for each number of ranks in turn; starting, compiling and the first updates are not measured.
-    On GPUs every rank needs one of its own.
+    On GPUs every rank needs a separate one.
 
     Args:
       ranks: Numbers of ranks, for example 1 2 4; efficiency is against the first.
@@ -68,8 +68,9 @@ def scaling(
       preset: Named configuration of the run.
       environments: Environments in one actor; 0: those of the preset.
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
-      actors: Actor processes of each rank; by default none on GPUs, where one lives inside each rank, otherwise one.
-      deadline: Seconds that one number of ranks may take in all.
+      actors: Actor processes of each rank; by default none on GPUs, where each rank runs one in its process, otherwise
+        one.
+      deadline: Deadline of one number of ranks, s.
       out: File for the results as JSON.
 
     Examples:
@@ -94,17 +95,17 @@ def startup(
     physics: PhysicsName = "auto",
     deadline: float = 600.0,
 ) -> int:
-    """Seconds from the start of a training to its first update, stage by stage: with empty caches, and again with them.
+    """Measure the seconds from the start of a training to its first update, by stage, with empty and with full caches.
 
-    Learner and actor live in one process, as on a GPU. Warp's kernels have a cache of their own, which is used as it
-    is. The machine's caches are neither used nor changed.
+    Learner and actor run in one process, as on a GPU. Warp's kernel cache is used unchanged. The machine's other caches
+    are neither used nor changed.
 
     Args:
       preset: Named configuration of the run.
       environments: Environments; 0: those of the preset.
       objects: Objects in the pool; 0: those of the preset.
       physics: Engine; auto takes warp on an NVIDIA GPU and native on a CPU.
-      deadline: Seconds that one start may take.
+      deadline: Deadline of one start, s.
 
     Examples:
       congrasp bench startup

@@ -15,16 +15,16 @@ def init(
     host: tuple[str, ...] = (),
     force: bool = False,
 ) -> int:
-    """Make a private authority, and number 0 of every role: all that a run on one machine needs.
+    """Create a private authority, and number 0 of every role: all that a run on one machine needs.
 
-    A certificate serves the one run that it names. The authority's ca.key signs certificates: keep it where nobody else
-    can read it. Commands on this machine take --certs FOLDER.
+    A certificate is valid for the run that it names. The authority's ca.key signs certificates: keep it unreadable for
+    others. Commands on this machine take --certs FOLDER.
 
     Args:
       folder: Folder for the authority and the certificates.
-      run: Name of the run that they are for.
+      run: Name of the run.
       host: Names and addresses of this machine, under which others will connect to its learner or policy server.
-      force: Replace an authority that is there; certificates that it issued are useless then.
+      force: Replace an existing authority; its certificates become invalid.
 
     Examples:
       congrasp certs init certs --run human --host 10.0.0.5
@@ -51,17 +51,17 @@ def issue(
 ) -> int:
     """Issue a certificate: a folder to copy to the machine where the role runs, whose commands take --certs FOLDER.
 
-    Learners need not be told of new certificates. Several actors may share one, if they trust one another.
+    Learners accept new certificates without changes. Several actors may share one, if they trust one another.
 
     Args:
       folder: Folder of the authority.
       role: Certificate role: learner, actor, server (of a policy), client (of a policy server) or observer (status,
         recorder).
-      run: Name of the run that it is for; by default the one that the authority was made for.
-      number: Tells the certificates of a role apart; the lowest that is free by default.
+      run: Name of the run; by default that of the authority.
+      number: Distinguishes the certificates of a role; by default the lowest free one.
       host: Names and addresses under which others will connect to it (learner and server).
       days: Days until it expires.
-      force: Replace the certificate of this number; the old one works until it expires, too.
+      force: Replace the certificate of this number; the old one stays valid until it expires.
 
     Examples:
       congrasp certs issue certs --role actor
@@ -71,21 +71,21 @@ def issue(
     from congrasp.services.ops.certificates import issue, read
 
     made = issue(folder, role, run=run, number=number, hosts=host, days=days, force=force)
-    print(f"{made}: good until {read(made / CERTIFICATE_FILE).expires:%Y-%m-%d}")
+    print(f"{made}: valid until {read(made / CERTIFICATE_FILE).expires:%Y-%m-%d}")
     return 0
 
 
 def revoke(folder: Folder = pathlib.Path("certs"), *, role: Role, number: int, run: str | None = None) -> int:
-    """Revoke a certificate whose key is lost or stolen: learners and servers let its owner in no more.
+    """Revoke a certificate whose key is lost or stolen: learners and servers no longer admit its owner.
 
-    Those on this machine notice within seconds, and all their peers connect anew. If it is a learner's or a server's
-    own, those who are connected to it end. Elsewhere, copy the file 'revoked' into the folders of the certificates.
+    Those on this machine notice within seconds, and all their peers reconnect. If it belongs to a learner or a server,
+    its peers disconnect. Elsewhere, copy the file 'revoked' into the folders of the certificates.
 
     Args:
       folder: Folder of the authority.
       role: The certificate's role.
       number: The certificate's number.
-      run: Name of the run that it was for; by default the one that the authority was made for.
+      run: Name of the certificate's run; by default that of the authority.
 
     Examples:
       congrasp certs revoke certs --role actor --number 1

@@ -1,4 +1,4 @@
-"""What commands show beside plain lines: tables on standard output, progress bars and errors on standard error."""
+"""Console output of commands: tables on standard output, progress bars and errors on standard error."""
 
 import contextlib
 import sys
@@ -11,21 +11,21 @@ from rich.table import Table
 from congrasp.common.errors import CongraspError
 
 Track = Callable[[str, int | None], Callable[[int], None]]
-"""(what is done, its total if known) -> what to call with the amount done."""
+"""(label, total if known) -> function to call with the number done."""
 
 
 def at_least(least: float, **counts: float) -> None:
-    """Raises a CongraspError for the first option, by its name, that is less."""
+    """Raises a CongraspError for the first option that is below the minimum."""
     for name, value in counts.items():
         if value < least:
             raise CongraspError(f"--{name} is {value}.", f"It must be at least {least:g}.")
 
 
 def at_most(most: float, unit: str, **amounts: float) -> None:
-    """Raises a CongraspError for the first option, by its name, that is negative or more."""
+    """Raises a CongraspError for the first option that is negative or above the maximum."""
     for name, value in amounts.items():
         if not 0 <= value <= most:
-            raise CongraspError(f"--{name} is {value}.", f"It is from 0 to {most:g} {unit}.")
+            raise CongraspError(f"--{name} is {value}.", f"It must be from 0 to {most:g} {unit}.")
 
 
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
@@ -37,7 +37,7 @@ def show_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 
 
 def show_facts(facts: Mapping[str, str]) -> None:
-    """Prints names and what belongs to each."""
+    """Prints names and values."""
     table = Table(show_header=False, box=None)
     for name, text in facts.items():
         table.add_row(name, text)
@@ -45,12 +45,12 @@ def show_facts(facts: Mapping[str, str]) -> None:
 
 
 def report_error(error: CongraspError) -> None:
-    """Prints an error that does not end the command, as `services.cli.main` prints those that do."""
+    """Prints an error that does not end the command, in the format of `services.cli.main`."""
     print(f"congrasp: error: {error}", file=sys.stderr)
 
 
 def bars() -> Progress:
-    """A line for each task: what is done, a bar, counts, time; nothing of it is left on the screen in the end."""
+    """Progress display with a line for each task: text, bar, counts, time; it is erased at the end."""
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
@@ -63,11 +63,11 @@ def bars() -> Progress:
 
 @contextlib.contextmanager
 def tracked() -> Iterator[Track]:
-    """Bars for work that reports the amount done."""
+    """Context with bars for work that reports its progress."""
     with bars() as progress:
 
         def track(text: str, total: int | None) -> Callable[[int], None]:
-            """A new bar."""
+            """Adds a bar."""
             task = progress.add_task(text, total=total)
             return lambda done: progress.update(task, completed=done)
 

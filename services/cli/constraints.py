@@ -1,4 +1,4 @@
-"""Constraint sets of objects: headings, reference poses and wrist trajectories as training draws them, or captured."""
+"""Constraint sets of objects: headings, reference poses and trajectories, generated as for training, or captured."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from congrasp.services.cli.console import Track
 
 REPORT = "import.json"
-"""File beside imported sets that holds the outcome of each sequence."""
+"""File next to imported sets with the outcome of each sequence."""
 
 
 def generate(
@@ -33,21 +33,21 @@ def generate(
     out: pathlib.Path = pathlib.Path("constraints"),
     seed: int = 0,
 ) -> int:
-    """Make the constraint sets of objects and write one file each, which says what its arrays mean.
+    """Generate the constraint sets of objects, one self-describing file each.
 
-    For the whole surface and for the graspable region: 256 headings by the paper's rules, 20 reference poses, and
-    wrist trajectories that end at them, from 15 to 25 cm away, replayed through the wrist's controller. 80 % of them
-    are for training, and the others are held out.
+    For the whole surface and for the graspable region: 256 headings by the paper's rules, 20 reference poses, and wrist
+    trajectories that end at them, from 15 to 25 cm away, replayed through the wrist's controller. 80 % of them are for
+    training, and the others are held out.
 
     Args:
       objects: Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7.
-      count: Besides, this many procedural objects.
+      count: Number of additional procedural objects.
       families: Their families, in turn, or groups of them: basic (if none is named), household, all.
       first_seed: Seed of the first of them; the others follow.
       hand: Name of the hand, or its file.
       references: closed: poses that close the hand around the object; policy: final states of a policy's grasps under
         headings, as in the paper.
-      policy: Policy file for its references; by default the hand's reference policy, which never had any itself.
+      policy: Policy file for its references; by default the hand's reference policy, which was trained without any.
       folder: Folder of objects.
       out: Folder for the files.
       seed: Seed of the constraints.
@@ -64,7 +64,7 @@ def generate(
     from congrasp.services.cli.console import tracked
 
     if not objects and count < 1:
-        raise CongraspError("There is no object to make constraints for.", "Name objects, or set --count.")
+        raise CongraspError("There is no object for which to generate constraints.", "Pass objects, or --count.")
     known = get_hand(hand)
     with tracked() as track:
         track("Preparing objects", None)
@@ -74,7 +74,7 @@ def generate(
             found += objects_of(path) if path.exists() else [find_object(text, folder)]
         found += generate_many(count, first_seed, families)
         bank = _references(known, policy, found, seed, track) if references == "policy" else None
-        track("Making constraints", None)
+        track("Generating constraints", None)
         for constraints in make_sets(known, TaskConfig(hand=known.name), found, seed, bank):
             save(constraints, out)
     what = "The constraint set of 1 object is" if len(found) == 1 else f"The sets of {len(found)} objects are"
@@ -85,7 +85,7 @@ def generate(
 def _references(
     hand: "Hand", policy: pathlib.Path | None, objects: "list[GraspObject]", seed: int, track: "Track"
 ) -> Any:
-    """Constraints with references from a policy's grasps; prints how many there are."""
+    """Returns constraints with references from a policy's grasps; prints their number."""
     from congrasp.common.policy import bundle as bundles
     from congrasp.common.policy.pretrained import policy_file, reference_file
     from congrasp.common.runtime.parallel import cores
@@ -94,14 +94,16 @@ def _references(
     bundle = bundles.load(policy or reference_file(hand.name) or policy_file(None, hand.name))
     if bundle.spec.hand_name != hand.name:
         raise CongraspError(
-            f"The policy is for the hand '{bundle.spec.hand_name}', not '{hand.name}'.",
-            f"Set --hand {bundle.spec.hand_name}.",
+            f"The policy has the hand '{bundle.spec.hand_name}', not '{hand.name}'.",
+            f"Pass --hand {bundle.spec.hand_name}.",
         )
     evaluator = Evaluator(bundle, objects, threads=cores(), seed=seed)
     advance = track("Grasping: reference poses", None)
     made = evaluator.references_of(bundle, lambda done, of: advance(done))
     whole = made.grasps[:, 0]
-    print(f"Grasps for each object: {whole.min()} to {whole.max()}; where there is none, the hand is closed around it.")
+    print(
+        f"Grasps per object: {whole.min()} to {whole.max()}; where there is none, the hand is closed around the object."
+    )
     return made.bank
 
 
@@ -118,27 +120,27 @@ def import_captures(
     objects: pathlib.Path = pathlib.Path("objects"),
     seed: int = 0,
 ) -> int:
-    """Make constraint sets of captured grasps, by the rules of the paper, and say what was dropped and why.
+    """Make constraint sets of captured grasps by the paper's rules, and report what was dropped and why.
 
     From each sequence come a reference pose (the `human` hand's finger angles in the grasping frame) and a wrist
-    trajectory to it of 15 waypoints, and, where the object's parts are labelled, which of them may be touched. Only
-    right hands are used. Objects are made of the data set's meshes.
+    trajectory to it of 15 waypoints, and, where the object's parts are labelled, those that may be touched. Only right
+    hands are used. Objects are imported from the data set's meshes.
 
     Args:
-      format: Whose files these are.
+      format: Data set of the files.
       path: The data set's folder, or one of its files.
-      meshes: Folders with the objects' meshes, where they are not in their place in the data set.
+      meshes: Folders with the objects' meshes, if they are not in the data set.
       mano: Your MANO_RIGHT.pkl, or CONGRASP_MANO; dexycb needs it, and grab and oakink are more exact with it.
-      hand: Hand of the sets. Human finger angles fit no other hand: it follows the captured wrist by its own grasp
+      hand: Hand of the sets. Human finger angles do not fit another hand: it follows the captured wrist by its grasp
         axes, with the captured headings and affordance, and closes its fingers around the object at the end.
       headings: sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps.
-      affordance: Graspable are parts that fingers touch; whatever they touch; or everything. auto: parts where they
-        are labelled.
-      beyond: Radians by which a captured joint may exceed the human hand's limits; it is then moved to the limit. For
-        another hand it does not count.
+      affordance: Graspable are parts that fingers touch; whatever they touch; or everything. auto: parts where they are
+        labelled.
+      beyond: Radians by which a captured joint may exceed the human hand's limits; it is then clamped. Not used for
+        other hands.
       out: Folder for the sets, and for import.json, which holds the outcome of each sequence.
       objects: Folder for the objects.
-      seed: Of sampled headings and of the split into training and held-out.
+      seed: Seed of sampled headings and of the split into training and held-out.
 
     Examples:
       congrasp constraints import grab GRAB/
@@ -155,9 +157,9 @@ def import_captures(
     if format not in IMPORTERS:
         raise CongraspError(f"There is no format '{format}'.", f"Choose one of: {', '.join(IMPORTERS)}.")
     if not path.exists():
-        raise CongraspError(f"There is no file or folder {path}.", "Name the data set's folder.")
+        raise CongraspError(f"There is no file or folder {path}.", "Pass the data set's folder.")
     if not beyond >= 0:
-        raise CongraspError(f"--beyond is {beyond}.", "It is in radians, and not negative.")
+        raise CongraspError(f"--beyond is {beyond}.", "It must be in radians, and not negative.")
     known, options = get_hand(hand), Options(headings, affordance, beyond, seed=seed)
     importer = importlib.import_module(IMPORTERS[format])
     with bars() as progress:
@@ -171,7 +173,7 @@ def import_captures(
         )
     report = made[-1]
     if not report.kept and not report.dropped:
-        raise CongraspError(f"{path} holds no sequence of {format}.", f"Name the folder that holds {importer.HOLDS}.")
+        raise CongraspError(f"{path} holds no sequence of {format}.", f"Pass the folder with {importer.HOLDS}.")
     about = {"format": format, "path": str(path), "hand": known.name, **dataclasses.asdict(options)}
     _save(*made, about, out, objects)
     _print_report(report, known.name, out, objects)
@@ -200,7 +202,7 @@ def _save(
 
 
 def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathlib.Path) -> None:
-    """What was kept, what was dropped by which rule, and where it all is."""
+    """Prints what was kept, what each rule dropped, and the locations of the results."""
     from congrasp.services.cli.console import show_table
 
     kept, dropped = report.kept, report.dropped
@@ -216,7 +218,7 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
         worst = max(kept, key=lambda row: row["residual_rad"])
         mean = sum(row["residual_rad"] for row in kept) / len(kept)
         print(
-            f"Finger angles leave {mean:.3f} rad a bone on average, {worst['residual_rad']:.3f} rad at most "
+            f"Finger angles differ by {mean:.3f} rad per bone on average, at most {worst['residual_rad']:.3f} rad "
             f"({worst['sequence']})."
         )
     if kept:
@@ -224,14 +226,14 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
             deep, moved = (max(apart, key=lambda row: row[name]) for name in ("overlap_m", "moved_apart_rad"))
             mean = sum(row["moved_apart_rad"] for row in apart) / len(apart)
             print(
-                f"Fingers of {len(apart)} lay inside one another, {1e3 * deep['overlap_m']:.1f} mm deep at most "
-                f"({deep['sequence']}). They were moved apart: their farthest joint by {mean:.2f} rad on average, "
-                f"{moved['moved_apart_rad']:.2f} rad at most ({moved['sequence']})."
+                f"Fingers of {len(apart)} overlapped, by up to {1e3 * deep['overlap_m']:.1f} mm "
+                f"({deep['sequence']}). They were separated: their farthest joint by {mean:.2f} rad on average, "
+                f"at most {moved['moved_apart_rad']:.2f} rad ({moved['sequence']})."
             )
         if later := [row["frames_after_touch"] for row in kept if row["frames_after_touch"]]:
             print(
-                f"Thumb and fingers oppose after the first touch in {len(later)} of {len(kept)}, and the reference is "
-                f"taken then: {sum(later) / len(later):.0f} frames later on average."
+                f"In {len(later)} of {len(kept)}, thumb and fingers oppose only after the first touch; the "
+                f"reference is taken then, {sum(later) / len(later):.0f} frames later on average."
             )
         above = sum(row["clear_of_table"] for row in kept)
         sets = len({row["object"] for row in kept})
@@ -252,13 +254,13 @@ def show(
     rest: int = 0,
     seed: int = 0,
 ) -> int:
-    """Print what a constraint set holds, and draw some of it.
+    """Print the content of a constraint set, and draw some of it.
 
     Args:
       file: A file of 'congrasp constraints generate' or 'import'.
       png: Picture to write: headings, affordance, trajectories and reference poses.
-      rest: Resting pose of the picture, from 1; 0 takes the one that leaves room for most poses.
-      seed: Draws which constraints the picture shows.
+      rest: Resting pose of the picture, from 1; 0 uses the one with the most poses.
+      seed: Seed of the drawn selection.
 
     Examples:
       congrasp constraints show sets/mug_7.constraints.safetensors

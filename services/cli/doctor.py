@@ -9,15 +9,15 @@ def doctor(
     folder: pathlib.Path = pathlib.Path(),
     certs: pathlib.Path | None = None,
 ) -> int:
-    """Look for what is wrong with this machine or installation: versions, GPU, ports, disk, clock, certificates.
+    """Check this machine and installation: versions, GPU, ports, disk, clock, certificates.
 
-    One line for each thing that was looked at, with the remedy where it is not well; the exit code is 1 if any is not.
+    Prints one line per check, with a remedy if it failed; the exit code is 1 if any failed.
 
     Args:
-      connect: A learner's endpoint that should be reachable from here; its clock is compared with this one.
+      connect: Endpoint of a learner to test; its clock is compared with this machine's.
       run: Name of the learner's run.
-      folder: Where runs are to be written.
-      certs: Folder of certificates (congrasp certs) to look at, and to connect with as an observer.
+      folder: Folder for runs.
+      certs: Folder of certificates (congrasp certs) to check, and to connect with as an observer.
 
     Examples:
       congrasp doctor

@@ -45,45 +45,45 @@ def evaluate(
     by: Literal["object"] | None = None,
     friction: float = 1.0,
 ) -> int:
-    """Evaluate policies by the paper's protocol, beside the paper's figures.
+    """Evaluate policies by the paper's protocol, with the paper's figures for comparison.
 
     An episode has as many control steps with the table as the policy was trained with, and 2 s without it. Success is
-    counted after the paper's 25 steps without the table, and again after the 2 s (held). Rates come with 95 %
-    intervals whose clusters are objects (captured sequences); 'of all objects' counts uncovered objects as failures.
-    Errors and forces are those of successful episodes in the paper's window of 25 steps. The policy acts by its mean.
-    Every object has the same number of episodes in a row, which is the same whatever other rows are requested.
-    Reference poses and trajectories are grasps of a reference policy, which never had any; the last fifth of each
-    object's 20 is evaluated.
+    counted after the paper's 25 steps without the table, and again after the 2 s (held). Rates come with 95 % intervals
+    whose clusters are objects (captured sequences); 'of all objects' counts uncovered objects as failures. Errors and
+    forces are those of successful episodes in the paper's window of 25 steps. The policy acts with its mean. Every
+    object has the same number of episodes in a row, independent of other requested rows. Reference poses and
+    trajectories are grasps of a reference policy trained without any; the last fifth of each object's 20 is evaluated.
 
     Args:
       policy: Policy files (policy.safetensors of a run), as FILE or METHOD=FILE, or folders of runs; by default a
         pretrained one.
       table: single: one constraint a row; composed: two; cross: the rows of the paper's cross-dataset table; hands:
-        single constraints for all hands with a pretrained policy, or those of --policy; ablation: for the full system
-        and what it is without one of its parts, where --policy names policies of them; objects: the heading alone on
-        any number of objects, by size, mass and family; noise: poses and trajectories with errors, as captured ones
-        have; sensing: the heading alone with a tracker's object poses, by their noise, delay, rate and losses, by
-        friction and by errors of gains, a student beside the pretrained policy; payload: the heading alone by the
-        objects' mass, from 0.05 to 2 kg; peers: the heading alone at the masses and frictions of RobustDexGrasp and of
-        Isaac Lab's dexsuite; all: every table of one policy. Several may be named.
-      exam: Procedural objects of all families: figures has seeds from 2,000,000, to be used for figures alone;
+        single constraints for all hands with a pretrained policy, or those of --policy; ablation: the full system and
+        variants without one of its parts, if --policy has policies of them; objects: the heading alone on any number of
+        objects, by size, mass and family; noise: poses and trajectories with errors like captured ones; sensing: the
+        heading alone with a tracker's object poses, by their noise, delay, rate and losses, by friction and by errors
+        of gains, a student and the pretrained policy; payload: the heading alone by the objects' mass, from 0.05 to 2
+        kg; peers: the heading alone at the masses and frictions of RobustDexGrasp and of Isaac Lab's dexsuite; all:
+        every table of one policy. Several may be named.
+      exam: Procedural objects of all families: figures has seeds from 2,000,000, to be used only for published figures;
         development has seeds from 1,000,000. Training uses neither.
-      objects: Objects to grasp instead: a folder as 'congrasp objects import' takes it, or one that it made.
+      objects: Objects to grasp instead: a folder accepted or created by 'congrasp objects import'.
       constraints: Folder of constraint sets of these objects, from 'congrasp constraints generate' or 'import'; its
         references are used instead of the reference policy's. Objects without a set are left out.
-      split: Of these sets all constraints, the 80 % for training, or those that are held out. Objects without a heading
-        among them are left out, and rows of poses and trajectories are of the objects that have one among them.
-      episodes: Episodes in each row; of the table 'objects', episodes in all.
+      split: Split of these sets: all constraints, the 80 % for training, or the held-out ones. Objects without a
+        heading in the split are left out, and rows of poses and trajectories cover the objects that have one in the
+        split.
+      episodes: Episodes of each row; for the table 'objects', the total.
       physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
-      pool: Number of procedural objects; 0 takes one of each family, and for the table 'objects' one an episode, at
+      pool: Number of procedural objects; 0 uses one of each family, and for the table 'objects' one per episode, at
         most 50,000.
-      batch: Worlds that run side by side; 0 chooses by the engine.
+      batch: Number of parallel worlds; 0 uses the engine's default.
       seed: Seed of constraints and episodes.
       json: Also write the rows to this file.
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
-      hand: Whose pretrained policy.
-      method: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center,
-        no-feedforward, two-phase, single-stage or student. A policy of another is refused; by default the policy says.
+      hand: Hand of the pretrained policy.
+      method: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center, no-feedforward,
+        two-phase, single-stage or student. A policy of another method is refused; by default that of the policy.
       by: object: also print the rates of each object; --json always has them.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.
@@ -113,7 +113,7 @@ def evaluate(
             setup = dataclasses.replace(setup, given=objects_of(objects, track=track))
         if constraints is not None:
             if not objects:
-                raise CongraspError("--constraints needs the sets' objects.", "Name their folder with --objects.")
+                raise CongraspError("--constraints needs the sets' objects.", "Pass their folder with --objects.")
             sets = captured(constraints, split, setup.given)
             _check_hand(sets.hand, [one.hand for one, _ in lineup.entrants])
             without = sorted({obj.name for obj in setup.given} - {obj.name for obj in sets.objects})
@@ -145,23 +145,23 @@ def evaluate(
 
 
 def _check_friction(friction: float) -> None:
-    """Raises a CongraspError for a friction that nothing has."""
+    """Raises a CongraspError for an implausible friction."""
     if not 0.05 <= friction <= 10.0:
-        raise CongraspError(f"--friction is {friction:g}.", "It must lie between 0.05 and 10.")
+        raise CongraspError(f"--friction is {friction:g}.", "It must be between 0.05 and 10.")
 
 
 def _check_hand(made_for: str, hands: Sequence[str]) -> None:
-    """Raises a CongraspError unless captured constraints are for these hands."""
+    """Raises a CongraspError unless captured constraints belong to these hands."""
     for hand in hands:
         if hand != made_for:
             raise CongraspError(
                 f"The constraint sets are for the hand '{made_for}', the policy for '{hand}'.",
-                f"Make them for it with 'congrasp constraints import … --hand {hand}'.",
+                f"Generate them for it with 'congrasp constraints import … --hand {hand}'.",
             )
 
 
 def _who(lineup: "Lineup") -> str:
-    """What was evaluated: a policy, a method that has none, or several."""
+    """Describes what was evaluated: a policy, a method without one, or several."""
     from congrasp.common.task.methods import get_method
 
     if len(lineup.entrants) > 1:
@@ -174,7 +174,7 @@ def _who(lineup: "Lineup") -> str:
 
 
 def _source(lineup: "Lineup", objects: pathlib.Path | None, exam: Exam) -> str:
-    """The objects, in the size of the hand where there is one."""
+    """Label of the objects, with their scale for the hand if there is one."""
     from congrasp.services.evaluate.protocol import objects_label
 
     labels = list(dict.fromkeys(objects_label(one.policy, objects, exam) for one, _ in lineup.entrants))
@@ -182,7 +182,7 @@ def _source(lineup: "Lineup", objects: pathlib.Path | None, exam: Exam) -> str:
 
 
 def _console() -> "Console":
-    """Standard output, wide where it is no terminal."""
+    """Standard output, wide if it is not a terminal."""
     import sys
 
     from rich.console import Console
@@ -191,7 +191,7 @@ def _console() -> "Console":
 
 
 def _show(results: "Sequence[Found]", lineup: "Lineup", title: str, by: str | None) -> None:
-    """Prints the tables, the effect of the rules for headings, the references' source, and why rows were left out."""
+    """Prints the tables, the effect of the rules for headings, the references' source, and reasons for skipped rows."""
     from congrasp.services.evaluate.cells import object_table, tables_of
 
     console, rows = _console(), [row for found in results for row in found.rows]
@@ -207,7 +207,7 @@ def _show(results: "Sequence[Found]", lineup: "Lineup", title: str, by: str | No
 
 
 def _about(lineup: "Lineup", results: "Sequence[Found]") -> dict[str, Any]:
-    """Policies, and how the rows were made, as the JSON file has them."""
+    """Policies, and provenance of the rows, for the JSON file."""
     from congrasp.services.evaluate.lineup import facts
     from congrasp.services.evaluate.results import provenance
 

@@ -15,17 +15,17 @@ def policy(
     out: pathlib.Path | None = None,
     force: bool = False,
 ) -> int:
-    """Write a policy as ONNX or StableHLO, and print by how much it differs from the original on random inputs.
+    """Write a policy as ONNX or StableHLO, and print its largest difference from the original on random inputs.
 
     Normalisation is inside; the file also holds the hand, the meaning and order of every input and output, and the
-    hand's MuJoCo model. docs/exports.md says how to use it; examples/onnx_grasp.py does.
+    hand's MuJoCo model. docs/exports.md and examples/onnx_grasp.py show its use.
 
     Args:
       policy: The policy file (.safetensors), or 'allegro-student'; the pretrained one otherwise.
-      hand: Whose pretrained policy.
+      hand: Hand of the pretrained policy.
       to: The format.
       out: The file to write; policy.onnx or policy.stablehlo.zip otherwise.
-      force: Replace a file that is there.
+      force: Replace an existing file.
 
     Examples:
       congrasp export policy
@@ -50,35 +50,39 @@ def motion(
     out: pathlib.Path | None = None,
     index: int = -1,
     success: bool = False,
+    fps: float = 0.0,
     camera: bool = False,
     force: bool = False,
 ) -> int:
     """Write a grasp motion for another program, read the file back, and print its largest error in millimetres.
 
     glb: Blender, the web, Unity, Unreal. usd: Isaac, Houdini, Maya. bvh: motion capture. ros2: a bag with joint
-    trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for each motion. docs/exports.md says what
-    is in each.
+    trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for each motion. docs/exports.md describes
+    each.
 
     Args:
       paths: Motions of 'congrasp grasp' (.npz), recordings (.mcap) or a run's folder; only lerobot takes several.
       to: The format.
       out: The file or folder to write; by default one named after the object, such as mug.glb, in the working
         directory.
-      index: Which of the recorded episodes, from 0; -1 is the last.
+      index: Index of the recorded episode, from 0; -1 is the last.
       success: Count only episodes that succeeded.
-      camera: Also film the motions; lerobot alone has videos.
-      force: Replace a file that is there; a folder never is.
+      fps: Frames a second, such as 24 for a film; the motion's own 100 by default.
+      camera: Also record videos of the motions; only lerobot has videos.
+      force: Replace an existing file; a folder is never replaced.
 
     Examples:
       congrasp export motion grasps/mug/grasp.npz --to glb
       congrasp export motion runs/mine --success --to ros2 --out bag
     """
     from congrasp.services.export.frames import TOLERANCE_MM
+    from congrasp.services.export.motion_file import at_rate
     from congrasp.services.export.motion_formats import default_name, export_motions, pick_motion
 
     if not paths:
-        raise CongraspError("No motion was named.", "Name a .npz of 'congrasp grasp', a recording or a run's folder.")
+        raise CongraspError("No motion was given.", "Pass a .npz of 'congrasp grasp', a recording or a run's folder.")
     motions = [pick_motion(path, index, success=success) for path in paths]
+    motions = [at_rate(motion, fps) for motion in motions] if fps else motions
     target = out or default_name(motions[0], to)
     error = export_motions(motions, to, target, camera=camera, force=force)
     frames = sum(len(motion.time) for motion in motions)
@@ -92,18 +96,18 @@ def grasp(
     out: pathlib.Path = pathlib.Path("dexgraspbench"),
     replay: bool = False,
 ) -> int:
-    """Write pregrasp, grasp and squeeze of motions, with their objects, for another project's exam of grasps.
+    """Write pregrasp, grasp and squeeze of motions, with their objects, for the grasp tests of another project.
 
     dexgraspbench: DexGraspBench, for Allegro, and for Shadow hands imported from the benchmark's own file. The folder
-    gets NPZ files with its names, of which examples/dexgraspbench.py makes its pickles. Each is read back and placed
-    by the benchmark's kinematics; the largest error in millimetres is printed.
+    gets NPZ files with its names, of which examples/dexgraspbench.py makes its pickles. Each is read back and placed by
+    the benchmark's kinematics; the largest error in millimetres is printed.
 
     Args:
-      paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); what is not held, or
-        cannot be exported, is left out.
+      paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); those that are not held, or cannot
+        be exported, are left out.
       to: The project.
       out: The folder to write.
-      replay: Also hold the exam here, by MuJoCo C: six pushes of 1 N without gravity, from the grasp and from the
+      replay: Also run the test here, in MuJoCo C: six pushes of 1 N without gravity, from the grasp and from the
         pregrasp; writes replay.json.
 
     Examples:
@@ -117,7 +121,7 @@ def grasp(
     from congrasp.services.export.replay import save_replay, summary
 
     if not paths:
-        raise CongraspError("No motion was named.", "Name a folder or a motion (.npz) of 'congrasp grasp'.")
+        raise CongraspError("No motion was given.", "Pass a folder or a motion (.npz) of 'congrasp grasp'.")
     with tracked() as track:
         grasps, error, left_out = export_grasps(paths, out, track("Exporting", None))
         found = replayed(grasps, track("Replaying", len(grasps))) if replay and grasps else []
@@ -138,9 +142,9 @@ def layout(
     """Write a layout for Foxglove: the actors' episodes in 3-D, learning curves, rewards, contacts and events.
 
     Args:
-      path: The run's folder, or one MCAP file, that the layout is to fit.
+      path: The run's folder, or an MCAP file, for which the layout is made.
       out: The file to write; in Foxglove: Layout, Import from file.
-      force: Replace a file that is there.
+      force: Replace an existing file.
 
     Examples:
       congrasp export layout runs/mine

@@ -45,6 +45,7 @@ def grasp(
     size: str = "1280x720",
     fps: float = 25.0,
     overlays: bool = False,
+    camera: str = "",
     pictures: bool = True,
     policy: pathlib.Path | None = None,
     hand: str = "human",
@@ -75,6 +76,8 @@ def grasp(
       size: Width and height of the video, pixels.
       fps: Frames a second of the video.
       overlays: Draw constraints and contacts into the video; grasp.png shows them in any case.
+      camera: Where pictures and video are seen from, in degrees around the table and above it: --camera "120 25"; by
+        default where fingers, contacts and object are seen best.
       pictures: Write pictures.
       policy: A policy file, or 'allegro-student'; by default the hand's that comes with the package.
       hand: Hand whose pretrained policy is taken; human:left takes its mirror image.
@@ -101,6 +104,7 @@ def grasp(
     from congrasp.services.grasp.grasper import Grasper
     from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
     from congrasp.services.viz.render import Film
+    from congrasp.services.viz.views import view_of
 
     if not objects:
         raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
@@ -128,7 +132,8 @@ def grasp(
 
         planner = ArmPlanner(arm, get_hand(bundle.spec.hand), seed)
         identity = (*identity, planner.identity)
-    settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, film, pictures, again, rest)
+    drawn = film, view_of(camera)
+    settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, *drawn, pictures, again, rest)
     grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed, arm=planner, left=left)
 
     for result in results:

@@ -1,4 +1,4 @@
-"""The hands there are, pictures of them, and hands of one's own."""
+"""Available hands, pictures of them, and custom hands."""
 
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def list_hands() -> int:
-    """List the hands: those of the package and your own, with joints, masses and whether a policy comes with them.
+    """List the hands: those of the package and your own, with joints, masses and available policies.
 
     Examples:
       congrasp hands list
@@ -42,7 +42,7 @@ def list_hands() -> int:
         )
         rows.append(row)
     show_table(("hand", "joints", "fingers", "mass", "torque", "objects", "policy"), rows)
-    print("\n".join([*missing, f"Your own hands are the files in {hands_folder()}."]))
+    print("\n".join([*missing, f"Custom hands are the files in {hands_folder()}."]))
     return 0
 
 
@@ -50,11 +50,11 @@ def sheet(
     hands: Annotated[tuple[str, ...], tyro.conf.Positional] = ("human", "allegro", "sharpa"),
     out: pathlib.Path = pathlib.Path("hands.png"),
 ) -> int:
-    """Draw hands open, half closed and closed, with their grasp frames, as their files drew them where they did.
+    """Draw hands open, half closed and closed, with their grasp frames, with the visual meshes of their files if any.
 
     Args:
       hands: Names of hands, or hand files.
-      out: The PNG file to write; with several hands, one beside another.
+      out: The PNG file to write; several hands are drawn in a row.
 
     Examples:
       congrasp hands sheet human
@@ -85,23 +85,23 @@ def import_hand(
     out: pathlib.Path | None = None,
     png: pathlib.Path | None = None,
 ) -> int:
-    """Make a hand of a URDF or MJCF file: what the file does not say is proposed, said and drawn.
+    """Import a hand from a URDF or MJCF file: missing values are proposed, listed and drawn.
 
-    The result is one JSON file, which every command takes as --hand, by its name or its path; what the file draws of
-    the hand is kept beside it. Look at the picture, and correct the file where the proposal is wrong: poses,
-    fingertips, gains, couplings and capsules are all in it.
+    The result is one JSON file, which every command takes as --hand, by its name or its path; the visual meshes are
+    stored next to it. Check the picture, and correct the file where a proposal is wrong: poses, fingertips, gains,
+    couplings and capsules are all in it.
 
     Args:
       file: The hand's URDF (.urdf) or MJCF (.xml), a right or left hand of hinges.
       name: Its name; that of the file by default.
-      palm: The body that is the palm; by default the one off which most fingers branch.
-      thumb: The last body of the finger that opposes the others;
-        by default one called thumb, or the one that best faces the others.
+      palm: Body of the palm; by default the one from which most fingers branch.
+      thumb: The last body of the finger that opposes the others; by default one called thumb, or the one that best
+        faces the others.
       object_scale: Factor on the objects that it learns to grasp; by default from its opening, 1 for a human hand's.
-      collision: What touches in physics: own takes the file's boxes, cylinders, balls, ellipsoids and capsules, and
+      collision: Collision shapes in physics: own uses the file's boxes, cylinders, balls, ellipsoids and capsules, and
         capsules for links that collide by meshes.
       out: The file to write; by default NAME.json in the folder of your own hands ('congrasp hands list' names it).
-      png: The picture; by default beside the file.
+      png: The picture; by default next to the file.
 
     Examples:
       congrasp hands import hand.urdf
@@ -122,7 +122,7 @@ def import_hand(
 
 
 def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | None) -> None:
-    """Writes a hand's file and picture, by default in the folder of the user's own hands, and prints all of it."""
+    """Writes a hand's file and picture, by default to the folder of custom hands, and prints a description."""
     from congrasp.common.errors import CongraspError
     from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder
     from congrasp.common.hands.files import hand_text
@@ -134,7 +134,7 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
 
     hand = proposal.hand
     if hand.name in HANDS:
-        raise CongraspError(f"'{hand.name}' is a hand of congrasp.", "Give yours another --name.")
+        raise CongraspError(f"'{hand.name}' is a hand of congrasp.", "Pass another --name.")
     path = out or hands_folder() / f"{hand.name}{SUFFIX}"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, hand_text(hand).encode())
@@ -152,11 +152,11 @@ def check(
     png: pathlib.Path | None = None,
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
 ) -> int:
-    """Decide whether a hand can grasp at all, before it is trained: one line for each check, with what mends it.
+    """Check whether a hand can grasp at all, before it is trained: one line for each check, with its remedy.
 
     Palm, joints, opening and strength are measured; servos, overlaps, and grips of a ball, a cylinder and a box, which
     are lifted and pushed, are simulated. The picture shows the grips and every joint. The exit code is 1 if a check
-    failed; what is in doubt may be as you want it.
+    failed; doubtful results may be intended.
 
     Args:
       hand: A hand, by its name or its file.
@@ -200,26 +200,26 @@ def train(
     training: str = "",
     patience: int = 240,
 ) -> int:
-    """From a URDF or MJCF to a policy and a report: import, self-check, training, evaluation.
+    """Train a hand from a URDF or MJCF to a policy and a report: import, self-check, training, evaluation.
 
     On a GPU it trains the full task by the recipe for all hands; afterwards grasp, serve, evaluate and view take the
-    policy as --hand NAME. Without a GPU the training is short and of an easier task. It stops where the self-check
-    fails. The same command goes on where it was stopped.
+    policy as --hand NAME. Without a GPU the training is short and of an easier task. It stops if the self-check fails.
+    Repeat the command to resume a stopped one.
 
     Args:
-      hand: The hand's URDF (.urdf) or MJCF (.xml), which is imported unless a hand of its name is among your own
-        already; or a hand's name or file.
+      hand: The hand's URDF (.urdf) or MJCF (.xml), which is imported unless there is a custom hand of its name; or a
+        hand's name or file.
       name: As in 'congrasp hands import', like the next three.
-      palm: The body that is the palm.
+      palm: Body of the palm.
       thumb: The last body of the finger that opposes the others.
       object_scale: Factor on the objects that it learns to grasp.
       out: Folder for the self-check, the run and the report; runs/hands/NAME by default.
       anyway: Train it although its self-check failed.
       physics: Engine of the full task and of the evaluation.
-      episodes: Episodes of each row of the report; 0 takes 200, without a GPU 24.
-      pool: Objects of the report; 0 takes 64, without a GPU 12.
+      episodes: Episodes of each row of the report; 0 uses 200, without a GPU 24.
+      pool: Objects of the report; 0 uses 64, without a GPU 12.
       training: Further options of 'congrasp train', as one text.
-      patience: Minutes after which the training is ended, to be resumed by the next 'congrasp hands train'.
+      patience: Minutes after which the training is stopped, to be resumed by the next 'congrasp hands train'.
 
     Examples:
       congrasp hands train my_hand.urdf
@@ -238,7 +238,9 @@ def train(
     at_least(0, episodes=episodes, pool=pool)
     at_least(1, patience=patience)
     full = accelerators()[0] != "cpu"
-    jax.config.update("jax_platforms", "cpu")  # the stages are processes that have a GPU's memory for themselves
+    jax.config.update(
+        "jax_platforms", "cpu"
+    )  # the stages are separate processes, so that each has the whole GPU memory
     reference = _taken(hand, Choices(name, palm, thumb, object_scale))
     found = get_hand(reference)
     request = Request(
@@ -259,7 +261,7 @@ def train(
 
 
 def _taken(hand: str, choices: "Choices") -> str:
-    """What commands call a hand by; that of a URDF or MJCF is imported, unless it was before."""
+    """Name of a hand in commands; that of a URDF or MJCF is imported, unless it was before."""
     from congrasp.common.hands import own_hands
     from congrasp.services.assets.hands.model_files import import_hand as proposed
 
@@ -269,7 +271,7 @@ def _taken(hand: str, choices: "Choices") -> str:
     proposal = proposed(file, choices)
     name = proposal.hand.name
     if name in own_hands():
-        print(f"The hand '{name}' is {own_hands()[name]}; 'congrasp hands import' would make it anew.")
+        print(f"The hand '{name}' is {own_hands()[name]}; 'congrasp hands import' would replace it.")
     else:
         _keep(proposal, None, None)
     return name

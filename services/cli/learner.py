@@ -38,34 +38,33 @@ def learner(
     metric_writers: tuple[MetricWriter, ...] = ("tensorboard",),
     watch: Watched = Watch(),  # noqa: B008
 ) -> int:
-    """The learner alone; actors on this machine or on others connect to it with `congrasp actor --connect`.
+    """Run only the learner; actors on this or other machines connect to it with `congrasp actor --connect`.
 
-    A new run takes its configuration from the preset and the command line; a directory that holds a run keeps its own,
-    but for --updates, --ppo.… and others that the learner alone uses.
+    A new run takes its configuration from the preset and the command line; a directory with a run keeps its
+    configuration, except for --updates, --ppo.… and others that only the learner uses.
 
     Args:
       config: The run.
-      run_dir: Where the run is kept.
-      preset: Named configuration to start from.
+      run_dir: Directory of the run.
+      preset: Named initial configuration.
       hand: The hand, by its name or its file; by default the preset's.
       listen: Endpoint for the actors, which takes four ports from this one on. Other machines need tls/0.0.0.0:PORT.
-      certs: Folder of a learner's certificate (congrasp certs): mutual TLS, and each role may do only what is its own.
+      certs: Folder of a learner's certificate (congrasp certs): enables mutual TLS, and restricts each role to its
+        rights.
       insecure: Listen beyond loopback without certificates.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
       teacher: A policy file, or the hand of a pretrained policy, to distil, as for `congrasp train`; ranks read it.
-      resume: Resume the run in --run-dir from its newest intact checkpoint; a run that has not come to one
-        begins anew.
-      or_resume: Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command
-        every time.
-      rank: Number of this process among several that train together; each needs a GPU of its own
-        (CUDA_VISIBLE_DEVICES).
-      ranks: Learner processes that train together: data parallel, each with actors of its own. The run is that in the
+      resume: Resume the run in --run-dir from its newest intact checkpoint; a run without a checkpoint starts again.
+      or_resume: Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command every
+        time.
+      rank: Number of this process among several that train together; each needs a separate GPU (CUDA_VISIBLE_DEVICES).
+      ranks: Learner processes that train together: data parallel, each with separate actors. The run is in the
         --run-dir of rank 0; rank r listens 4 r ports above --listen.
-      coordinator: Where the ranks find rank 0: its host and a port, which and the next of which must be free there.
-      inside: An actor lives in this process, too, so that its rollouts never leave the device.
-      metric_writers: Where the learner's metrics are written, too: tensorboard (files in the run's folder),
-        wandb-offline (files there, for `wandb sync`), wandb (needs an account); with no name none.
-      watch: How it is watched.
+      coordinator: Host and port of rank 0; this port and the next must be free there.
+      inside: Also run an actor in this process, so that its rollouts never leave the device.
+      metric_writers: Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there,
+        for `wandb sync`), wandb (needs an account); none by default.
+      watch: Monitoring.
 
     Examples:
       congrasp learner --preset human --run-dir runs/human --listen tls/0.0.0.0:7447 --certs certs
@@ -89,7 +88,9 @@ def learner(
                 certs=certs,
                 insecure=insecure,
                 run=config.name,
-                longest_rollout=_longest_rollout(config) if ranks == 1 else None,  # others have rank 0's configuration
+                longest_rollout=_longest_rollout(config)
+                if ranks == 1
+                else None,  # other ranks use rank 0's configuration
             ) as transport,
         ):
             if rank == 0 and resume:
@@ -118,7 +119,7 @@ def learner(
 
 
 def _longest_rollout(config: RunConfig) -> int:
-    """Twice the bytes of a run's rollouts: what is longer is none."""
+    """Limit of rollout messages: twice the size of the run's rollouts, bytes."""
     from congrasp.common.policy.bundle import policy_spec
     from congrasp.learner.algorithms import make_algorithm
     from congrasp.learner.batch import rollout_form
@@ -140,7 +141,7 @@ def _learn(
     writers: Sequence[MetricWriter],
     watch: Watch,
 ) -> None:
-    """Runs the learner until it is finished or told to stop."""
+    """Runs the learner until it is finished or stopped."""
     from congrasp.learner.run_directory import has_checkpoints
     from congrasp.services.ops.logs import log
     from congrasp.services.train.learn import learn

@@ -7,6 +7,8 @@ import importlib
 import inspect
 import io
 import os
+import pathlib
+import re
 import signal
 import sys
 import traceback
@@ -15,7 +17,7 @@ from typing import Any, TextIO
 
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.files import cache_folder
-from congrasp.services.ops.logs import log_error
+from congrasp.services.ops.logs import announced, log_error
 from congrasp.services.ops.shutdown import follow_parent, on_signal
 
 COMMANDS = {
@@ -46,9 +48,13 @@ COMMANDS = {
 }
 """Commands in the order of the help; `services.cli.<name>` is the module."""
 
+_READ = {".obj", ".stl", ".ply", ".glb", ".npz", ".csv", ".bvh", ".mcap", ".safetensors", ".urdf", ".xml"}
+"""Endings of files that commands read."""
+_WRITTEN = ("--out", "--json", "--png", "--video", "--pictures")
+"""Options that name what a command writes."""
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
-"""The reader of the output is gone, as with `congrasp … | head`."""
+"""Raised when the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PATH = (
@@ -76,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except CongraspError as error:
         code = _fail(str(error), error.exit_code, debug)
     except BrokenPipeError:
-        if _last_words(sys.stdout, "\n"):  # it is another pipe that broke
+        if _last_words(sys.stdout, "\n"):  # another pipe broke
             raise
         code = UNREAD
     except OSError as error:
@@ -87,22 +93,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
-    if code in SIGNALLED:  # no time for what an interpreter does at its end
+    if code in SIGNALLED:  # skips the interpreter's shutdown
         os._exit(code)
     sys.exit(code)
 
 
 def _said_of(error: OSError) -> str:
-    """What a full disk, or a path that cannot be used, is to a user; raises other errors, which are faults of ours."""
+    """Describes a full disk, or an unusable path, to the user; raises other errors, which are bugs."""
     if error.errno in _FULL:
         where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
         return f"{where}: {error.strerror}. Free space and start again."
     if error.errno in _PATH and error.filename:
         return str(
-            CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its rights.")
+            CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its permissions.")
         )
     if error.errno == errno.EIO:
-        return "A file could not be read or written: the disk that it is on failed. Try another path."
+        return "A file could not be read or written, because its disk failed. Try another path."
     raise error
 
 
@@ -121,18 +127,47 @@ def run(arguments: list[str]) -> int:
         near = difflib.get_close_matches(name, COMMANDS, 1)
         meant = f"Did you mean '{near[0]}'?" if near else f"Choose one of: {', '.join(COMMANDS)}."
         raise CongraspError(f"There is no command '{name}'.", meant)
+    _check_files(rest)
     _prepare_environment()
     with on_signal(interrupt=True) as stop:
         try:
-            result = _parsed(name, load(name), rest)()
+            with announced(f"Loading 'congrasp {name}'"):
+                call = _parsed(name, load(name), rest)
+            result = call()
         except KeyboardInterrupt:
             result = None
-            stop.wait(1.0)  # the thread that notes which signal it was may be a moment behind
+            stop.wait(1.0)  # the thread that records the signal may be slightly late
         return stop.exit_code or (result if isinstance(result, int) else 0)
 
 
+def _check_files(arguments: Sequence[str]) -> None:
+    """Raises a CongraspError for a file to read that is not there, before anything that takes long is imported."""
+    option = ""
+    for argument in arguments:
+        if argument.startswith("-"):
+            option = argument
+            continue
+        path = pathlib.Path(re.sub(r":\w+$", "", argument))
+        if path.suffix.lower() not in _READ or option in _WRITTEN or _is_there(path):
+            continue
+        named = f"{option}: there" if option else "There"
+        siblings = [one.name for one in path.parent.iterdir()] if path.parent.is_dir() else []
+        near = difflib.get_close_matches(path.name, siblings, 1)
+        remedy = f"Did you mean {path.parent / near[0]}?" if near else "Check the path."
+        raise CongraspError(f"{named} is no file {path}.", remedy)
+
+
+def _is_there(path: pathlib.Path) -> bool:
+    """Returns whether a path exists; an OSError for one that cannot be used."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
-    """The command's module as a function from its arguments to the call that they ask for."""
+    """Returns the command's module as a function from its arguments to the requested call."""
     module = importlib.import_module(f"congrasp.services.cli.{name}")
     from congrasp.services.cli import parser
 
@@ -143,7 +178,7 @@ def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
 
 
 def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: list[str]) -> Callable[[], Any]:
-    """Parses a command line; what is wrong with it becomes one line instead of the parser's box."""
+    """Parses a command line; errors are one line instead of the parser's box."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -162,7 +197,7 @@ def _parsed(name: str, parse: Callable[[list[str]], Callable[[], Any]], rest: li
 
 
 def usage() -> str:
-    """The text of `congrasp --help`."""
+    """Text of `congrasp --help`."""
     width = max(map(len, COMMANDS))
     rows = "\n".join(f"  {name:<{width}}  {text}" for name, text in COMMANDS.items())
     return (
@@ -175,8 +210,10 @@ def usage() -> str:
 
 
 def _prepare_environment() -> None:
-    """Keeps compiled programs between runs, the compilers' chatter off the screen, and OpenGL, for which MuJoCo would
-    start processes, out; what the user set stays."""
+    """Configures caches of compiled programs, compiler output and OpenGL (for which MuJoCo would start processes).
+
+    Variables set by the user are kept.
+    """
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder("jax")))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("MUJOCO_GL", "disable")
@@ -193,7 +230,7 @@ def _fail(text: str, code: int, debug: bool) -> int:
 
 
 def _last_words(stream: TextIO, text: str = "") -> bool:
-    """Writes and flushes, if that is possible; a log on a full disk must not turn the exit code into another."""
+    """Writes and flushes if possible; a log on a full disk must not change the exit code."""
     try:
         stream.write(text)
         stream.flush()

@@ -50,15 +50,15 @@ def import_meshes(
     out: str = "objects",
     mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(),  # noqa: B008
 ) -> int:
-    """Make objects of meshes: decompose them, weigh them, find their resting poses, and store them in a folder.
+    """Import objects from meshes: decompose and weigh them, find their resting poses, and store them in a folder.
 
     A path is a mesh file (STL, OBJ, PLY, GLB), a folder with `graspable.*` and `non_graspable.*`, a folder with convex
-    pieces `contact*` beside `<name>.*` and `<name>_<part>.*`, or a folder of such files and folders.
+    pieces `contact*`, `<name>.*` and `<name>_<part>.*`, or a folder of such files and folders.
 
     Args:
       paths: Mesh files and folders.
       out: Folder for the objects.
-      mesh: How meshes become objects.
+      mesh: Conversion of meshes to objects.
 
     Examples:
       congrasp objects import examples/mug.obj
@@ -70,7 +70,7 @@ def import_meshes(
     from congrasp.services.cli.console import bars, report_error
 
     if not paths:
-        raise CongraspError("There is nothing to import.", "Name mesh files or folders.")
+        raise CongraspError("There is nothing to import.", "Pass mesh files or folders.")
     sources, done, failures = [], 0, 0
     for path in paths:
         try:
@@ -92,7 +92,7 @@ def import_meshes(
                     print(f"{obj.name}: {note}.")
             progress.advance(task)
     if done:
-        print(f"{done} of {done + failures} imported; they are in {out}.")
+        print(f"{done} of {done + failures} imported to {out}.")
     return 2 if failures else 0
 
 
@@ -199,7 +199,7 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
 def rests(
     object: Annotated[str, tyro.conf.Positional], folder: str = "objects", png: pathlib.Path | None = None
 ) -> int:
-    """List an object's resting poses, the likeliest first, and draw them: what `congrasp grasp --rest` takes.
+    """List and draw an object's resting poses, the most likely first, for `congrasp grasp --rest`.
 
     Args:
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
@@ -233,7 +233,7 @@ def rests(
 
 
 def _reach(obj: "GraspObject", headings: "Headings | None", *, region: bool = False) -> list[str]:
-    """Share of the headings, or of those on the graspable region, that the human hand has in each resting pose."""
+    """Share of the headings, or of those on the graspable region, that the human hand can use in each resting pose."""
     from congrasp.common.hands.human import HUMAN
     from congrasp.common.hands.outline import outline
     from congrasp.common.task.sampling.headings import above, within_reach
@@ -258,20 +258,20 @@ def set_affordance(
     name: str = "",
     folder: str = "objects",
 ) -> int:
-    """Divide an object's surface anew into graspable region and avoid region.
+    """Divide an object's surface into graspable region and avoid region.
 
-    Graspable is what lies on the mesh of a part, what is painted in a colour, or what lies beyond a plane. It must have
-    a tenth of the surface at least. Sets of constraints and evaluation then keep to it.
+    The graspable region is the mesh of a part, a painted colour, or the side of a plane. It must cover at least a tenth
+    of the surface. Constraint sets and evaluation then use it.
 
     Args:
       object: A name in the folder, an object file, a mesh, or FAMILY:SEED of the generator, such as mug:7.
-      part_mesh: A mesh of the graspable part, in the frame and unit of the object's own file.
+      part_mesh: A mesh of the graspable part, in the frame and unit of the object's file.
       painted: A PLY file of the object with coloured vertices, in the same frame and unit.
-      colour: Of the graspable region in the painted file: red, green, blue, yellow, or #rrggbb.
-      half_space: Three numbers of a direction and one in metres: graspable is what lies farther than that along the
-        direction. In the object's frame, whose origin is its centre of mass.
-      invert: What was found is the avoid region, and the rest may be grasped.
-      name: Name of the new object; the old one otherwise, which it then replaces.
+      colour: Colour of the graspable region in the painted file: red, green, blue, yellow, or #rrggbb.
+      half_space: Three numbers of a direction and one in metres: the region farther than that along the direction is
+        graspable. In the object's frame, whose origin is its centre of mass.
+      invert: Use the selection as the avoid region, and the rest as the graspable one.
+      name: Name of the new object; by default it replaces the old one.
       folder: Folder of objects, to which the new one goes.
 
     Examples:
@@ -284,7 +284,7 @@ def set_affordance(
 
     if [part_mesh, painted, half_space or None].count(None) != 2:
         raise CongraspError(
-            "It must be clear what may be grasped.", "Set one of --part-mesh, --painted and --half-space."
+            "The graspable region is not defined.", "Pass one of --part-mesh, --painted and --half-space."
         )
     if len(half_space) not in (0, 4):
         raise CongraspError(
@@ -300,7 +300,7 @@ def set_affordance(
         found = affordance.in_half_space(obj, half_space[:3], half_space[3])
     if (found != invert).all():
         raise CongraspError(
-            f"All of the surface of '{obj.name}' could be grasped, so that nothing is divided.",
+            f"All of the surface of '{obj.name}' would be graspable, so nothing is divided.",
             "Choose a smaller part.",
         )
     labelled = affordance.two_parts(obj, found != invert, name)
@@ -311,13 +311,13 @@ def set_affordance(
 
 
 def _size(obj: "GraspObject") -> str:
-    """The sides of its box in cm."""
+    """Sides of its box in cm."""
     sides = 100 * (obj.visual_vertices.max(0) - obj.visual_vertices.min(0))
     return " x ".join(f"{side:.1f}" for side in sides)
 
 
 def _errors(obj: "GraspObject") -> str:
-    """How faithful its pieces are, where it was imported."""
+    """Describes the errors of its pieces, if it was imported."""
     if obj.surface_error is None:
         return "the object is its pieces"
     volume = "" if obj.volume_error is None else f", volume {obj.volume_error:+.1%}"
@@ -325,14 +325,14 @@ def _errors(obj: "GraspObject") -> str:
 
 
 def _parts(obj: "GraspObject") -> tuple[str, str]:
-    """The names of the parts of the graspable and of the avoid region."""
+    """Names of the parts of the graspable and of the avoid region."""
     named = list(zip(obj.part_names, obj.graspable, strict=True))
     graspable, avoided = (", ".join(name for name, allowed in named if allowed == wanted) for wanted in (True, False))
     return graspable, avoided
 
 
 def _colour(text: str) -> tuple[int, int, int]:
-    """Red, green and blue, 0 to 255, of a name or of #rrggbb."""
+    """Parses a colour name or #rrggbb to red, green and blue, 0 to 255."""
     if text in _COLOURS:
         return _COLOURS[text]
     try:

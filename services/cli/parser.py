@@ -1,4 +1,4 @@
-"""Command functions as parsers: their signatures become options, their docstrings help that people read."""
+"""Builds parsers from command functions: signatures become options, and docstrings help."""
 
 import contextlib
 import dataclasses
@@ -15,9 +15,9 @@ import tyro
 
 Command = Callable[..., Any]
 Parser = Callable[[list[str]], Callable[[], Any]]
-"""From the arguments to the call that they ask for."""
+"""From the arguments to the requested call."""
 _QUIET = ("", "None", "False")
-"""Defaults that say nothing: the help text has what happens without the option."""
+"""Defaults that are not shown, because the help describes them."""
 _LARGEST_SEED = 10**15
 _CONTINUED = re.compile(r"\s*\n\s*")
 
@@ -25,7 +25,7 @@ _CONTINUED = re.compile(r"\s*\n\s*")
 def of_command(
     command: Command, prog: str, defaults: Callable[[list[str]], Mapping[str, Any]] = lambda rest: {}
 ) -> Parser:
-    """The parser of a command; `defaults` finds values of its parameters that depend on the arguments."""
+    """Returns the parser of a command; `defaults` computes values of its parameters that depend on the arguments."""
 
     def parse(rest: list[str]) -> Callable[[], Any]:
         bound = functools.partial(_deferred(command), **defaults(rest))
@@ -42,7 +42,7 @@ def of_command(
 
 
 def of_group(commands: Mapping[str, Command], prog: str, description: str | None) -> Parser:
-    """The parser of a group of commands by name."""
+    """Returns the parser of a group of commands by name."""
 
     def parse(rest: list[str]) -> Callable[[], Any]:
         if rest and rest[0] in commands:
@@ -55,14 +55,14 @@ def of_group(commands: Mapping[str, Command], prog: str, description: str | None
 
 
 def examples(command: Command) -> list[str]:
-    """The command lines in the section `Examples` of a command's docstring."""
+    """Returns the command lines in the section `Examples` of a command's docstring."""
     found = docstring_parser.parse(inspect.getdoc(command) or "").examples
     return [line.strip() for example in found for line in (example.description or "").splitlines() if line.strip()]
 
 
 @contextlib.contextmanager
 def _epilog(lines: Sequence[str]) -> Iterator[None]:
-    """Prints examples behind the help, which is what a parser that ends the process without an error has printed."""
+    """Prints examples after the help, which is what a parser prints when it exits without an error."""
     try:
         yield
     except SystemExit as end:
@@ -72,7 +72,7 @@ def _epilog(lines: Sequence[str]) -> Iterator[None]:
 
 
 def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
-    """The command with its arguments bound, to be called once they are known to be right."""
+    """Returns the command with its arguments bound, to be called once they are valid."""
 
     def bind(*args: Any, **options: Any) -> Callable[[], Any]:
         return functools.partial(command, *args, **options)
@@ -87,7 +87,7 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
 
 
 def _described(name: str, hint: Any) -> Any:
-    """A parameter's type, with how its values and its default are shown, and what a seed may be."""
+    """Returns a parameter's type, with the display of its values and default, and the range of seeds."""
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     marks += [_SEED] if name == "seed" or name.endswith("_seed") else []
     for mark in marks:  # a type that is known only when a command line is parsed, such as the engines' names
@@ -99,7 +99,7 @@ def _described(name: str, hint: Any) -> Any:
 
 
 def _seed(words: list[str]) -> int:
-    """A seed that every generator of random numbers takes, with room for those that follow it."""
+    """Parses a seed that every random generator accepts, with room for the following ones."""
     if not words[0].isdecimal() or int(words[0]) > _LARGEST_SEED:
         raise ValueError(f"a seed is a whole number from 0 to {_LARGEST_SEED:.0e}")
     return int(words[0])
@@ -115,14 +115,14 @@ _SEED = tyro.constructors.PrimitiveConstructorSpec(
 
 
 def _value(kind: Any) -> str:
-    """How one value of a tuple is shown."""
+    """Display form of one value of a tuple."""
     if typing.get_origin(kind) is typing.Literal:
         return "{" + ",".join(map(str, typing.get_args(kind))) + "}"
     return "PATH" if kind.__name__ == "Path" else kind.__name__.upper()
 
 
 def _hint(default: str) -> str:
-    """What stands behind an option's help."""
+    """Suffix of an option's help."""
     shown = default.strip("[']")  # a choice is shown as a list
     return "" if shown in _QUIET else f"(default: {shown})"
 
@@ -151,7 +151,7 @@ def _dataclass(info: tyro.constructors.StructTypeInfo) -> tyro.constructors.Stru
 
 
 def _meaning(kind: type, field: str) -> str | None:
-    """What a field means, on one line: the string under it."""
+    """Help of a field, on one line: the string under it."""
     for base in kind.__mro__:
         if found := _meanings(base).get(field):
             return found
@@ -160,7 +160,7 @@ def _meaning(kind: type, field: str) -> str | None:
 
 @functools.cache
 def _meanings(kind: type) -> Mapping[str, str]:
-    """What the fields of one class mean."""
+    """Help of the fields of one class."""
     if kind is object:
         return types.MappingProxyType({})
     params = docstring_parser.parse_from_object(kind).params

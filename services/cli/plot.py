@@ -14,11 +14,11 @@ def plot(
     """Draw a run's learning curves, reward terms and other metrics, or an evaluation's table, rates and errors.
 
     Args:
-      paths: Runs' folders, or MCAP files, which are drawn over one another; a run that is not over is drawn up to its
-        last half second. Or the JSON file of one 'congrasp evaluate --json'.
-      out: Folder for the figures; 'plots' beside the recordings or the JSON file otherwise. Of several runs it must
-        be named.
-      formats: Of the files.
+      paths: Runs' folders, or MCAP files, which are overlaid; a run in progress is drawn up to its last half second. Or
+        the JSON file of one 'congrasp evaluate --json'.
+      out: Folder for the figures; by default 'plots' next to the recordings or the JSON file. Required for several
+        runs.
+      formats: Formats of the files.
 
     Examples:
       congrasp plot runs/mine
@@ -30,11 +30,11 @@ def plot(
 
     evaluations = [path for path in paths if path.suffix == ".json"]
     if not paths:
-        raise CongraspError("No run was named.", "Name the folders of runs: congrasp plot runs/mine")
+        raise CongraspError("No run was given.", "Pass the folders of runs: congrasp plot runs/mine")
     if len(paths) > 1 and evaluations:
-        raise CongraspError(f"{evaluations[0]} can only be drawn alone.", "Runs are drawn over one another.")
+        raise CongraspError(f"{evaluations[0]} cannot be combined with other files.", "Only runs can be overlaid.")
     if len(paths) > 1 and out is None:
-        raise CongraspError("The figures of several runs belong to none of them.", "Name a folder with --out.")
+        raise CongraspError("The figures of several runs have no default folder.", "Pass a folder with --out.")
     folder = out or (paths[0] if paths[0].is_dir() else paths[0].parent) / "plots"
     for file in plot_evaluation(paths[0], folder, formats) if evaluations else plot_runs(paths, folder, formats):
         print(file)

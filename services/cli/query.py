@@ -20,18 +20,18 @@ def query(
     health: bool = False,
     json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Ask a policy server for one action at the start of an episode, or measure its latency.
+    """Query a policy server for one action at the start of an episode, or measure its latency.
 
     Args:
       connect: The server's endpoint.
-      name: Name under which the policy is served.
+      name: Name of the served run.
       object_seed: Seed of the procedural object and of the heading.
-      repeat: Queries in all.
-      concurrency: Clients that ask at the same time, each with a connection of its own.
+      repeat: Total number of queries.
+      concurrency: Number of concurrent clients, each with a separate connection.
       states: States in one query, up to 64; each gets an answer.
-      timeout: Seconds that one query may take.
+      timeout: Deadline of one query, s.
       certs: Folder of a client's certificate (congrasp certs).
-      health: Ask only whether the server is ready; the exit code is 0 if it is, and 4 if it is not.
+      health: Only check whether the server is ready; the exit code is 0 if it is, else 4.
       json: Print JSON: p50_ms, p99_ms, answers_per_s, failed, overloaded.
 
     Examples:

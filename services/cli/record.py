@@ -17,16 +17,16 @@ def record(
 ) -> int:
     """Record a run to MCAP, from this machine or another: metrics, events, versions, rollouts and episodes.
 
-    Ctrl-C ends it and finishes the file. A recorder that is slow or dies never holds the run up, and its file reads up
-    to the last half second.
+    Ctrl-C ends it and finishes the file. A slow or killed recorder never blocks the run, and its file is readable up to
+    the last half second.
 
     Args:
       connect: The learner's endpoint, such as tcp/10.0.0.5:7447.
       run: Name of the run.
       out: Folder for the MCAP files.
-      live: Also offer everything to the Foxglove app on this port of the loopback interface: ws://127.0.0.1:PORT.
-      duration: Seconds after which to stop; without it until Ctrl-C.
-      log_format: Text, or one JSON object a line: time, level, role, id, run, text, fields.
+      live: Also serve everything to the Foxglove app on this port of the loopback interface: ws://127.0.0.1:PORT.
+      duration: Seconds after which to stop; by default on Ctrl-C.
+      log_format: Text, or one JSON object per line: time, level, role, id, run, text, fields.
       certs: Folder of an observer's certificate (congrasp certs).
 
     Examples:

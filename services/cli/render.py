@@ -39,7 +39,7 @@ def episode(
     Args:
       path: A run's folder, or one MCAP file.
       out: The PNG file to write.
-      index: Which of the recorded episodes, from 0; -1 is the last.
+      index: Index of the recorded episode, from 0; -1 is the last.
       success: Count only episodes that succeeded.
       frames: Pictures on the sheet.
       video: Also write the whole episode as an MP4.

@@ -26,22 +26,22 @@ def report(
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None,
     check: pathlib.Path | None = None,
 ) -> int:
-    """Write one HTML file about a policy: results beside the paper's, failed and successful episodes, and its training.
+    """Write one HTML file about a policy: results and those of the paper, failures and successes, and its training.
 
-    It evaluates the policy by the paper's protocol first, and draws some of those very episodes. With 200 episodes a
-    row that takes some minutes on a CPU; a first look: --episodes 16.
+    It evaluates the policy by the paper's protocol first, and draws some of these episodes. With 200 episodes per row
+    that takes some minutes on a CPU; for a quick look pass --episodes 16.
 
     Args:
       source: A run's folder or a policy file; by default a pretrained policy.
       out: The file to write.
-      objects: Objects to grasp, as 'congrasp evaluate' takes them; held-out procedural ones by default.
+      objects: Objects to grasp, as for 'congrasp evaluate'; held-out procedural ones by default.
       episodes: Episodes in each row.
       physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
       pool: Number of procedural objects.
       seed: Seed of constraints and episodes.
-      hand: Whose pretrained policy.
+      hand: Hand of the pretrained policy.
       json: Also write the rows to this file.
-      check: A file of 'congrasp hands check --json', with the picture beside it, to be part of the report.
+      check: A file of 'congrasp hands check --json', with its picture, to include in the report.
 
     Examples:
       congrasp report runs/mine --episodes 16
@@ -52,13 +52,14 @@ def report(
     from congrasp.services.cli.console import at_least, tracked
     from congrasp.services.evaluate.reporting import report_on
     from congrasp.services.evaluate.scores import write_json
+    from congrasp.services.ops.logs import announced
 
     at_least(1, episodes=episodes, pool=pool)
     if out.is_dir():
-        raise CongraspError(f"--out is the folder {out}.", f"Name a file in it: --out {out / 'report.html'}")
+        raise CongraspError(f"--out is the folder {out}.", f"Pass a file in it: --out {out / 'report.html'}")
     run_dir = source if source is not None and source.is_dir() else None
     file = _policy_of_run(run_dir) if run_dir else policy_file(source, hand)
-    with tracked() as track:
+    with announced("Making the report", every=30.0), tracked() as track:
         made = report_on(
             file,
             out,
@@ -82,22 +83,22 @@ def report(
 
 
 def _checked(file: pathlib.Path) -> "HandCheck":
-    """The self-check that a file and the picture beside it show."""
+    """Returns the self-check of a file, with its picture."""
     from congrasp.services.assets.hands.check import read_findings
     from congrasp.services.evaluate.report import HandCheck
 
     picture = file.with_suffix(".png")
     if not picture.is_file():
-        raise CongraspError(f"There is no picture {picture}.", "Make it with 'congrasp hands check --png'.")
+        raise CongraspError(f"There is no picture {picture}.", "Create it with 'congrasp hands check --png'.")
     return HandCheck(read_findings(file), picture.read_bytes())
 
 
 def _policy_of_run(run_dir: pathlib.Path) -> pathlib.Path:
-    """The policy file of a run's folder; a CongraspError if it has none."""
+    """Returns the policy file of a run's folder; raises a CongraspError if it has none."""
     from congrasp.learner.run_directory import POLICY_FILE
 
     if not (run_dir / POLICY_FILE).is_file():
-        raise CongraspError(f"The folder {run_dir} holds no {POLICY_FILE}.", "Name a run's folder, or a policy file.")
+        raise CongraspError(f"The folder {run_dir} holds no {POLICY_FILE}.", "Pass a run's folder, or a policy file.")
     return run_dir / POLICY_FILE
 
 

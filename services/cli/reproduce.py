@@ -33,24 +33,24 @@ def reproduce(
     training: str = "",
     patience: int = 240,
 ) -> int:
-    """From nothing to the paper's tables: trains what is missing, evaluates, and writes a page, JSON and LaTeX.
+    """Reproduce the paper's tables: train missing policies, evaluate, and write a page, JSON and LaTeX.
 
-    On a GPU it trains the full system for each hand, then the baselines and ablations that learn, each as
-    'congrasp train' in a run of its own below OUT/policies; one that fails does not stop the rest. Then it evaluates
-    all tables. Every figure stands beside the paper's with its interval and the difference, and what is not comparable
-    is listed with the reason. The same command goes on where it was stopped: trainings from their last checkpoint,
-    tables that are done are not made again unless policy or numbers changed.
+    On a GPU it trains the full system for each hand, then the baselines and ablations that learn, each as 'congrasp
+    train' in a separate run below OUT/policies; a failure does not stop the rest. Then it evaluates all tables. Every
+    figure is shown with the paper's, its interval and the difference; figures that are not comparable are listed with
+    the reason. Repeat the command to resume a stopped one: trainings resume from their last checkpoint, and finished
+    tables are only repeated if policy or settings changed.
 
     Args:
       out: Folder for reproduction.html, reproduction.json and tables.tex, and for runs, rows and pictures.
       quick: Take the pretrained policies, train nothing, and evaluate 48 episodes a row: minutes on two CPU cores.
-      hands: Whose full system is evaluated, the first one's under everything else too; by default all with a
-        pretrained policy.
+      hands: Whose full system is evaluated, the first one's under everything else too; by default all with a pretrained
+        policy.
       methods: Which methods stand beside it: pd, graspxl, dgrasp, no-dynamic-center, no-feedforward, two-phase,
         single-stage; by default all.
       policy: Policies that need no training, as 'congrasp evaluate' takes them.
-      captured: Folders of captured data sets, each with the folders 'objects' and 'constraints' that
-        'congrasp constraints import' makes; most of the paper's tables are of such.
+      captured: Folders of captured data sets, each with the folders 'objects' and 'constraints' that 'congrasp
+        constraints import' makes; most of the paper's tables are of such.
       episodes: Episodes of a row; 0 takes 1,000, with --quick 48.
       pool: Procedural objects of a row; 0 takes 64, with --quick 24.
       physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.

@@ -39,6 +39,10 @@ def serve(
     import os
     import secrets
 
+    from congrasp.services.ops.logs import announced, log
+
+    starting = contextlib.ExitStack()
+    starting.enter_context(announced("Loading and compiling the policy"))
     # Waking a thread costs more than it saves in one policy's inference: no pool (JAX reads it when it starts) ...
     os.environ.setdefault("NPROC", "1")
 
@@ -48,7 +52,6 @@ def serve(
     from congrasp.common.policy.pretrained import policy_file
     from congrasp.common.transport import urls
     from congrasp.common.transport.keys import Keys
-    from congrasp.services.ops.logs import log
     from congrasp.services.ops.metrics import ServerMetrics
     from congrasp.services.ops.shutdown import on_signal
     from congrasp.services.serve.server import PolicyServer, follow_file, follow_run
@@ -62,6 +65,7 @@ def serve(
     with (
         watch.watched("server", name, run if connect else "", metrics),
         on_signal() as stop,
+        starting,
         contextlib.ExitStack() as stack,
     ):
         if connect:
@@ -73,6 +77,7 @@ def serve(
         transport = stack.enter_context(urls.listen(listen, "server", certs=certs, insecure=insecure))
         server = PolicyServer(transport, name, source, on_answer=metrics.answer, on_batch=metrics.batch)
         metrics.health = server.health
+        starting.close()
         health = server.health()
         log("info", f"Serving '{name}' at {listen}: hand {health['hand']}, version {health['version']}.")
         stop.wait()

@@ -19,7 +19,7 @@ def status(
     certs: pathlib.Path | None = None,
     json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Who works on a run, and how it goes: versions, lag, rates, and the outcomes of tickets and rollouts.
+    """Show the processes and the state of a run: versions, lag, rates, and the outcomes of tickets and rollouts.
 
     The exit code is 1 where the counters do not add up.
 
@@ -27,7 +27,7 @@ def status(
       run_dir: Folder of a run whose learner runs on this machine, in place of --connect and --run.
       connect: The learner's endpoint.
       run: Name of the run.
-      watch: Go on until Ctrl-C, also while the learner is disconnected.
+      watch: Continue until Ctrl-C, also while the learner is disconnected.
       every: Seconds between two looks with --watch.
       certs: Folder of an observer's certificate (congrasp certs).
       json: Print JSON instead of tables; with --watch one object a line, and null while the learner is disconnected.

@@ -105,8 +105,7 @@ def train(
 
 
 def defaults(arguments: list[str]) -> dict[str, Any]:
-    """What a command line decides about the other options' defaults: the preset, and the configuration that it names
-    together with hand and teacher.
+    """Defaults that depend on a command line: the preset, and its configuration for the given hand and teacher.
 
     With --resume the configuration is the run's own; a preset for another hand is refused.
     """

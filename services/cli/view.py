@@ -20,7 +20,7 @@ def view(
     insecure: bool = False,
     certs: pathlib.Path | None = None,
 ) -> int:
-    """Ask for a grasp in the browser and see it: set the heading, paint the avoid region, draw the wrist's path.
+    """Request a grasp in the browser and watch it: set the heading, paint the avoid region, draw the wrist's path.
 
     With a run's folder, or with --connect, it takes the newest weights of a run that is being trained and shows the
     run: its curves, its actors and their episodes. With --recordings a click on a curve finds the episodes of that
@@ -33,7 +33,7 @@ def view(
       connect: A learner's endpoint, such as tcp/10.0.0.5:7447, to attach to.
       run: Name of the run that is attached to.
       recordings: Folder of a run's recordings (*.mcap), of a live run or of one that is over.
-      host: Interface of the page. There is no password: whoever reaches it can use it.
+      host: Interface of the page. There is no password: every client that reaches it can use it.
       port: Port of the page; 0 takes a free one.
       insecure: Offer the page beyond loopback.
       certs: Folder of an observer's certificate (congrasp certs), for --connect.
@@ -42,8 +42,14 @@ def view(
       congrasp view runs/mine
       congrasp view --objects my-objects --port 8080
     """
+    import contextlib
+
     from congrasp.common.errors import CongraspError
+    from congrasp.services.ops.logs import announced
     from congrasp.services.ops.shutdown import on_signal
+
+    starting = contextlib.ExitStack()
+    starting.enter_context(announced("Loading the policies and compiling the studio's rules"))
     from congrasp.services.studio.app import open_view
 
     if run_dir is not None:
@@ -55,6 +61,7 @@ def view(
         connect, run, policy, recordings = _of_folder(run_dir, certs)
     with (
         on_signal() as stop,
+        starting,
         open_view(
             objects=objects,
             policy=policy,
@@ -67,6 +74,7 @@ def view(
             certs=certs,
         ) as url,
     ):
+        starting.close()
         print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
         stop.wait()
         return stop.exit_code

@@ -12,7 +12,7 @@ from congrasp.services.ops.logs import LogFormat, logging_as
 
 @dataclasses.dataclass(frozen=True)
 class Watch:
-    """How a role is watched."""
+    """Options for monitoring a role."""
 
     log_format: LogFormat = "text"
     """Lines of text, or one JSON object a line: time, level, role, id, run, text, fields."""

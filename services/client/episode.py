@@ -78,7 +78,7 @@ class EpisodePolicy(Policy):
         return self._episode
 
     def _ask(self, episode: Mapping[str, np.ndarray], states: Sequence[State]) -> list[Answer]:
-        """The answers to one query, which is made anew if the layout of packed ones has changed."""
+        """Returns the answers to one query, which is repeated if the layout of packed ones has changed."""
         began = time.perf_counter()
         try:
             reply, parts = self._exchange(episode, states)
@@ -95,10 +95,9 @@ class EpisodePolicy(Policy):
         ]
 
     def _exchange(self, episode: Mapping[str, np.ndarray], states: Sequence[State]) -> tuple[Message, list[Any]]:
-        """A query of names at an episode's begin, which is checked field by field; packed ones from then on.
+        """Sends a named query at an episode's start, which is checked field by field; packed ones from then on.
 
-        A query of names says nothing of the past: where a policy that looks back comes into an episode that goes on, it
-        only brings the layout.
+        A named query has no history: when a policy with history joins a running episode, it only provides the layout.
 
         Returns:
           The reply; the actions, finger targets and wrist targets.
@@ -132,7 +131,7 @@ class _Packer:
         self._episode = np.zeros(layout["size"], np.float32)
         points = self._fields["surface_points"][1]
         for name, value in episode.items():
-            if name in ("surface_points", "surface_minus") and len(value) != points:
+            if name in ("surface_points", "surface_avoid") and len(value) != points:
                 value = value[np.arange(points) * len(value) // points]
             self._write(self._episode, name, value)
 
@@ -182,7 +181,7 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
         "object_position_initial": request.object_pose[0],
         "object_quaternion_initial": request.object_pose[1],
         "surface_points": request.surface,
-        **({} if request.avoid is None else {"surface_minus": request.avoid}),
+        **({} if request.avoid is None else {"surface_avoid": request.avoid}),
         **{f"{name}_{field}": value for name, own in request.constraints.items() for field, value in own.items()},
     }
     return {name: _numbers(name, value) for name, value in given.items()}

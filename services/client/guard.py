@@ -1,4 +1,4 @@
-"""What stands between a policy and a robot: a command every tick, whatever the policy does or fails to do.
+"""Guard between a policy and a robot: a command every tick, whatever the policy does.
 
 The policy is asked in a thread of its own, so that no network holds the control loop up. Needs nothing but numpy.
 """
@@ -23,7 +23,7 @@ _END = 2.0  # seconds that the asking thread has to end
 
 @dataclasses.dataclass
 class Counters:
-    """What has happened since the guard was made."""
+    """Counters since the guard was created."""
 
     steps: int = 0
     """Commands."""
@@ -56,14 +56,14 @@ class Counters:
 
 
 class Command(NamedTuple):
-    """What the robot is to do until the next one; all of it within the limits."""
+    """Command for the robot until the next one, within all limits."""
 
     q_target: np.ndarray
     """(F,) finger joint targets, rad."""
     u_target: np.ndarray
     """(6,) wrist targets relative to the base: x, y, z in m, intrinsic x-y-z angles in rad."""
     q_torque: np.ndarray
-    """(F,) N.m: the same, for a robot that is told torques."""
+    """(F,) the same as torques, for a torque-controlled robot, N.m."""
     u_torque: np.ndarray
     """(6,) N and N.m, likewise."""
     mode: Mode
@@ -78,12 +78,13 @@ class Guard:
 
     An answer is fresh when the state that it was asked with is at most `stale` old. While there is none, the last
     targets are held; after `hold` seconds without one, the fallback is taken and kept until the next `reset`: `freeze`
-    keeps the targets, `open` opens the fingers as fast as the limits allow and keeps the wrist. The policy goes on
-    from the targets that were commanded, not from those that it wanted.
+    keeps the targets, `open` opens the fingers as fast as the limits allow and keeps the wrist. The policy continues
+    from the commanded targets, not from its own.
 
     Attributes:
       counters: what has happened.
-      trouble: why the last query had no answer; empty while it has, also during a fallback, which goes on asking.
+      trouble: reason why the last query had no answer; empty otherwise, also during a fallback, which keeps sending
+        queries.
     """
 
     def __init__(
@@ -137,12 +138,13 @@ class Guard:
         self._asker = _Asker(policy)
 
     def reset(self, request: GraspRequest, *, moved: bool = False) -> None:
-        """Begins an episode; what is under way of the one before counts no more.
+        """Begins an episode; a pending query of the previous one is dropped.
 
         Args:
           request: see `Policy.reset`; the wrist's targets start from its `wrist`, where the hand must be, and those of
-            the fingers go on from the last command. The first episode's start from its `q`.
-          moved: somebody else has moved the fingers since the last command: they, too, start from `q`.
+            the fingers continue from the last command. The first episode's start from its `q`.
+          moved: True if the fingers were moved by other means since the last command: their targets also start from
+            `q`.
 
         Raises:
           CongraspError: its `q` is not a finite angle for each finger joint.
@@ -213,7 +215,7 @@ class Guard:
             self.counters.answers += 1
 
     def _mode(self) -> Mode:
-        """What the next command does."""
+        """Mode of the next command."""
         age = self._clock() - self._fresh
         if self._latched or not 0.0 <= age <= self._hold:
             self._latched = True

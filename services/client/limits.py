@@ -1,4 +1,4 @@
-"""Limits of what a robot is told, whatever comes in; needs nothing but numpy.
+"""Limits of a robot's commands, for any input; needs nothing but numpy.
 
 Every comparison is written so that what is not a number fails it: a target that is NaN, infinite or of the wrong shape
 holds the joint where it was told to be last.
@@ -86,14 +86,14 @@ class JointLimits:
 
 
 class Limited(NamedTuple):
-    """What a robot may be told."""
+    """A command within the limits."""
 
     target: np.ndarray
     """(J,) positions, within the limits of position and speed."""
     torque: np.ndarray
     """(J,) what the servos give at that target, within the limits; 0 where the measurement is not finite."""
     by: tuple[str, ...]
-    """What held a target back: of `not_finite`, `torque`, `speed`, `position`."""
+    """Limits that were applied to a target: of `not_finite`, `torque`, `speed`, `position`."""
 
 
 class Limiter:

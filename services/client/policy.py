@@ -1,4 +1,4 @@
-"""What a control loop asks of a policy, wherever it is; needs nothing but numpy."""
+"""Interface of policies for control loops, local or remote; needs nothing but numpy."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol, Self
@@ -12,7 +12,7 @@ State = Mapping[str, np.ndarray]
 
 
 class Answer(NamedTuple):
-    """What the policy wants next."""
+    """Targets of the policy."""
 
     q_target: np.ndarray
     """(F,) finger joint targets, rad."""
@@ -23,7 +23,7 @@ class Answer(NamedTuple):
     version: int
     """Version of the policy that answered."""
     active: tuple[str, ...]
-    """Which constraints are active and why, in sentences."""
+    """Active constraints and the reasons, in sentences."""
     round_trip_ms: float
     """From asking to the answer."""
     server_ms: float
@@ -68,13 +68,13 @@ class Policy(Protocol):
         ...
 
     def act_each(self, states: Sequence[State]) -> list[Answer]:
-        """Joint targets for each of several states, as `act` would give them now; the episode does not go on.
+        """Joint targets for each of several states, as `act` would return them now; the episode does not advance.
 
         For planners that weigh candidates: one query for all of them costs a small part of one for each.
 
         Args:
           states: see `act`; 1 to 64. One may also have its own `time` in control steps, and `q_target` and `u_target`,
-            from which its targets go on.
+            from which its targets continue.
 
         Raises:
           TransportError: see `act`; if one state is bad, none gets an answer.

@@ -1,8 +1,8 @@
-"""The hands that DexGraspBench has, and which joint of a hand of this project is which of theirs.
+"""Hands of DexGraspBench, and the correspondence between their joints and those of this project's hands.
 
 The benchmark takes them from MuJoCo Menagerie (Allegro V3: SimLab, BSD-2; Shadow: Shadow Robot Company, Apache-2.0).
-Here are their names and kinematics as facts, in the frame of the palm's body with every joint at zero. A hand is told
-by these, not by names: it is the benchmark's if its joints are where the benchmark has them.
+Here are their names and kinematics as facts, in the frame of the palm's body with every joint at zero. A hand is
+recognised by these, not by names: it is the benchmark's if its joints are at the same places.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from congrasp.services.export.motion_file import GraspMotion
 Row = tuple[float, float, float, float, float, float]
 """Anchor (m) and axis (unit) of a joint, in the palm's frame at zero."""
 PLACES_MM = 0.1
-"""How far a joint may be from where the benchmark has it."""
-_FACING = 1e-3  # rad, how far an axis may be turned
+"""Tolerance of a joint's position relative to the benchmark."""
+_FACING = 1e-3  # tolerance of an axis's direction, rad
 
 
 class Shape(NamedTuple):
@@ -44,7 +44,7 @@ class BenchmarkHand(NamedTuple):
     fingers: dict[str, tuple[Row, ...]]
     """The joints of each finger from the palm on; the key with a number is a joint's name."""
     from_tip: bool
-    """Whether they are numbered from the tip, from 1 on, instead of from the palm, from 0 on."""
+    """True if they are numbered from the tip, from 1 on, instead of from the palm, from 0 on."""
     position: tuple[float, float, float]
     """m, of the palm in the frame of the root, which is what the benchmark places."""
     quaternion: tuple[float, float, float, float]
@@ -56,7 +56,7 @@ class BenchmarkHand(NamedTuple):
     torque_limit: float
     """N.m of every motor."""
     shapes: tuple[Shape, ...] = ()
-    """What collides; empty where that is meshes."""
+    """Collision shapes; empty if those are meshes."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -69,7 +69,7 @@ class BenchmarkHand(NamedTuple):
 
     @property
     def rows(self) -> np.ndarray:
-        """(F, 2, 3) anchors and axes."""
+        """Anchors and axes (F, 2, 3)."""
         return np.array([*itertools.chain(*self.fingers.values())]).reshape(-1, 2, 3)
 
 
@@ -189,7 +189,7 @@ BENCHMARK_HANDS = {
 
 
 class Match(NamedTuple):
-    """A hand of this project as the benchmark has it."""
+    """Assignment of a hand of this project to the benchmark's."""
 
     name: str
     """Of the benchmark's hand."""
@@ -204,7 +204,8 @@ class Match(NamedTuple):
     """From the wrist frame to the root's."""
 
     def qpos(self, position: np.ndarray, rotation: Rotation, q: np.ndarray) -> np.ndarray:
-        """(7 + F,) root's place and quaternion (w, x, y, z) in the world and the joints, as the benchmark stores them.
+        """Position and quaternion (w, x, y, z) of the root in the world and joints (7 + F,), as the benchmark stores
+        them.
 
         Args:
           position: (3,) m, of the wrist in the world.
@@ -233,14 +234,14 @@ class Match(NamedTuple):
         return found
 
     def joint_frames(self, qpos: np.ndarray) -> tuple[np.ndarray, Rotation]:
-        """Where the benchmark's kinematics has what each joint moves, by the product of exponentials.
+        """Frames of each joint's link in the benchmark's kinematics, by the product of exponentials.
 
         Args:
           qpos: (7 + F,), see `qpos`.
 
         Returns:
-          (F, 3) m, the joints' anchors in the world; and the turn of what follows each from this project's zero pose
-          to the world.
+          (F, 3) m, the joints' anchors in the world; and the turn of what follows each from this project's zero pose to
+          the world.
         """
         root = Rotation.from_quat(qpos[3:7], scalar_first=True)
         palm = root * Rotation.from_quat(self.hand.quaternion, scalar_first=True)
@@ -261,9 +262,9 @@ class Match(NamedTuple):
 
 
 def match_hand(motion: GraspMotion) -> Match:
-    """The benchmark's hand that a motion's hand is, whatever its joints are called.
+    """Returns the benchmark's hand for a motion's hand, whatever the names of its joints.
 
-    Every way of pairing fingers with the benchmark's is laid over it (Kabsch); the best must fit to `PLACES_MM`.
+    Every assignment of fingers is aligned with the benchmark's (Kabsch); the best must match to `PLACES_MM`.
 
     Raises:
       CongraspError: the benchmark has no such hand.
@@ -290,7 +291,7 @@ def match_hand(motion: GraspMotion) -> Match:
 
 
 def benchmarked(hand: Hand, match: Match) -> Hand:
-    """The hand with the benchmark's motors, damping, and collision shapes where they are no meshes."""
+    """Returns the hand with the benchmark's motors, damping, and collision shapes unless those are meshes."""
     motor = match.hand
 
     def driven(joint: Joint) -> Joint:
@@ -311,7 +312,7 @@ def benchmarked(hand: Hand, match: Match) -> Hand:
 
 
 def _chains(motion: GraspMotion) -> list[np.ndarray]:
-    """Indices of the joints of each finger, from the palm on; none for a hand that is no palm with chains."""
+    """Joint indices of each finger, from the palm on; empty if the hand is not a palm with chains."""
     parents, links = motion.link_parent, motion.joint_link
     found = []
     for tip in sorted({*range(len(parents))} - {*parents.tolist()}):
@@ -327,7 +328,7 @@ def _chains(motion: GraspMotion) -> list[np.ndarray]:
 
 
 def _laid_over(name: str, hand: BenchmarkHand, order: np.ndarray, motion: GraspMotion) -> tuple[float, Match | None]:
-    """How far in mm the farthest joint is off with these joints for the benchmark's, and the match."""
+    """Error in mm of the farthest joint for this assignment of joints, and the match."""
     theirs, anchors, axes = hand.rows, motion.joint_anchor[order].astype(float), motion.joint_axis[order].astype(float)
     middle, center = theirs[:, 0].mean(0), anchors.mean(0)
     turn = Rotation.align_vectors(theirs[:, 0] - middle, anchors - center)[0]

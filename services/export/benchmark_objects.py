@@ -1,4 +1,4 @@
-"""The object of a motion as DexGraspBench has objects: a folder with its mesh, its convex pieces and its mass."""
+"""Object of a motion in the format of DexGraspBench: a folder with its mesh, its convex pieces and its mass."""
 
 import hashlib
 import json
@@ -27,7 +27,7 @@ _MOST_FILES = 1024  # bodies whose pieces are kept
 
 
 def convex_object(motion: GraspMotion) -> GraspObject:
-    """The object in the motion's object frame, made of convex pieces: a motion has its mesh alone.
+    """Returns the object in the motion's object frame, made of convex pieces, since a motion only has its mesh.
 
     Raises:
       CongraspError: the mesh has no volume.
@@ -39,7 +39,7 @@ def convex_object(motion: GraspMotion) -> GraspObject:
         bodies = [trimesh.Trimesh(*shape)]
     pieces = [piece for body in bodies for piece in _pieces(body, max(1, MAX_MESH_PIECES // len(bodies)))]
     if not pieces:
-        raise CongraspError(f"The mesh of '{motion.object}' has no volume.", "Make the motion anew.")
+        raise CongraspError(f"The mesh of '{motion.object}' has no volume.", "Generate the motion again.")
     return plain_object(motion.object, tuple(pieces), _DENSITY)
 
 
@@ -73,8 +73,8 @@ def write_object(folder: pathlib.Path, obj: GraspObject, origin: np.ndarray, sca
 def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
     """Convex pieces of one body; none of a flat one.
 
-    What CoACD made is kept in the user's cache folder until the code of the decomposition changes. What stands in for
-    that where CoACD had too little time is not: another run may have more.
+    Results of CoACD are cached in the user's cache folder until the code of the decomposition changes. Substitutes
+    after a timeout of CoACD are not cached.
     """
     vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
     code = source_digest(congrasp.services.assets.objects, congrasp.common.objects).encode()

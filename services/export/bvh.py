@@ -1,6 +1,6 @@
 """Biovision hierarchy: centimetres and y-up, as motion-capture programs expect; read back by bvhio.
 
-The format has no place for comments, so that what the numbers mean is written beside it, to `<name>.json`.
+The format has no comments, so the meaning of the numbers is written to `<name>.json` next to it.
 """
 
 import json
@@ -22,7 +22,7 @@ _ROOT = "world"
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
-    """Writes one motion, and what it means beside it."""
+    """Writes one motion, and the description of its numbers next to it."""
     (motion,) = motions
     found = bodies(motion)
     names = identifiers([_ROOT, *(body.name for body in found)])[1:]
@@ -80,13 +80,13 @@ def _row(values: np.ndarray) -> str:
 
 
 def _end(motion: GraspMotion, index: int) -> np.ndarray:
-    """Where the end of a last link is drawn, m in its frame: the far end of its last capsule."""
+    """Drawn end of a last link, in its frame, m: the far end of its last capsule."""
     capsules = np.flatnonzero(motion.capsule_link == index)
     return motion.capsule_ends[capsules[-1], 1] if len(capsules) else np.array([0.0, 0.0, 0.01])
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """What bvhio reads, put together from the root to the tips."""
+    """Reads a file with bvhio, composed from the root to the tips."""
     import bvhio
 
     names = json.loads(path.with_name(f"{path.name}.json").read_text())["frames"]

@@ -1,4 +1,4 @@
-"""What a camera that stands still sees of motions: hand, object and table, without what only a simulation knows."""
+"""Video of motions from a fixed camera: hand, object and table, without simulation-only elements."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +23,7 @@ _STEP = 10  # frames from one that the camera is fitted to, to the next
 
 
 def camera_for(motions: Sequence[GraspMotion]) -> Camera:
-    """The camera that holds hands and objects of all motions."""
+    """Returns a camera that shows hands and objects of all motions."""
     points = np.concatenate([_extent(motion) for motion in motions])
     return fit(points[ConvexHull(points).vertices], _DIRECTION, SIZE[0] / SIZE[1])
 
@@ -61,7 +61,7 @@ def calibration(camera: Camera) -> dict[str, Any]:
 
 
 def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
-    """The hand, the object, and the table while it stands."""
+    """Shapes of the hand, the object, and the table while it is present."""
     hand = skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
     own = motion.colours
     mesh = motion.object_vertices, motion.object_faces

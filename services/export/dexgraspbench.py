@@ -45,7 +45,7 @@ _LEVER = 0.05  # m; points this far from a joint show its rotation
 
 
 class State(NamedTuple):
-    """A hand beside the object as it lies in the grasp."""
+    """A hand relative to the object at the grasp."""
 
     position: np.ndarray
     """(3,) m, of the wrist in the world."""
@@ -56,7 +56,7 @@ class State(NamedTuple):
 
 
 class Grasp(NamedTuple):
-    """What the benchmark is given of a motion."""
+    """Data of a motion for the benchmark."""
 
     name: str
     hand: Hand
@@ -80,21 +80,21 @@ class Grasp(NamedTuple):
 def export_grasps(
     paths: Sequence[pathlib.Path], folder: pathlib.Path, progress: Callable[[int], None] = lambda done: None
 ) -> tuple[list[Grasp], float, list[str]]:
-    """Writes the grasps of motions into a new folder, which comes into being when all are written.
+    """Writes the grasps of motions into a new folder, which is created when all are written.
 
     Args:
-      paths: NPZ files, recordings, and folders of `congrasp grasp`, of which all results below them are taken.
-      folder: gets `GRASPS` and `OBJECTS`.
-      progress: told how many motions are done.
+      paths: NPZ files, recordings, and folders of `congrasp grasp`, with all results below them.
+      folder: output folder, with `GRASPS` and `OBJECTS`.
+      progress: called with the number of finished motions.
 
     Returns:
-      The grasps, the largest error in mm (`write_grasp`), and why motions were left out.
+      The grasps, the largest error in mm (`write_grasp`), and reasons for skipped motions.
 
     Raises:
       CongraspError: nothing can be exported, the motions are of several hands, or the folder cannot be written.
     """
     if folder.exists():
-        raise CongraspError(f"{folder} is there already.", "Remove it or name another with --out.")
+        raise CongraspError(f"{folder} exists already.", "Remove it or pass another with --out.")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workplace:
@@ -102,7 +102,7 @@ def export_grasps(
             found = _write_grasps(paths, draft, progress)
             draft.rename(folder)
     except OSError as error:
-        raise CongraspError(f"{folder} cannot be written: {error.strerror}.", "Choose another with --out.") from None
+        raise CongraspError(f"{folder} cannot be written: {error.strerror}.", "Pass another with --out.") from None
     return found
 
 
@@ -121,12 +121,12 @@ def _write_grasps(
             left_out.append(f"{file}: {error}")
         else:
             if grasps and grasp.hand.name != grasps[0].hand.name:
-                raise CongraspError(f"{file} is of another hand, {grasp.hand.name}.", "Export each hand for itself.")
+                raise CongraspError(f"{file} is of another hand, {grasp.hand.name}.", "Export each hand separately.")
             if (off := write_grasp(grasp, folder)) <= TOLERANCE_MM:
                 grasps.append(grasp)
                 worst = max(worst, off)
             else:
-                left_out.append(f"{file}: the benchmark has it {off:.3g} mm off; {TOLERANCE_MM} mm is let through")
+                left_out.append(f"{file}: off by {off:.3g} mm in the benchmark, above the limit of {TOLERANCE_MM} mm")
         progress(done)
     if not grasps:
         raise CongraspError(" ".join(["None of the motions can be exported.", *left_out[:1]]))
@@ -134,17 +134,18 @@ def _write_grasps(
 
 
 def _files_at(paths: Sequence[pathlib.Path]) -> Iterator[pathlib.Path]:
-    """Files as they are, and all results below folders of `congrasp grasp`."""
+    """Yields files unchanged, and all results below folders of `congrasp grasp`."""
     for path in paths:
         below = sorted(path.rglob(_MOTION)) if path.is_dir() else []
         yield from below or [path]
 
 
 def _grasp_at(file: pathlib.Path, names: set[str]) -> Grasp:
-    """The grasp of a motion's file, by a name that is not among `names`, to which it is added.
+    """Returns the grasp of a motion's file, under a name that is added to `names`.
 
     Raises:
-      CongraspError: it is no motion, its object is not held or has no volume, or the benchmark does not have its hand.
+      CongraspError: it is not a motion, its object is not held or has no volume, or the benchmark does not have its
+        hand.
     """
     motion = pick_motion(file)
     if not motion.metrics.get("held", motion.success):
@@ -201,7 +202,7 @@ def squeezed(hand: Hand, motion: GraspMotion, t: int, kp: float) -> np.ndarray:
 
 
 def arrays_of(grasp: Grasp) -> dict[str, np.ndarray]:
-    """What the benchmark reads of a grasp, by its names.
+    """Arrays of a grasp for the benchmark, by its names.
 
     Returns:
       `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + F,): the root's place (m) and quaternion (w, x, y, z) in the
@@ -234,7 +235,7 @@ def write_grasp(grasp: Grasp, folder: pathlib.Path) -> float:
     arrays: dict[str, Any] = arrays_of(grasp)
     np.savez(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
-    error = error_mm(grasp, read_npz(path, "Export it anew."))
+    error = error_mm(grasp, read_npz(path, "Export it again."))
     if error <= TOLERANCE_MM:
         write_object(folder / OBJECTS / grasp.name, grasp.obj, grasp.origin, grasp.scale)
     else:
@@ -281,7 +282,7 @@ def _state(motion: GraspMotion, t: int) -> State:
 
 
 def _carried(motion: GraspMotion, t: int, last: int) -> State:
-    """The hand of frame `t` beside the object as it lies in frame `last`."""
+    """The hand of frame `t` relative to the object of frame `last`."""
     state = _state(motion, t)
     turn = _rotation(motion.object_quaternion[last]) * _rotation(motion.object_quaternion[t]).inv()
     place = motion.object_position[last] + turn.apply(state.position - motion.object_position[t])

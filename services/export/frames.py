@@ -1,4 +1,4 @@
-"""Poses of every link and of the object over time: what each format is made from, and what each is checked by."""
+"""Poses of every link and of the object over time, from which formats are written and checked."""
 
 import contextlib
 import re
@@ -21,10 +21,10 @@ OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""
 SKIN = "skin"
 """Name of the hand's surface."""
-COLOURS = {"flesh": palette.FLESH, "link": palette.SKIN, "joint": palette.JOINT, OBJECT: palette.OBJECT}
-"""Of a human hand, of a robot's links and joints, and of the object."""
+COLOURS = {**palette.MATERIALS, OBJECT: palette.OBJECT}
+"""Of the materials of hands, and of the object."""
 TOLERANCE_MM = 0.1
-"""Files whose kinematics differ by more than this are not kept."""
+"""Largest error of the kinematics of a file that is kept, mm."""
 _LEVER = 0.1  # m; a point this far from a frame's origin shows its rotation
 _SAME_TIME = 1e-6  # s
 _KINEMATICS = ("link_names", "link_parent", "joint_link", "joint_axis", "joint_anchor")
@@ -38,7 +38,7 @@ TO_Y_UP = Rotation.from_matrix(FROM_Y_UP[:3, :3].T)
 
 
 class Track(NamedTuple):
-    """What a file says about one motion, worked out by its reader."""
+    """Content of a file for one motion, computed by its reader."""
 
     time: np.ndarray
     """(T,) s, from zero."""
@@ -93,8 +93,8 @@ def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def skin_of_motion(motion: GraspMotion) -> Skin:
-    """The surface of the motion's hand; the meshes of its file where it is one of the user's own and can be read."""
-    with contextlib.suppress(CongraspError):  # the motion itself has all that is needed
+    """Returns the surface of the motion's hand; that of its file's meshes if it is a custom hand and readable."""
+    with contextlib.suppress(CongraspError):  # the motion itself has all the data
         if motion.hand in own_hands() and _same_hand(motion, hand := get_hand(motion.hand)):
             return skin_of(hand)
     origins = np.zeros((len(motion.link_names), 3))
@@ -116,7 +116,7 @@ def skin_of_motion(motion: GraspMotion) -> Skin:
 
 
 def _same_hand(motion: GraspMotion, hand: Hand) -> bool:
-    """Whether a hand of the motion's name still is as in the motion."""
+    """True if the hand of the motion's name is unchanged."""
     arrays = hand_arrays(hand)
     return all(np.array_equal(arrays[name], getattr(motion, name)) for name in _KINEMATICS)
 
@@ -146,7 +146,7 @@ def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
 
 
 def error_mm(motion: GraspMotion, track: Track) -> float:
-    """Largest distance in mm between where a point is and where the file has it.
+    """Largest distance in mm between points of the motion and of the file.
 
     The points are each frame's origin and three a decimetre away along its axes, at every time, and the object's
     triangles in its frame.
@@ -179,7 +179,7 @@ def error_mm(motion: GraspMotion, track: Track) -> float:
 
 
 def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dict[str, Any]:
-    """What goes into every file: where the motion comes from, and what its numbers mean in this format."""
+    """Metadata of every file: origin of the motion, and meaning of its numbers in this format."""
     return {
         "generator": "congrasp",
         "hand": motion.hand,

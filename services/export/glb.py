@@ -42,7 +42,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     file.asset.generator = "congrasp"
     file.nodes.append(gltf.Node(name="world", rotation=TO_Y_UP.as_quat().tolist(), extras=about))
     skin = skin_of_motion(motion)
-    for name in (*(("flesh",) if skin.flesh else ("link", "joint")), OBJECT):
+    for name in (*skin.parts(), OBJECT):
         surface = gltf.PbrMetallicRoughness(baseColorFactor=[*COLOURS[name], 1.0], metallicFactor=0.0)
         file.materials.append(gltf.Material(name=name, pbrMetallicRoughness=surface))
     time = _add(file, data, motion.time, bounds=True)
@@ -126,12 +126,10 @@ def _add_skin(file: gltf.GLTF2, data: bytearray, skin: Skin) -> None:
         JOINTS_0=_add(file, data, links, gltf.ARRAY_BUFFER),
         WEIGHTS_0=_add(file, data, weights, gltf.ARRAY_BUFFER),
     )
-    of_joints = skin.joint[skin.faces[:, 0]]
     primitives = []
-    for material, part in enumerate((skin.faces[~of_joints], skin.faces[of_joints])):
-        if len(part):
-            indices = _add(file, data, part.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
-            primitives.append(gltf.Primitive(attributes=attributes, indices=indices, material=material))
+    for material, part in enumerate(skin.parts().values()):
+        indices = _add(file, data, part.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
+        primitives.append(gltf.Primitive(attributes=attributes, indices=indices, material=material))
     inverse = np.tile(np.eye(4), (len(skin.origins), 1, 1))
     inverse[:, :3, 3] = -skin.origins
     joints = [1 + link for link in range(len(skin.origins))]

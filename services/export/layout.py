@@ -17,7 +17,7 @@ CURVES = {
     "Staleness": ("staleness_mean", "staleness_max"),
     "Losses": ("policy_loss", "value_loss", "kl"),
 }
-"""Plots of a learner's metrics; those that the recording lacks are left out."""
+"""Plots of a learner's metrics; those that the recording lacks are omitted."""
 SIGNALS = {
     "Reward": ("reward.total", "reward.contact", "reward.distance"),
     "Contact": ("links_in_contact", "object_height"),
@@ -26,7 +26,7 @@ SIGNALS = {
 _LOOKED_AT = ("/episode/", "/metrics/learner/", "/events/")
 _SHOWN = ("scene", "contacts")
 _ACTORS = 4
-"""Actors whose scenes are shown at first; the others can be switched on."""
+"""Actors whose scenes are shown initially; the others can be enabled."""
 
 
 def export_layout(recording: pathlib.Path, path: pathlib.Path) -> int:
@@ -103,6 +103,6 @@ def _scene(actors: Sequence[str]) -> fl.ThreeDeePanel:
 
 
 def _split(direction: str, items: Sequence[tuple[float, fl.Content]]) -> fl.Content:
-    """Panels side by side or below one another, with their shares of the space."""
+    """Arranges panels horizontally or vertically, with their shares of the space."""
     kept = [fl.SplitItem(proportion=share, content=content) for share, content in items]
     return fl.SplitContainer(direction="row" if direction == "row" else "column", items=kept)

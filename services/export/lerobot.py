@@ -1,6 +1,6 @@
 """A LeRobot dataset, version 3.0: one episode a motion; written with pyarrow, read back by its own layout.
 
-`observation.state` is what the robot feels (finger joints, then the wrist's pose), `observation.environment_state` the
+`observation.state` is the proprioception (finger joints, then the wrist's pose), `observation.environment_state` the
 object's pose, `action` the finger targets and the wrist's pose one step later. The hand is in `meta/hand.urdf`. With a
 camera there is `observation.images.front` too: one MP4 for all episodes, a frame for every row.
 """
@@ -45,7 +45,9 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
         raise CongraspError(f"A control step of {first.control_dt} s makes no whole number of frames a second.")
     for motion in motions:
         if (motion.hand, motion.control_dt) != (first.hand, first.control_dt):
-            raise CongraspError("A dataset has one hand and one control step; the motions differ.", "Export each set.")
+            raise CongraspError(
+                "A dataset has one hand and one control step, but the motions differ.", "Export each set."
+            )
     tasks = list(dict.fromkeys(_task(motion) for motion in motions))
     episodes = [_columns(motion, i, tasks) for i, motion in enumerate(motions)]
     lengths = [len(motion.time) for motion in motions]
@@ -96,7 +98,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
 
 
 class _Film(NamedTuple):
-    """What a camera saw."""
+    """Recording of a camera."""
 
     camera: Camera
     pixels: list[np.ndarray]
@@ -104,7 +106,7 @@ class _Film(NamedTuple):
 
 
 def _film(path: pathlib.Path, motions: Sequence[GraspMotion], fps: int) -> _Film:
-    """Writes the video of all motions, one after the other, from a camera that holds them all."""
+    """Writes the video of all motions in sequence, from a camera that shows all of them."""
     camera, pixels = camera_for(motions), list[np.ndarray]()
 
     def frames() -> Iterator[np.ndarray]:
@@ -121,7 +123,7 @@ def _film(path: pathlib.Path, motions: Sequence[GraspMotion], fps: int) -> _Film
 
 
 def _filmed(pixels: np.ndarray, frames: int, seconds: np.ndarray) -> dict[str, Any]:
-    """What the row of an episode says of its part of the video, from one second (2,) to another."""
+    """Entries of an episode's row for its part of the video, from one second (2,) to another."""
     begin, end = seconds.tolist()
     place = {**_PLACE, "from_timestamp": begin, "to_timestamp": end}
     statistics = _image_statistics(pixels, frames)
@@ -205,7 +207,7 @@ def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
 
 
 def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int) -> dict[str, Any]:
-    """What the data set holds: features with their shapes and names, counts, where files are."""
+    """Description of the data set: features with their shapes and names, counts, paths of files."""
     joints = motion.joint_names.tolist()
     wrist = [f"wrist_{name}" for name in _POSE]
     names = {

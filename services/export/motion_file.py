@@ -1,4 +1,4 @@
-"""A grasp motion as one NPZ file that says itself what its numbers mean; what exports and other programs start from.
+"""A grasp motion as one self-describing NPZ file, the source of exports and other programs.
 
 Metres, radians, seconds, newtons; quaternions are (w, x, y, z) and turn a body's frame into the world. The world's z
 axis points up and the table's top is at z = 0. T frames, F finger joints, L links, C capsules, K waypoints.
@@ -40,7 +40,7 @@ _OLDER = {"pose_joints": "pose_q"}
 class GraspMotion:
     """A hand that approaches an object, closes, and holds it after table removal.
 
-    What is no array is kept as JSON under the name `meta`, beside the meaning of every array.
+    Other values are stored as JSON under the name `meta`, with the meaning of every array.
     """
 
     hand: str
@@ -48,7 +48,7 @@ class GraspMotion:
     object: str
     """Name of the object."""
     success: bool
-    """Whether the object was held a quarter of a second after table removal; `metrics["held"]`: to the end."""
+    """True if the object was held a quarter of a second after table removal; `metrics["held"]`: to the end."""
     control_dt: float
     """Seconds between two frames."""
     constraints: tuple[str, ...]
@@ -56,7 +56,7 @@ class GraspMotion:
     metrics: dict[str, float]
     """Errors, forces and reward of the episode, by the names in `actors.env.metric_names`."""
     about: dict[str, Any]
-    """Where it comes from: version of the policy, file of the object, command."""
+    """Origin: version of the policy, file of the object, command."""
     time: Annotated[np.ndarray, "(T,) s"]
     table: Annotated[np.ndarray, "(T,) bool, whether the table stands"]
     wrist_position: Annotated[np.ndarray, "(T, 3) m, world"]
@@ -83,7 +83,7 @@ class GraspMotion:
     capsule_ends: Annotated[np.ndarray, "(C, 2, 3) m, link frame"]
     capsule_radius: Annotated[np.ndarray, "(C,) m"]
     surface_points: Annotated[np.ndarray, "(N, 3) m, object frame, points of the surface"]
-    surface_minus: Annotated[np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"]
+    surface_avoid: Annotated[np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"]
     colours: Colours | None
     """The object's own, in its frame."""
     goal: dict[str, np.ndarray]
@@ -106,8 +106,24 @@ _COLOURS = {
 }
 
 
+def at_rate(motion: GraspMotion, fps: float) -> GraspMotion:
+    """Returns the motion at another frame rate: for each of its times the nearest frame, at most half a step off.
+
+    Raises:
+      CongraspError: the rate is above the motion's own, or not above zero.
+    """
+    own = 1 / motion.control_dt
+    if not 0 < fps <= own + 1e-6:
+        raise CongraspError(f"--fps is {fps:g}.", f"The motion has {own:g} frames a second: set at most as many.")
+    time = np.arange(int((len(motion.time) - 1) * fps / own + 1e-6) + 1) / fps
+    nearest = np.minimum(np.round(time * own).astype(int), len(motion.time) - 1)
+    timed = [name for name, meaning in _ARRAYS.items() if meaning.startswith(("(T,", "(T)"))]
+    arrays = {name: getattr(motion, name)[nearest] for name in timed}
+    return dataclasses.replace(motion, **{**arrays, "time": time.astype(motion.time.dtype)}, control_dt=1 / fps)
+
+
 def motion_of_episode(episode: Message) -> GraspMotion:
-    """The motion of an episode, whether just made or read from MCAP (`services.record.reader.read_episodes`)."""
+    """Returns the motion of an episode, in memory or read from MCAP (`services.record.reader.read_episodes`)."""
     arrays, meta = {name: np.asarray(value) for name, value in episode.arrays.items()}, dict(episode.meta)
     hand = known_hand(meta.pop("hand"))
     dt = float(meta.pop("control_dt"))
@@ -136,7 +152,7 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         object_file_scale=np.asarray(meta.pop("object_file_scale", 1.0), np.float64),
         **hand_arrays(hand),
         surface_points=arrays["surface_points"],
-        surface_minus=arrays["surface_minus"].astype(bool),
+        surface_avoid=arrays["surface_avoid"].astype(bool),
         colours=Colours(arrays["colour_points"], arrays["colour_values"]) if "colour_values" in arrays else None,
         goal={
             name.removeprefix("goal/"): value for name, value in arrays.items() if name.removeprefix("goal/") in _GOALS
@@ -162,7 +178,7 @@ def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:
 
 
 def save_motion(path: str | os.PathLike[str], motion: GraspMotion) -> None:
-    """Writes a motion as NPZ, whole or not at all.
+    """Writes a motion as NPZ, atomically.
 
     Raises:
       CongraspError: the file cannot be written.
@@ -189,7 +205,7 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
     Raises:
       CongraspError: there is no such file, it is another kind of file, larger than `MAX_BYTES`, or damaged.
     """
-    remedy = "Make it anew with 'congrasp grasp'."
+    remedy = "Run 'congrasp grasp' again."
     arrays = read_npz(pathlib.Path(path), remedy, kind="a grasp motion", largest=MAX_BYTES)
     try:
         meta = json.loads(str(arrays.pop(_META)))
@@ -209,7 +225,7 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
 
 
 def _check_facts(facts: dict[str, Any]) -> None:
-    """A ValueError or CongraspError where a fact is of another kind than `GraspMotion` says."""
+    """Raises a ValueError or CongraspError for a fact with another type than in `GraspMotion`."""
     for name in ("hand", "object"):
         file_name(facts[name], f"the {name} of a motion")
     if not (isinstance(facts["success"], bool) and isinstance(facts["about"], dict)):
@@ -225,14 +241,14 @@ def _check_facts(facts: dict[str, Any]) -> None:
 
 
 def _check_arrays(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> None:
-    """A ValueError where an array is not what its meaning says, or has values that cannot be."""
+    """Raises a ValueError if an array does not match its meaning, or has invalid values."""
     sizes = check_arrays(arrays, meanings, indices=_INDICES, largest=_LARGEST)
     faces = arrays["object_faces"]
     if faces.min() < 0 or faces.max() >= sizes["V"]:
-        raise ValueError("object_faces names vertices that are not there")
+        raise ValueError("object_faces names vertices that do not exist")
     for name, below in (("link_parent", "L"), ("joint_link", "L"), ("capsule_link", "L")):
         if arrays[name].min() < -(name == "link_parent") or arrays[name].max() >= sizes[below]:
-            raise ValueError(f"{name} names links that are not there")
+            raise ValueError(f"{name} names links that do not exist")
     colours = arrays.get(_VALUES, np.zeros(1))
     if colours.min() < 0 or colours.max() > 255:
         raise ValueError(f"{_VALUES} are not from 0 to 255")

@@ -42,13 +42,13 @@ _UNIT = 1e-3
 def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:
     """The motion of an NPZ file, or an episode recorded at `path` (see `pick_episode`)."""
     if not path.exists():
-        raise CongraspError(f"There is no {path}.", "Name a motion (.npz), a recording (.mcap) or a run's folder.")
+        raise CongraspError(f"There is no {path}.", "Pass a motion (.npz), a recording (.mcap) or a run's folder.")
     if path.suffix == ".npz":
         if index not in (-1, 0):
-            raise CongraspError(f"{path} is one motion and has no number {index}.", "Leave --index out.")
+            raise CongraspError(f"{path} is one motion and has no number {index}.", "Remove --index.")
         return load_motion(path)
     if path.is_file() and path.suffix != ".mcap":
-        raise CongraspError(f"{path} holds no motion.", "Name a grasp.npz, a recording (.mcap) or a run's folder.")
+        raise CongraspError(f"{path} holds no motion.", "Pass a grasp.npz, a recording (.mcap) or a run's folder.")
     return motion_of_episode(pick_episode(path, index, success=success))
 
 
@@ -58,28 +58,28 @@ def export_motions(
     """Writes motions in a format, reads the file back and compares.
 
     Args:
-      motions: one, or several where the format takes them.
+      motions: one, or several if the format supports them.
       kind: one of `FORMATS`.
       path: the file or folder to write.
-      camera: also film them, where the format has videos.
-      force: replace a file that is there; a folder is never replaced.
+      camera: also records videos, if the format has them.
+      force: replaces an existing file; a folder is never replaced.
 
     Returns:
       The largest error in mm (see `services.export.frames.error_mm`).
 
     Raises:
-      CongraspError: the error is above `TOLERANCE_MM`, and nothing was written; or `path` is there already, or
-        cannot be written.
+      CongraspError: the error is above `TOLERANCE_MM`, and nothing was written; or `path` exists already, or cannot be
+        written.
     """
     if len(motions) > 1 and kind not in SEVERAL:
-        raise CongraspError(f"A {kind} file holds one motion, and {len(motions)} were named.", "Name one at a time.")
+        raise CongraspError(f"A {kind} file holds one motion, but {len(motions)} were given.", "Pass one at a time.")
     if camera and kind not in FILMED:
-        raise CongraspError(f"A {kind} file holds no video.", f"Leave --camera out, or set --to {FILMED[0]}.")
+        raise CongraspError(f"A {kind} file holds no video.", f"Remove --camera, or pass --to {FILMED[0]}.")
     if (suffix := FORMATS[kind]) and path.suffix.lower() != suffix:
         name = path / f"grasp{suffix}" if path.is_dir() else f"{path}{suffix}"
         raise CongraspError(f"The name of a {kind} file ends in {suffix}, and {path} does not.", f"Use --out {name}")
     if path.is_dir():
-        raise CongraspError(f"The folder {path} is there already.", "Remove it or name another with --out.")
+        raise CongraspError(f"The folder {path} exists already.", "Remove it or pass another with --out.")
     check_free(path, force=force)
     for motion in motions:
         _check(motion)
@@ -88,7 +88,7 @@ def export_motions(
         path.parent.mkdir(parents=True, exist_ok=True)
         workplace = pathlib.Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     except OSError as error:
-        raise CongraspError(f"{path} cannot be written: {error.strerror}.", "Choose another with --out.") from None
+        raise CongraspError(f"{path} cannot be written: {error.strerror}.", "Pass another with --out.") from None
     try:
         draft = workplace / path.name
         module.write(draft, motions, **({"camera": True} if camera else {}))
@@ -98,8 +98,8 @@ def export_motions(
         worst = max(error_mm(motion, track) for motion, track in zip(motions, tracks, strict=True))
         if not worst <= TOLERANCE_MM:
             raise CongraspError(
-                f"The {kind} file is off by {worst:.3g} mm; {TOLERANCE_MM} mm is let through.",
-                "Nothing was written. Is the motion's file intact?",
+                f"The {kind} file is off by {worst:.3g} mm, above the limit of {TOLERANCE_MM} mm.",
+                "Nothing was written. Check that the motion's file is intact.",
             )
         made = sorted(workplace.iterdir())
         for file in made:
@@ -112,16 +112,16 @@ def export_motions(
 
 
 def default_name(motion: GraspMotion, kind: str) -> pathlib.Path:
-    """Where a motion goes unless told otherwise: the object's name in the working directory."""
+    """Default path of a motion: the object's name in the working directory."""
     return pathlib.Path(f"{motion.object}{FORMATS[kind] or f'-{kind}'}")
 
 
 def _check(motion: GraspMotion) -> None:
-    """Raises a CongraspError for numbers that are not finite, or quaternions that are not of length one."""
-    remedy = "Make it anew with 'congrasp grasp'."
+    """Raises a CongraspError for numbers that are not finite, or quaternions that are not normalised."""
+    remedy = "Run 'congrasp grasp' again."
     for name in _NUMBERS:
         values = np.asarray(getattr(motion, name))
         if not np.isfinite(values).all():
             raise CongraspError(f"The motion's {name} has values that are not finite numbers.", remedy)
         if name.endswith("quaternion") and np.abs(np.linalg.norm(values, axis=-1) - 1).max() > _UNIT:
-            raise CongraspError(f"The motion's {name} has quaternions that are not of length one.", remedy)
+            raise CongraspError(f"The motion's {name} has quaternions that are not normalised.", remedy)

@@ -28,14 +28,14 @@ from congrasp.common.wire.codec import encode
 from congrasp.services.client.limits import JointLimits
 
 TOLERANCE = 1e-5
-"""Largest absolute difference between an exported policy and the Flax policy that is let through, in action units."""
+"""Largest accepted difference between an exported policy and the Flax policy, in action units."""
 SUFFIXES = {"onnx": ".onnx", "stablehlo": ".stablehlo.zip"}
 _SAMPLES = 512
 _PLATFORMS = ("cpu", "cuda", "tpu")
 
 
 def describe(bundle: PolicyBundle) -> dict[str, Any]:
-    """What a user of the exported policy must know, as JSON: every number that goes in and comes out, in order."""
+    """Description of the exported policy for its user, as JSON: every input and output number, in order."""
     hand, task = get_hand(bundle.spec.hand), bundle.task
     joints = [joint.name for joint in hand.joints]
     frame = grasp_frame(hand)
@@ -162,7 +162,7 @@ def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
 
 
 def sample_observations(bundle: PolicyBundle, count: int, seed: int = 0) -> np.ndarray:
-    """(count, D) observations as the policy knows them and beyond: three times as spread, masks drawn at random."""
+    """Observations (count, D) within and beyond the policy's range: three times as spread, with random masks."""
     rng = np.random.default_rng(seed)
     known = bundle.observation
     spread = np.sqrt(np.asarray(known.m2) / max(float(known.count), 1.0)) + 1e-3
@@ -200,7 +200,7 @@ def export_policy(bundle: PolicyBundle, kind: str, path: pathlib.Path) -> float:
     difference = float(np.abs(answers - expected).max())
     if not difference <= TOLERANCE:
         raise CongraspError(
-            f"The {kind} policy differs from the Flax policy by {difference:.2e}; {TOLERANCE:g} is let through.",
+            f"The {kind} policy differs from the Flax policy by {difference:.2e}, above the limit of {TOLERANCE:g}.",
             "Nothing was written; please report this with the versions that 'congrasp doctor' prints.",
         )
     write_atomically(path, encoded)

@@ -1,11 +1,10 @@
-"""The export's own exam by MuJoCo C, after DexGraspBench's: whether exported grasps hold without a policy.
+"""Test of exported grasps without a policy in MuJoCo C, after DexGraspBench.
 
 An object of 0.1 kg floats without table and gravity, friction 0.6. The hand is at the grasp with its targets at the
 squeeze, or at the pregrasp, from which targets go to the grasp and on to the squeeze, 0.4 s each, open loop. Then the
 object is pushed for two seconds by 1 N along or against an axis of the world, each push from the start. Motors have the
-benchmark's gains and no speed feedback beside the joints' damping, and contacts are as hard as the benchmark's and rub
-against turning as there. What touches are Allegro's boxes as the benchmark has them, and of Shadow this project's
-shapes.
+benchmark's gains and no speed feedback beside the joints' damping, and contacts have the benchmark's stiffness and
+torsional friction. Collision shapes are the benchmark's boxes for Allegro, and this project's shapes for Shadow.
 """
 
 import itertools
@@ -41,7 +40,7 @@ _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
 class Replayed(NamedTuple):
-    """What became of one grasp."""
+    """Result of one grasp."""
 
     name: str
     from_grasp: bool
@@ -57,7 +56,7 @@ class Replayed(NamedTuple):
 
 
 def replay(grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda done: None) -> list[Replayed]:
-    """What becomes of grasps of one hand; `progress` is told how many are done."""
+    """Replays grasps of one hand; `progress` is called with the number of finished ones."""
     hand = benchmarked(grasps[0].hand, grasps[0].match)
     found: list[Replayed] = []
     for first in range(0, len(grasps), _TOGETHER):
@@ -67,7 +66,7 @@ def replay(grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda don
 
 
 def summary(found: Sequence[Replayed]) -> str:
-    """A line about replayed grasps."""
+    """Summary of replayed grasps in one line."""
     held, closed = (100 * np.mean([getattr(one, f"from_{start}") for one in found]) for start in STARTS)
     depth, own, pushed = np.array([(one.depth_mm, one.self_mm, one.pushed_mm) for one in found]).T
     return (
@@ -78,12 +77,12 @@ def summary(found: Sequence[Replayed]) -> str:
 
 
 def save_replay(folder: pathlib.Path, found: Sequence[Replayed]) -> None:
-    """Writes what became of each grasp as `replay.json`."""
+    """Writes the result of each grasp to `replay.json`."""
     write_atomically(folder / "replay.json", json.dumps([one._asdict() for one in found], indent=2).encode())
 
 
 def _replay(hand: Hand, grasps: Sequence[Grasp]) -> list[Replayed]:
-    """What becomes of grasps side by side."""
+    """Replays grasps in parallel."""
     physics = NativePhysics(hand, _TASK, [grasp.obj for grasp in grasps], cores())
     try:
         _begin(physics, grasps, "grasp")
@@ -99,7 +98,7 @@ def _replay(hand: Hand, grasps: Sequence[Grasp]) -> list[Replayed]:
 
 
 def _pushed(physics: NativePhysics, hand: Hand, grasps: Sequence[Grasp], start: str) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) whether each grasp survives its six pushes from a state, and the deepest penetration in them, mm."""
+    """Survival (N,) of six pushes from a state for each grasp, and the deepest penetration in them, mm."""
     _begin(physics, grasps, start)
     origin = physics.read(physics)
     kept: np.ndarray = np.ones(6 * len(grasps), bool)
@@ -179,7 +178,7 @@ def _between(hand: Hand, states: Mapping[str, State], names: tuple[str, str, str
 
 
 def _near(origin: PhysicsState, state: PhysicsState) -> np.ndarray:
-    """(B,) whether objects are about where they were."""
+    """(B,) bool: objects are close to their initial poses."""
     way = np.linalg.norm(np.asarray(state.object_position - origin.object_position), axis=-1)
     cosine = np.abs(np.sum(np.asarray(state.object_quaternion * origin.object_quaternion), -1))
     return (way < FARTHEST) & (2 * np.arccos(np.minimum(cosine, 1.0)) < MOST_TURNED) & ~np.asarray(state.diverged)

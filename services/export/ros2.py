@@ -192,7 +192,7 @@ def _marker(make: _Messages, motion: GraspMotion) -> Any:
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """What mcap-ros2-support decodes: poses by joint trajectory and URDF, after a check that TF says the same."""
+    """Reads a file with mcap-ros2-support: poses by joint trajectory and URDF, after a check that TF agrees."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 

@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.hands.skin import Skin
+from congrasp.common.hands.skin import MATERIALS, Skin
 from congrasp.common.rotations import continuous
 from congrasp.services.export.frames import (
     COLOURS,
@@ -126,8 +126,7 @@ def _add_surface(stage: Usd.Stage, path: Sdf.Path, skin: Skin, skeleton: UsdSkel
     mesh = _new_mesh(stage, path, skin.points, skin.faces)
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(skin.normals))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    own = COLOURS["flesh" if skin.flesh else "link"]
-    colours = np.where(skin.joint[:, None], COLOURS["joint"], own).astype(np.float32)
+    colours = np.array([COLOURS[name] for name in MATERIALS], np.float32)[skin.material]
     colour = mesh.CreateDisplayColorAttr(Vt.Vec3fArray.FromNumpy(colours))
     UsdGeom.Primvar(colour).SetInterpolation(UsdGeom.Tokens.vertex)
     influences, weights = skin.influences()
@@ -151,7 +150,7 @@ def _new_mesh(stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """What the text says, put together from the root to the tips."""
+    """Reads a file's text, composed from the root to the tips."""
     layer = _parse(path.read_text(encoding="utf-8"))
     assert layer["upAxis"] == "Z" and layer["metersPerUnit"] == 1
     codes = np.arange(layer["startTimeCode"], layer["endTimeCode"] + 1)

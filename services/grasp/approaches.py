@@ -51,6 +51,14 @@ def headings(
         weights += [1.0 / ((r + 1) * max(room.sum(), 1))] * int(room.sum())
     if not options:
         raise CongraspError(*_no_room(obj, request))
+    free = request.rest is None and not request.above and direction is None and position is None and not restricted
+    if free and (first := min(r for r, *_ in options)) > 0:
+        height = np.ptp(matrix(obj.rest_poses[0][3:])[2] @ obj.points.T)
+        raise CongraspError(
+            f"'{obj.name}' lies too flat for the {hand.name} hand: {1000 * height:.0f} mm high in its likeliest "
+            "resting pose, which leaves the fingers no room over the table.",
+            f"Set --rest {first + 1} to grasp it in another resting pose.",
+        )
     shares = np.array(weights) / np.sum(weights)
     chosen = rng.choice(len(options), batch, replace=len(options) < batch, p=shares)
     rests, positions, directions, crosses = zip(*(options[i] for i in chosen), strict=True)

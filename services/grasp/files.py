@@ -20,7 +20,6 @@ from congrasp.services.record.scene import episode_entries
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.viz.render import (
     Film,
-    best_camera,
     episode_sheet,
     grasp_picture,
     grasp_steps,
@@ -28,10 +27,11 @@ from congrasp.services.viz.render import (
     save_episode_video,
 )
 from congrasp.services.viz.sheets import save_png
+from congrasp.services.viz.views import View, camera_of, views
 
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
 PORTRAIT = "portrait.png"
-"""Its last frame, 1280 x 720, with a view from the thumb's side."""
+"""Its last frame, 1280 x 720, from two sides."""
 _FORMAT = 4  # of result.json: what was written with another is done anew
 THUMBNAIL = "thumbnail.png"
 """A picture of its last frame."""
@@ -41,9 +41,18 @@ OBJECT = "object.png"
 
 _SMALL = (320, 240)  # pixels
 _HELD = 0.5  # of the hold, in videos, s
+_FRAMED = 10  # steps from one that the video's camera must hold to the next
 
 
-def save_grasp(folder: pathlib.Path, found: Grasp, *, film: Film | None, pictures: bool, about: dict[str, Any]) -> None:
+def save_grasp(
+    folder: pathlib.Path,
+    found: Grasp,
+    *,
+    film: Film | None,
+    pictures: bool,
+    about: dict[str, Any],
+    view: View | None = None,
+) -> None:
     """Writes a grasp; the result comes last, so that where there is one everything is there.
 
     Args:
@@ -52,6 +61,7 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, film: Film | None, picture
       film: how the MP4 is drawn; None writes none.
       pictures: also writes the contact sheet.
       about: further entries of the result.
+      view: where pictures and video are seen from; what shows most of the grasp by default.
 
     Raises:
       CongraspError: a file cannot be written.
@@ -67,13 +77,14 @@ def save_grasp(folder: pathlib.Path, found: Grasp, *, film: Film | None, picture
     steps = _steps_to_draw(*grasp_steps(episode), len(episode.arrays["table"]) - 1)
     last = steps[-1]
     if pictures:
-        camera = best_camera(episode, steps)
+        camera = camera_of(episode, steps, view=view)
         save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera))
-        save_png(folder / PORTRAIT, grasp_picture(episode, last))
+        save_png(folder / PORTRAIT, grasp_picture(episode, last, view=view))
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if film:
-        until = found.first("hold") + round(_HELD / float(episode.meta["control_dt"]))
-        seen_from = best_camera(episode, [*steps[:-1], min(until, last)], film.size[0] / film.size[1])
+        until = min(found.first("hold") + round(_HELD / float(episode.meta["control_dt"])), last)
+        filmed = [*range(0, until, _FRAMED), until]
+        seen_from = camera_of(episode, filmed, film.size[0] / film.size[1], view or views(episode, steps)[0])
         save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 

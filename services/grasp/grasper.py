@@ -47,17 +47,17 @@ if TYPE_CHECKING:
 ATTEMPTS = 16
 """Grasps that are simulated side by side."""
 ROUNDS = 4
-"""How often that many others are attempted while none holds."""
+"""Number of further rounds of attempts while none holds."""
 HOLD_SECONDS = 2.0
-"""How long the object should be held without the table."""
+"""Required hold of the object without the table."""
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
 _SCALES |= {"moved_at_removal": 0.01, "force_link_max": 10.0, "slip": 0.02}
-"""What weighs as much as one another, among grasps that hold: errors, the object's way before table removal (m), the
-strongest link's force (N), and the object's way after it went (m)."""
+"""Scales that make costs of grasps that hold comparable: errors, displacement of the object before table removal (m),
+force of the strongest link (N), and displacement after removal (m)."""
 _FIRM = ("clean", *SURVIVAL)
-"""What counts one against a grasp that lacks it, likewise."""
+"""Cost of a grasp that lacks it."""
 _UNLIKELY = 0.5
-"""What each resting pose that comes before its own weighs against a grasp, likewise."""
+"""Cost of each resting pose that precedes a grasp's own."""
 _TOUCHED = 0.2
 """Share of touches on what must not be touched from which others are attempted."""
 
@@ -73,21 +73,21 @@ class Grasp:
     episode: Message
     """The whole episode, as recordings keep it."""
     motion: GraspMotion
-    """What the NPZ holds."""
+    """Content of the NPZ."""
     attempts: int
-    """How many were simulated."""
+    """Number of simulated attempts."""
     held: int
-    """How many of them held the object to the end."""
+    """Number of those that held the object to the end."""
     rest: int
-    """Which of the object's resting poses it starts from."""
+    """Index of the initial resting pose."""
     active: tuple[str, ...]
-    """Which constraints are active and why, in sentences."""
+    """Active constraints and the reasons, in sentences."""
     arm: "ArmMotion | None" = None
     """The same on an arm, if there is one."""
 
     @property
     def success(self) -> bool:
-        """Whether this one held the object to the end."""
+        """True if this one held the object to the end."""
         return self.motion.metrics["held"] > 0
 
     @property
@@ -341,8 +341,14 @@ def grasp(
 ) -> Grasp:
     """The best grasp motion of an object under constraints; what is compiled is kept for the next call.
 
+    Example:
+      import congrasp
+
+      found = congrasp.grasp("mug:7", heading="above", attempts=8)
+      print(found.success, found.held, "of", found.attempts, "attempts hold it")
+
     Args:
-      mesh: a mesh (STL, OBJ, PLY, GLB), an object file, or an object.
+      mesh: a mesh (STL, OBJ, PLY, GLB), an object file, FAMILY:SEED of the generator, or an object.
       policy: a policy file; the one that comes with the package if none is named.
       hand: name of the hand whose pretrained policy is taken; `human:left` is its left hand.
       options: how a mesh becomes an object.
@@ -370,7 +376,7 @@ def _grasper(file: pathlib.Path, changed: int, attempts: int, seed: int, left: b
 
 
 def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int) -> RequestedEpisodes:
-    """What is asked for of a labelled object, `batch` times, in the resting pose that the request names."""
+    """Request for a labelled object, repeated `batch` times, in the requested resting pose."""
     rest = np.asarray(obj.rest_poses[request.rest or 0], np.float32)
     goal, surface, rest = jax.tree.map(
         lambda array: np.broadcast_to(array, (batch, *np.shape(array))),

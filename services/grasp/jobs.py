@@ -20,31 +20,34 @@ from congrasp.services.assets.objects.materials import with_mass
 from congrasp.services.assets.objects.named import ObjectAt, objects_at
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sizes import size_in_words
-from congrasp.services.grasp.files import OBJECT, THUMBNAIL, VIDEO, finished, key_of, save_grasp
+from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, key_of, save_grasp
 from congrasp.services.grasp.grasper import Grasper, Progress
 from congrasp.services.grasp.parse import numbered, read_request
 from congrasp.services.viz.import_sheet import import_sheet, mesh_of_file
 from congrasp.services.viz.render import Film
 from congrasp.services.viz.sheets import contact_sheet, save_png
+from congrasp.services.viz.views import View
 
 SHEET, SUMMARY = "summary.png", "summary.json"
 _COLUMNS = 6
 
 
 class Settings(NamedTuple):
-    """What the grasps of all objects share."""
+    """Settings shared by the grasps of all objects."""
 
     out: pathlib.Path
     options: ImportOptions
     constraints: dict[str, Any]
     """See `services.grasp.parse.read_request`."""
     identity: tuple[Any, ...]
-    """What else makes a grasp: policy, seed, attempts."""
+    """Further identity of a grasp: policy, seed, attempts."""
     film: Film | None
-    """How a video is drawn; None for no video."""
+    """Style of a video; None for no video."""
+    view: View | None
+    """Where pictures and video are seen from; what shows most of the grasp if None."""
     pictures: bool
     again: bool
-    """Whether to redo finished objects."""
+    """Repeats finished objects."""
     rest: str = ""
     """Resting pose: `upright` or a number from 1 on; any where empty."""
 
@@ -77,7 +80,10 @@ class Result(NamedTuple):
         errors = [f"{what} {_shown(facts, stem)}" for stem, what in _ERRORS.items() if f"{stem}_m" in facts]
         if "affordance_ratio" in facts:
             errors.append(f"{100 * facts['affordance_ratio']:.0f} % of the touches where there should be none")
-        return "; ".join([facts["size"], outcome, best, *errors, f"strongest link {facts['force_link_max']:.1f} N"])
+        lying = [f"in resting pose {facts['rest']}, not the likeliest"] if facts["rest"] > 1 else []
+        return "; ".join(
+            [facts["size"], outcome, *lying, best, *errors, f"strongest link {facts['force_link_max']:.1f} N"]
+        )
 
 
 _ERRORS = {"heading": "heading off by", "pose": "pose off by", "trajectory": "trajectory off by"}
@@ -107,7 +113,7 @@ def find_objects(paths: Sequence[pathlib.Path], folder: str = "objects") -> tupl
 
 
 def _is_name(path: pathlib.Path) -> bool:
-    """Whether a path may be an object's name: there is no such file, and it has neither a folder nor a suffix."""
+    """True if a path can be an object's name: there is no such file, and it has neither a folder nor a suffix."""
     return not path.exists() and path.name == str(path) and not path.suffix and ":" not in path.name
 
 
@@ -131,7 +137,8 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
         key = key_of(at.digest(), options, given, settings.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
-        if before is not None and ((folder / VIDEO).exists() or settings.film is None):
+        drawn = [settings.film and [*settings.film], settings.view and [*settings.view]]
+        if before is not None and (settings.film is None or json.loads(json.dumps(drawn)) == before.get("drawn")):
             return Result(at.name, before, skipped=True)
         progress("Importing", 0, 1)
         obj = _load(at, settings.options)
@@ -139,7 +146,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
         if settings.rest:
             request = dataclasses.replace(request, rest=rest_pose(obj, settings.rest))
         if settings.pictures and at.source:
-            save_png(folder / OBJECT, import_sheet(grasper.hand, obj, mesh_of_file(at.source)))
+            save_png(folder / OBJECT, import_sheet(grasper.hand, obj, mesh_of_file(at.source), request.avoid))
         found = grasper.grasp(obj, request, progress)
         progress("Drawing", 0, 1)
         about = {
@@ -150,8 +157,10 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "shape_reliable": obj.shape_reliable,
             "notes": [*obj.notes, *_notes(at, obj, settings.options), *([found.arm.note()] if found.arm else [])],
             "rules": list(found.active),
+            "drawn": drawn,
         }
-        save_grasp(folder, found, film=settings.film, pictures=settings.pictures, about=about)
+        drawing = {"film": settings.film, "pictures": settings.pictures, "view": settings.view}
+        save_grasp(folder, found, about=about, **drawing)
         return Result(at.name, {**found.facts(), **about})
     except CongraspError as error:
         return Result(at.name, {}, str(error))
@@ -177,7 +186,7 @@ def rest_pose(obj: GraspObject, text: str) -> int:
 
 
 def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
-    """Where a mesh's mass comes from, where the user has not set it."""
+    """Notes on the source of a mesh's mass, if the user has not set it."""
     if not at.source or options.mass is not None:
         return []
     basis = f"of {options.material}" if options.material else "by its surface and volume"
@@ -195,7 +204,7 @@ def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
 
 
 def _identity(text: str) -> str:
-    """What a constraint asks for: its file's content, where it names one."""
+    """Identity of a constraint: the content of its file, if it names one."""
     path, number = numbered(text)
     return f"{hashlib.sha256(path.read_bytes()).hexdigest()}:{number}" if path.is_file() else text
 

@@ -26,10 +26,13 @@ from congrasp.common.task.constraints.base import Option, Part
 from congrasp.common.task.constraints.heading import ABOVE
 from congrasp.common.task.sampling import sets as constraint_sets
 from congrasp.common.wire.codec import Message
+from congrasp.services.assets.captures.extract import Surface, approach
+from congrasp.services.assets.captures.sequence import Dropped
+from congrasp.services.assets.captures.transfer import followed
 from congrasp.services.assets.objects.headers import check_header
 from congrasp.services.assets.objects.sizes import size_in_words
 from congrasp.services.export.motion_file import GraspMotion, load_motion
-from congrasp.services.grasp.wrist_paths import HUGE, read_csv
+from congrasp.services.grasp.wrist_paths import HUGE, read_csv, read_wrist_path
 from congrasp.services.record.goals import grasp_span
 
 _LARGEST = 4 << 20  # bytes of a JSON or CSV file
@@ -37,7 +40,7 @@ _FAR = 1.0  # m from an object beyond which nobody grasps it
 
 
 class Target(NamedTuple):
-    """What constraints are written for."""
+    """Context of constraints: the hand and the object they apply to."""
 
     obj: GraspObject
     hand: Hand
@@ -76,7 +79,7 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
 
 
 def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
-    """What an option says, by its kind; None if it is not given."""
+    """Returns the value of an option, by its kind; None if it is not given."""
     if not text:
         return None
     if isinstance(text, tuple) or option.kind == "text" or text in option.words:
@@ -85,7 +88,7 @@ def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
 
 
 def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]) -> str | tuple[str, ...]:
-    """What was written for an option: its words where it takes several, else one text, empty for a switch that is off.
+    """Returns the text of an option: its words if it takes several, else one text, empty for a flag that is off.
 
     A number stands for its text.
     """
@@ -203,10 +206,13 @@ def _reference(q: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> d
 
 
 def _path(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
-    """A wrist trajectory from a motion, a constraint set, CSV, or JSON."""
+    """A wrist trajectory from a motion, a constraint set, CSV, BVH, or JSON."""
     obj, hand, waypoints = target
     origin = target.origin
     path, index = numbered(text)
+    file, _, joint = text.partition(":")
+    if file.lower().endswith(".bvh"):
+        return _recorded(pathlib.Path(file), joint or "RightHand", name, target)
     if path.suffix == ".npz":
         motion = _motion(path, hand, index)
         first, last = grasp_part(motion)
@@ -228,6 +234,22 @@ def _path(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
         quaternion = _floats(given["quaternion"], (count, 4), f"{name}: 'quaternion' of {path}")
     _check_near(obj, position[-1] - origin, f"{name}: the end of {path}")
     return _resampled(position - origin, quaternion, waypoints, name, path)
+
+
+def _recorded(path: pathlib.Path, joint: str, name: str, target: Target) -> dict[str, np.ndarray]:
+    """The way of a joint of a BVH skeleton to where it is nearest to the object, as captures are cut."""
+    recorded = read_wrist_path(path, joint=joint)
+    position, rotation = followed(target.hand, recorded.position, recorded.rotation)
+    position = position - target.origin
+    away = Surface(target.obj).distance(position)
+    frame = int(away.argmin())
+    _check_near(target.obj, position[frame], f"{name}: the joint '{joint}' of {path}")
+    known = np.ones(len(away), bool)
+    try:
+        _, places, turns = approach(path.stem, position, rotation.as_matrix(), away, known, frame, target.waypoints)
+    except Dropped as dropped:
+        raise CongraspError(f"{name}: {path}: {dropped.reason}.", "Move the skeleton, or name another joint.") from None
+    return {"position": places, "quaternion": turns}
 
 
 def numbered(text: str) -> tuple[pathlib.Path, int]:

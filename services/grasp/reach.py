@@ -263,7 +263,7 @@ def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:
 
 
 def _of_steps(name: str, value: np.ndarray, steps: int) -> bool:
-    """Whether an array of an episode has a row for each control step."""
+    """True if an array of an episode has a row for each control step."""
     kinds = ("reward/", "error/", "link_", "object_position", "object_quaternion", "q_target", "u_target")
     named = name.startswith(kinds) or name in ("contact_force", "q", "u", "action", "table")
     return named and value.ndim > 0 and len(value) == steps

@@ -183,7 +183,7 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_number(word: str) -> bool:
-    """Whether it is a number that can be meant."""
+    """True if a word is a plausible number."""
     try:
         return abs(float(word)) < HUGE
     except ValueError:

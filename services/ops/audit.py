@@ -97,7 +97,7 @@ def _is_entry(entry: dict[str, Any]) -> bool:
     if "made" in entry:
         return has_fields(entry, made=int, version=int, checksum=str)
     if "answer" in entry:
-        return has_fields(entry, answer=int, outcome=str, life=str)
+        return has_fields(entry, answer=int, outcome=str, session_id=str)
     return has_fields(entry, actor=str, incarnation=str)
 
 
@@ -115,7 +115,7 @@ def _made(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
             if who is not None and "made" in entry:
                 made[*who, entry["made"]] = Made(entry["version"], entry["checksum"], [])
             elif who is not None and (identity := (*who, entry.get("answer", -1))) in made:
-                made[identity].answers.append((entry["outcome"], entry["life"]))
+                made[identity].answers.append((entry["outcome"], entry["session_id"]))
     return made
 
 
@@ -123,7 +123,7 @@ def _made(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
 class _Session:
     """Initial state of a learner's session, and its record of unused rollouts."""
 
-    life: str
+    session_id: str
     run_id: str
     version: int
     max_staleness: int
@@ -140,7 +140,7 @@ class _Session:
 
     def had(self, identity: Identity, accepted_by: set[str]) -> bool:
         """True if it accepted a rollout, or recovered it from an earlier session."""
-        return self.life in accepted_by or identity in self.taken
+        return self.session_id in accepted_by or identity in self.taken
 
 
 class _Outcomes(NamedTuple):
@@ -174,11 +174,11 @@ def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
     sessions: list[_Session] = []
     saved = -1
     for entry in book:
-        if "life" in entry:
-            begin = entry["life"], entry["epoch"], entry["version"], entry["max_staleness"]
+        if "session_id" in entry:
+            begin = entry["session_id"], entry["run_id"], entry["version"], entry["max_staleness"]
             kept = entry.get("kept") is True
             sessions.append(_Session(*begin, kept, entry["version"] < saved, started=not kept))
-        saved = entry.get("saved", entry["version"] if "life" in entry else saved)
+        saved = entry.get("saved", entry["version"] if "session_id" in entry else saved)
         if sessions:
             sessions[-1].started |= "taken" in entry
             sessions[-1].taken.update(_rows(entry, "taken"))
@@ -252,7 +252,7 @@ def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
         return "dropped"
     if identity in found.spoilt:
         return "damaged on disk"
-    accepted_by = {life for outcome, life in rollout.answers if outcome in ("accepted", "duplicate")}
+    accepted_by = {session for outcome, session in rollout.answers if outcome in ("accepted", "duplicate")}
     for book in found.books:
         had = [n for n, session in enumerate(book) if session.had(identity, accepted_by)]
         if not had:

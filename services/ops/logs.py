@@ -5,6 +5,8 @@ import datetime
 import json
 import logging
 import sys
+import threading
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
@@ -64,6 +66,25 @@ def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> Non
     """Writes a line; levels: info, warning, error, fatal. Numbers that are not finite are dropped from the fields."""
     finite = {name: value for name, value in (fields or {}).items() if abs(value) < float("inf")}
     _logger.log(logging.getLevelNamesMapping()[level.upper()], text, extra={"fields": finite})
+
+
+@contextlib.contextmanager
+def announced(what: str, first: float = 3.0, every: float = 10.0) -> Iterator[None]:
+    """Prints what takes long, and for how long already, after `first` and then every `every` seconds (to stderr)."""
+    done, began = threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        """Prints until it is done."""
+        pause = first
+        while not done.wait(pause):
+            print(f"{what}: {time.monotonic() - began:.0f} s so far.", file=sys.stderr, flush=True)
+            pause = every
+
+    threading.Thread(target=tell, daemon=True, name="announced").start()
+    try:
+        yield
+    finally:
+        done.set()
 
 
 def log_error(text: str) -> bool:

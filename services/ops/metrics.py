@@ -81,7 +81,7 @@ class LearnerMetrics:
         yield _gauge("queue_limit", "Rollouts that may wait.", status["queue"]["limit"])
         for name, value in status["rates"].items():
             yield _gauge(name, "Over the last ten seconds.", value)
-        yield from self._ledger(status["ledger"])
+        yield from self._counters(status["counters"])
         yield _gauge("roles_unlisted", "Processes beyond those that are listed.", status["unlisted"])
         yield from self._roles(status["roles"])
         update = _gauge("update", "Metrics of the last update, by the names of the log.", labels=["figure"])
@@ -90,11 +90,11 @@ class LearnerMetrics:
         yield update
 
     @staticmethod
-    def _ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:
+    def _counters(counters: Mapping[str, int]) -> Iterator[Metric]:
         """Counters of tickets and rollouts."""
         tickets = CounterMetricFamily("congrasp_learner_tickets", "Tickets by outcome.", labels=["outcome"])
         rollouts = CounterMetricFamily("congrasp_learner_rollouts", "Rollouts by outcome.", labels=["outcome"])
-        for name, value in ledger.items():
+        for name, value in counters.items():
             if name in _GAUGES:
                 yield _gauge(*_GAUGES[name], value)
             elif name != "queued":

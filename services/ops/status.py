@@ -46,25 +46,25 @@ def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, A
 
 def warnings(status: Mapping[str, Any]) -> list[str]:
     """Inconsistencies of a learner's status, one line each."""
-    ledger, queue = status["ledger"], status["queue"]
+    counters, queue = status["counters"], status["queue"]
     found = []
     for total, parts in _SUMS.items():
-        if ledger[total] != sum(ledger[part] for part in parts):
-            found.append(f"The counters are inconsistent: {total} {ledger[total]} is not {_sum(ledger, parts)}.")
-    if ledger["queued"] != queue["length"]:
-        found.append(f"{ledger['queued']} rollouts are counted as queued, but the queue holds {queue['length']}.")
+        if counters[total] != sum(counters[part] for part in parts):
+            found.append(f"The counters are inconsistent: {total} {counters[total]} is not {_sum(counters, parts)}.")
+    if counters["queued"] != queue["length"]:
+        found.append(f"{counters['queued']} rollouts are counted as queued, but the queue holds {queue['length']}.")
     return found
 
 
-def _sum(ledger: Mapping[str, int], parts: tuple[str, ...]) -> str:
+def _sum(counters: Mapping[str, int], parts: tuple[str, ...]) -> str:
     """Formats a sum of counters as a formula."""
-    return " + ".join(f"{part} {ledger[part]}" for part in parts)
+    return " + ".join(f"{part} {counters[part]}" for part in parts)
 
 
 def tables(status: Mapping[str, Any]) -> Group:
     """Formats the status for a terminal."""
     ended = ", finished" if status["finished"] else ""
-    roles = Table(title=f"{status['run']}, version {status['version']}, run id {status['epoch']}{ended}")
+    roles = Table(title=f"{status['run']}, version {status['version']}, run id {status['run_id']}{ended}")
     refused = any(role.get("refused") for role in status["roles"])
     for column in (*_ROLE, "refused") if refused else _ROLE:
         roles.add_column(column, justify="left" if column in _ROLE[:3] else "right")
@@ -74,12 +74,12 @@ def tables(status: Mapping[str, Any]) -> Group:
         counts = (version, role.get("lag", ""), role.get("rollouts", ""), *rates)
         who = (Text(ascii(role[name])[1:70].rstrip("'")) for name in ("role", "id", "incarnation"))
         roles.add_row(*who, *map(str, counts), *([str(role.get("refused", ""))] if refused else []))
-    ledger = Table(title="Counters: tickets and rollouts")
-    ledger.add_column("count")
-    ledger.add_column("number", justify="right")
-    ledger.add_column("which is")
-    for name, value in status["ledger"].items():
-        ledger.add_row(name, str(value), " + ".join(_SUMS.get(name, ())))
+    counters = Table(title="Counters: tickets and rollouts")
+    counters.add_column("count")
+    counters.add_column("number", justify="right")
+    counters.add_column("which is")
+    for name, value in status["counters"].items():
+        counters.add_row(name, str(value), " + ".join(_SUMS.get(name, ())))
     rates, queue = status["rates"], status["queue"]
     line = (
         f"{rates['rollouts_per_second']:.2f} rollouts/s, {rates['steps_per_second']:.0f} steps/s; "
@@ -88,4 +88,4 @@ def tables(status: Mapping[str, Any]) -> Group:
     more = len(status["roles"][_SHOWN:]) + status["unlisted"]
     others = [Text(f"{more} more live process(es).")] if more else []
     wrong = (Text(f"Warning: {text}", style="yellow") for text in status["warnings"])
-    return Group(roles, *others, ledger, Text(line), *wrong)
+    return Group(roles, *others, counters, Text(line), *wrong)

@@ -8,7 +8,7 @@ version. rollout: a rollout as it went to the learner. episode: T control steps 
 (T, L, 3), `link_quaternion` (T, L, 4), `object_position`
   (T, 3), `object_quaternion` (T, 4), `contact_force` (T, L, 3) in the world, m and N; `q`, `q_target` (T, F), `u`,
   `u_target` (T, 6), `action` (T, M + 6), `table` (T,) bool, `reward/<term>` (T,); `goal/<field>` of
-  `common.task.types.Goal` for this world, in the object's frame; `surface_points` (N, 3), `surface_minus` (N,) bool,
+  `common.task.types.Goal` for this world, in the object's frame; `surface_points` (N, 3), `surface_avoid` (N,) bool,
   `visual_vertices` (V, 3), `visual_faces` (F, 3), `piece_*` in the object's frame, and where the object has colours of
   its own, `colour_values` (P, 3) uint8 at `colour_points` (P, 3). Meta: `hand`, `object`, `control_dt` (s), `version`,
   `actor`, `success`, `metrics` {name: number}. Quaternions are (w, x, y, z).

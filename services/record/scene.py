@@ -209,7 +209,7 @@ def _add_ghost(entity: SceneEntity, hand: Hand, ghost: Ghost) -> None:
 
 def _surface(actor: str, arrays: Mapping[str, np.ndarray], now: int) -> PointCloud:
     """The object's surface points: graspable region green, avoid region red."""
-    colours = np.where(arrays["surface_minus"][:, None], AVOID, GRASPABLE)
+    colours = np.where(arrays["surface_avoid"][:, None], AVOID, GRASPABLE)
     return _cloud(f"{actor}/object", arrays["surface_points"], colours, now)
 
 

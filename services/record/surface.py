@@ -14,9 +14,10 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.skeleton import skeleton_of
-from congrasp.common.hands.skin import Skin, skin_of, skin_on
+from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
-from congrasp.services.record.palette import FLESH, JOINT, SKIN, Colour
+from congrasp.services.record.palette import MATERIALS as COLOURS
+from congrasp.services.record.palette import Colour
 
 _OVERLAP = 0.4  # weight of a link on a vertex above which the triangle belongs to the link
 _MOST_FACES = 12_000  # triangles of a hand; meshes of links may have more
@@ -36,7 +37,7 @@ class Part(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
-    """Parts of each link: its surface, and the darker parts of its joints."""
+    """Parts of each link, one of each material."""
     skin = _skin(hand)
     strongest = np.eye(len(hand.links), dtype=bool)[skin.weights[skin.faces].sum(1).argmax(-1)]
     members = strongest | (skin.weights[skin.faces].max(1) >= _OVERLAP)
@@ -44,10 +45,10 @@ def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
     found = []
     for member, origin in zip(members.T, skin.origins, strict=True):
         parts = []
-        for of_joint, colour in ((False, FLESH if skin.flesh else SKIN), (True, JOINT)):
-            faces = skin.faces[member & (skin.joint[skin.faces[:, 0]] == of_joint)]
+        for number, name in enumerate(MATERIALS):
+            faces = skin.faces[member & (skin.material[skin.faces[:, 0]] == number)]
             if len(faces):
-                parts.append(Part(colour, *_light(skin.points[faces] - origin, kept)))
+                parts.append(Part(COLOURS[name], *_light(skin.points[faces] - origin, kept)))
         found.append(tuple(parts))
     return tuple(found)
 

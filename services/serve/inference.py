@@ -84,7 +84,7 @@ class PolicyFunction:
         hand, task = self.layout.hand, self.layout.task
         fields, checks = self.layout.complete(vectors)
         asked = {c.name: fields["asked"][:, i] > 0.5 for i, c in enumerate(self.layout.known) if c.optional}
-        surface = Surface(fields["surface_points"], fields["surface_minus"])
+        surface = Surface(fields["surface_points"], fields["surface_avoid"])
         resolution = resolve(hand, surface, self.layout.goal(fields), asked)
         state = SceneState(**{name: fields[name] for name in SceneState._fields})
         if (readings := self.layout.readings(fields)) is not None:

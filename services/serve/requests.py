@@ -92,7 +92,7 @@ class Layout:
         steps = (task.history - 1,)
         self.shapes |= {name: (*steps, *self.shapes[name.removeprefix("past_")]) for name in self._past}
         self.shapes |= {name: np.shape(value) for name, value in self._neutral.items()}
-        self.shapes |= {"surface_points": (points, 3), "surface_minus": (points,), "asked": (len(self.known),)}
+        self.shapes |= {"surface_points": (points, 3), "surface_avoid": (points,), "asked": (len(self.known),)}
         self.offsets = {}
         self.size = 0
         for name, shape in self.shapes.items():
@@ -158,7 +158,7 @@ class Layout:
                 raise CongraspError(f"The query lacks the field '{name}'.")
         vector = np.zeros(self.size, np.float32)
         given = dict(arrays)
-        given["surface_points"], given["surface_minus"] = self._surface(given)
+        given["surface_points"], given["surface_avoid"] = self._surface(given)
         for name in self._past:  # without history, the current state is repeated
             given.setdefault(name, np.broadcast_to(given[name.removeprefix("past_")], self.shapes[name]))
         for name, value in given.items():
@@ -181,7 +181,7 @@ class Layout:
         finite = jnp.isfinite(vectors).all(1)
         fields = self.unpack(jnp.where(finite[:, None], vectors, 0.0))
         asked = fields["asked"] > 0.5
-        for name in ("contact_found", "table", "surface_minus", *self._flags):
+        for name in ("contact_found", "table", "surface_avoid", *self._flags):
             fields[name] = fields[name] > 0.5
         lengths = []
         for name in self._directions:
@@ -191,7 +191,7 @@ class Layout:
             fields[name], length = _unit(fields[name], wanted, default)
             lengths.append(length)
         fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"])
-        surface, goal = Surface(fields["surface_points"], fields["surface_minus"]), self.goal(fields)
+        surface, goal = Surface(fields["surface_points"], fields["surface_avoid"]), self.goal(fields)
         fitting = [~asked[:, i] | c.valid(surface, goal[c.name]) for i, c in enumerate(self.known)]
         return fields, jnp.stack([finite, *fitting, *lengths], 1)
 
@@ -245,9 +245,9 @@ class Layout:
             raise CongraspError(
                 f"The field 'surface_points' has shape {points.shape}; it must be (N, 3), N at most {SURFACE_LIMIT}."
             )
-        avoid = np.asarray(arrays.get("surface_minus", np.zeros(len(points), bool)))
+        avoid = np.asarray(arrays.get("surface_avoid", np.zeros(len(points), bool)))
         if avoid.shape != (len(points),):
-            raise CongraspError(f"The field 'surface_minus' has shape {avoid.shape}; it must be ({len(points)},).")
+            raise CongraspError(f"The field 'surface_avoid' has shape {avoid.shape}; it must be ({len(points)},).")
         if len(points) == self.task.surface_points:
             return points, avoid
         index = np.arange(self.task.surface_points) * len(points) // self.task.surface_points

@@ -14,7 +14,7 @@ _versions = itertools.count(1)
 
 
 class Paint(NamedTuple):
-    """What is painted."""
+    """Painted regions."""
 
     avoid: np.ndarray
     """(512,) bool, surface points of the painted avoid region."""
@@ -57,7 +57,7 @@ class Canvas:
             raise CongraspError(f"The brush has a radius of {radius} m.", "Choose 1 mm to 20 cm.")
 
         def brushed(places: np.ndarray, before: np.ndarray) -> np.ndarray:
-            """What is painted of some places after a stroke."""
+            """Painted state of some places after a stroke."""
             squared = ((places[:, None] - strokes[None]) ** 2).sum(-1).min(-1, initial=np.inf)
             return np.where(squared <= radius**2, avoid, before)
 

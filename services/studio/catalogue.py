@@ -31,7 +31,7 @@ class Catalogue:
 
     @property
     def names(self) -> list[str]:
-        """What there is."""
+        """Names of the available objects."""
         return list(self._makers)
 
     def add(self, name: str, maker: Callable[[], GraspObject]) -> str:
@@ -64,7 +64,7 @@ class Upload:
     unit: str = ""
     """Its unit: the user's choice, else the one that makes an object for a hand; empty where that is not only one."""
     notes: tuple[str, ...] = ()
-    """What its import mended."""
+    """Repairs by its import."""
 
     def view(self) -> dict[str, Any]:
         """For the page: the file, its unit, and the size that each unit makes of it."""

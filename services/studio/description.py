@@ -1,4 +1,4 @@
-"""What a page shows of a request, as JSON."""
+"""Description of a request for the page, as JSON."""
 
 import functools
 from collections.abc import Mapping

@@ -21,7 +21,7 @@ def why_nothing_held(
       episode: the attempt that is shown.
       request: what it was asked for.
       explanation: what the priority rules do with it, strongest constraint first.
-      held: attempts it anew under a weaker request.
+      held: attempts it again under a weaker request.
       attempts: how many there are at once.
       drop_height: m below where it was at which the object has fallen.
     """

@@ -22,9 +22,9 @@ from congrasp.services.viz.scene import Camera
 from congrasp.services.viz.sheets import png_of
 
 DATA = ("npz", "mcap", *FORMATS)
-"""What a motion can be saved as at once."""
+"""Formats in which a motion can be saved at once."""
 DRAWN = ("mp4", "png")
-"""What is drawn first, which takes a while."""
+"""Formats that are drawn first, which takes a while."""
 _PICTURE, _VIDEO = (1280, 720), (854, 480)  # pixels
 
 

@@ -22,15 +22,17 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.grasp.grasper import costs, repeated, surface_of
 from congrasp.services.serve.server import Source
 from congrasp.services.studio.diagnosis import why_nothing_held
-from congrasp.services.studio.jobs import Progress
+from congrasp.services.studio.jobs import SECONDS, Progress
 
 ATTEMPTS = 8
 """Grasps side by side: the one that was drawn, and others near it."""
 HOLD_SECONDS = 2.0
 _ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
-"""How far the others are from what was drawn: m, rad, rad (one standard deviation)."""
+"""Deviation of the others from what was drawn: m, rad, rad (one standard deviation)."""
+_COMPILING = 60
+"""Seconds that the first grasp takes on two cores of a laptop without kept programs."""
 _OTHER = 2.0
-"""What it costs not to be the one that was drawn, beside the costs of `services.grasp.grasper`."""
+"""Cost of deviating from what was drawn, in addition to the costs of `services.grasp.grasper`."""
 
 
 class PolicyGrasping:
@@ -83,7 +85,7 @@ class PolicyGrasping:
         Its meta `note` says which it is; where none held, why.
         """
         first_time = not self._compiled
-        progress("compiling: the first grasp takes some seconds more" if first_time else "newest weights", 0.02)
+        progress(f"compiling, {SECONDS} s of about {_COMPILING}" if first_time else "newest weights", 0.02)
         self.refresh()
         require_known(request.constraints, self.task)
         outcome, aside = self._attempt(obj, request, lambda share: progress("grasping", share))
@@ -95,7 +97,7 @@ class PolicyGrasping:
             return episode
 
         def held(weaker: GraspRequest, without: str) -> int:
-            """How many attempts hold under a weaker request."""
+            """Returns the number of attempts that hold under a weaker request."""
             text = f"nothing held; without the {get_constraint(without).title}"
             found, _ = self._attempt(obj, weaker, lambda share: progress(text, share))
             return int((found.metrics["held"] > 0).sum())

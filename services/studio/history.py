@@ -57,7 +57,7 @@ class History:
         self._swap(self._undone, self._done)
 
     def view(self) -> dict[str, str]:
-        """What would be undone and redone, as a person calls it; empty where there is nothing."""
+        """Labels of the next undo and redo; empty if there is none."""
         found = {"undo": self._done, "redo": self._undone}
         return {name: ACTIONS[edits[-1][0]] if edits else "" for name, edits in found.items()}
 

@@ -1,6 +1,7 @@
 """Work that takes longer than a click: one job at a time, with its progress."""
 
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -8,6 +9,8 @@ from typing import Any
 from congrasp.common.errors import CongraspError
 from congrasp.services.ops.logs import log
 
+SECONDS = "{seconds}"
+"""In the text of a job: stands for how long it runs already."""
 Progress = Callable[[str, float], None]
 """(what is being done, how much of it is done from 0 to 1)."""
 
@@ -20,6 +23,7 @@ class Jobs:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="studio")
         self._lock = threading.RLock()
         self._number = 0
+        self._since = 0.0
         self._state: dict[str, Any] = _state(0, running=False)
 
     def start(self, text: str, work: Callable[[Progress], str | None]) -> dict[str, Any]:
@@ -31,6 +35,7 @@ class Jobs:
         with self._lock:
             self.require_idle()
             self._number += 1
+            self._since = time.monotonic()
             self._state = _state(self._number, text=text)
             self._pool.submit(self._run, work)
             return dict(self._state)
@@ -39,12 +44,13 @@ class Jobs:
         """Raises a CongraspError while a job is running."""
         with self._lock:
             if self._state["running"]:
-                raise CongraspError(f"Please wait: {self._state['text']}.")
+                raise CongraspError(f"Please wait: {self.state()['text']}.")
 
     def state(self) -> dict[str, Any]:
         """The present job, or the last one: number, running, text, share, error, and what it made."""
         with self._lock:
-            return dict(self._state)
+            seconds = f"{time.monotonic() - self._since:.0f}"
+            return {**self._state, "text": self._state["text"].replace(SECONDS, seconds)}
 
     def close(self) -> None:
         """Takes no more jobs, and waits for none."""

@@ -1,4 +1,4 @@
-"""How each constraint was met, step by step: a lane is green where the hand keeps to it."""
+"""Lanes: fulfilment of each constraint step by step, green where the hand satisfies it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ _UNITS = {"rad": (180 / np.pi, "°"), "m": (100.0, " cm"), "": (100.0, " %")}
 MEANINGS = {term.name: term.meaning for term in GRASP} | {
     weight.name: weight.meaning for constraint in CONSTRAINTS for weight in constraint.weights
 }
-"""What each term of the reward is, by its name."""
+"""Descriptions of the reward terms by name."""
 
 
 class Lane(NamedTuple):
@@ -34,7 +34,7 @@ class Lane(NamedTuple):
     counts: np.ndarray
     """(T,) bool: the constraint is meant for this step (a heading for the grasp, a path for the approach)."""
     legend: str
-    """What is measured, and up to where it is met."""
+    """Measured quantity, and its tolerance."""
     errors: Mapping[str, np.ndarray]
     """(T,) by name with its unit."""
 
@@ -81,7 +81,7 @@ def for_page(episode: Message) -> Message:
         "contact_force",
         "table",
     )
-    keep += ("visual_vertices", "visual_faces", "surface_points", "surface_minus")
+    keep += ("visual_vertices", "visual_faces", "surface_points", "surface_avoid")
     arrays: dict[str, Any] = {name: episode.arrays[name] for name in keep}
     if "colour_values" in episode.arrays:
         own = Colours(episode.arrays["colour_points"], episode.arrays["colour_values"])
@@ -113,7 +113,7 @@ def _drawn(episode: Message) -> dict[str, np.ndarray]:
             quaternion = (wrist * _turn(quaternion)).as_quat(scalar_first=True)
             fields = {"position": position, "quaternion": quaternion}
         elif isinstance(marker, Paint):
-            fields = {"avoid": np.asarray(episode.arrays["surface_minus"])}
+            fields = {"avoid": np.asarray(episode.arrays["surface_avoid"])}
         else:
             fields = marker._asdict()
         found |= {f"{kind}/{name}/{field}": np.asarray(value, np.float32) for field, value in fields.items()}

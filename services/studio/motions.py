@@ -3,10 +3,14 @@
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.task.constraints import get_constraint
 from congrasp.common.wire.codec import Message
+from congrasp.services.record.goals import active_constraints
 
+_ABOVE = np.cos(np.radians(45.0))
 MOST = 30
 """Motions that are kept; the oldest goes first."""
 
@@ -38,16 +42,26 @@ class Motions:
         self._kept.pop(key, None)
 
     def view(self) -> list[dict[str, Any]]:
-        """What a list shows of each, the newest first."""
+        """List entries of the motions, the newest first."""
         return [_described(key, episode) for key, episode in self._kept.items()][::-1]
 
 
+def _asked(episode: Message) -> str:
+    """What was asked of a motion in words: its constraints, and the way the hand came in the world."""
+    arrays, names = episode.arrays, active_constraints(episode.arrays)[1:]
+    turn = Rotation.from_quat(arrays["object_quaternion"][0], scalar_first=True)
+    down = -float(turn.apply(np.asarray(arrays["goal/heading_direction"], float))[2])
+    way = "from above" if down > _ABOVE else "from below" if down < -_ABOVE else "from the side"
+    return ", ".join([*(get_constraint(name).title for name in names), way])
+
+
 def _described(key: str, episode: Message) -> dict[str, Any]:
-    """What a list shows of a motion."""
+    """List entry of a motion."""
     meta, metrics = episode.meta, episode.meta.get("metrics", {})
     return {
         "id": key,
         "object": meta["object"],
+        "asked": _asked(episode),
         "success": bool(meta["success"]),
         "held": bool(metrics.get("held", 0.0) > 0),
         "note": meta.get("note", ""),

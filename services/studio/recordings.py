@@ -25,7 +25,7 @@ class Recordings:
     """
 
     def __init__(self, path: pathlib.Path):
-        """Nothing is read before somebody searches: files may come and grow."""
+        """Reads nothing before the first search: files may appear and grow."""
         self.path = path
         self._lock = threading.Lock()
         self._found: dict[str, Message] = {}
@@ -76,7 +76,7 @@ class Recordings:
 
 
 def _row(key: str, message: Message) -> dict[str, Any]:
-    """What a list shows of an episode."""
+    """List entry of an episode."""
     time, _, topic = key.partition("/")
     return {
         "id": key,

@@ -67,7 +67,7 @@ class PageServer:
             routes = (gets, posts)
 
             def allowed(self) -> bool:
-                """Whether it comes from the page itself."""
+                """True if it comes from the page itself."""
                 return server._allowed(self)
 
         try:
@@ -84,7 +84,7 @@ class PageServer:
 
     @property
     def url(self) -> str:
-        """Where a browser on this machine finds the page."""
+        """URL of the page for a browser on this machine."""
         host = "127.0.0.1" if self.host in ("0.0.0.0", "::", "") else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
 
@@ -95,7 +95,7 @@ class PageServer:
         self._thread.join(2.0)
 
     def _allowed(self, request: http.server.BaseHTTPRequestHandler) -> bool:
-        """Whether a request comes from the page itself: other sites that the browser shows must not reach it.
+        """True if a request comes from the page itself: other sites in the browser must not reach it.
 
         A site can have its name point to this machine, so the name that was asked for must be this machine's own.
         """
@@ -125,7 +125,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     routes: tuple[Mapping[str, Get], Mapping[str, Post]]
 
     def allowed(self) -> bool:
-        """Whether the request may be answered."""
+        """True if the request may be answered."""
         raise NotImplementedError
 
     def do_GET(self) -> None:

@@ -18,6 +18,7 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.wire.codec import Message
+from congrasp.services.assets.objects.materials import MATERIALS, with_mass
 from congrasp.services.assets.objects.sizes import METRES
 from congrasp.services.studio.catalogue import Catalogue, Importer, Uploads
 from congrasp.services.studio.description import describe
@@ -33,8 +34,11 @@ from congrasp.services.studio.thumbnails import Thumbnails
 from congrasp.services.studio.training import TrainingWindow
 from congrasp.services.viz.shapes import skin_colours
 
+LIGHTEST_G, HEAVIEST_G = 1, 5000
+_OWN_WEIGHT = {"mass_g": 0.0, "material": ""}
+"""The object weighs what it came with."""
 _DRAWING = "drawing"
-"""What a job says it made when that is a picture or a video, and no motion."""
+"""Kinds of results of a job that are a picture or a video instead of a motion."""
 
 
 class Grasping(Protocol):
@@ -44,7 +48,7 @@ class Grasping(Protocol):
     task: TaskConfig
 
     def newest(self) -> dict[str, Any]:
-        """Where the policy comes from and its version, after a look for newer weights."""
+        """Source of the policy and its version, after a check for newer weights."""
 
     def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
         """The episode of a grasp."""
@@ -77,6 +81,7 @@ class Session:
         self._lock = threading.RLock()
         self._jobs, self._motions, self._thumbnails = Jobs(), Motions(), Thumbnails()
         self._drawn: Download | None = None
+        self._weight = dict(_OWN_WEIGHT)
         self._hand = next(iter(hands))
         self._object, self._shown = objects.names[0], 0
         self._take_hand(hands[self._hand](), objects.get(self._object))
@@ -102,7 +107,7 @@ class Session:
         self._folder.cleanup()
 
     def state(self) -> dict[str, Any]:
-        """What the page shows of studio, policy, objects, motions and job."""
+        """State of studio, policy, objects, motions and job for the page."""
         with self._lock:
             upload = self._uploads.of(self._object)
             return {
@@ -119,6 +124,7 @@ class Session:
                 "motions": self._motions.view(),
                 "training": self._window is not None,
                 "recordings": self._recordings is not None,
+                "weight": {**self._weight, "materials": list(MATERIALS)},
                 "saves": [*DRAWN, *DATA],
                 "drawn": DRAWN,
                 "job": self._jobs.state(),
@@ -158,7 +164,7 @@ class Session:
         return self._drawn
 
     def training(self, names: str) -> dict[str, Any]:
-        """What the window shows; `names`: curves, separated by commas."""
+        """Content of the window; `names`: curves, separated by commas."""
         if self._window is None:
             raise CongraspError("The studio follows no run.", "Start it with --connect, or with --recordings.")
         return self._window.view([name for name in names.split(",") if name])
@@ -186,6 +192,7 @@ class Session:
                 "hand": self._choose_hand,
                 "object": self._choose_object,
                 "unit": self._choose_unit,
+                "weigh": self._weigh,
                 "grasp": self._grasp,
                 "draw_motion": self._draw_motion,
                 "delete": lambda id: self._motions.delete(str(id)),
@@ -212,11 +219,19 @@ class Session:
             return self._jobs.state()
 
     def _choose_unit(self, unit: str) -> None:
-        """Imports the uploaded mesh anew in another unit."""
+        """Imports the uploaded mesh again in another unit."""
         upload, replaces = self._uploads.of(self._object), "" if self._uploads.pending else self._object
         if upload is None or unit not in METRES:
             raise CongraspError(f"The unit cannot be '{str(unit)[:20]}'.", "Open a mesh, then choose m, cm, mm or in.")
         self._import(upload.path.name, lambda: self._uploads.load(upload, unit, replaces))
+
+    def _weigh(self, mass_g: float = 0, material: str = "") -> None:
+        """Sets what the object weighs: its mass, else by a material; its own mass where neither is given."""
+        if mass_g and not LIGHTEST_G <= mass_g <= HEAVIEST_G:
+            raise CongraspError(f"The mass is {mass_g:g} g.", f"Write {LIGHTEST_G} to {HEAVIEST_G} g, or nothing.")
+        obj = self._objects.get(self._object)
+        self._studio.obj = with_mass(obj, mass_g / 1000 if mass_g else None, material)
+        self._weight = {"mass_g": mass_g, "material": material}
 
     def _import(self, file: str, load: Callable[[], str]) -> dict[str, Any]:
         """Begins an import, which returns the object's name; shows the object."""
@@ -269,6 +284,7 @@ class Session:
     def _show(self, name: str) -> None:
         """Puts an object that is there into the studio."""
         self._studio.take(self._objects.get(name))
+        self._weight = dict(_OWN_WEIGHT)
         self._history = History(self._studio)
         self._object, self._shown = name, self._shown + 1
 

@@ -240,7 +240,7 @@ class Studio:
 
     @property
     def request(self) -> GraspRequest:
-        """What a policy is asked for.
+        """Request for the policy.
 
         Raises:
           CongraspError: it cannot be asked for; see `trouble`.

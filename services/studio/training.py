@@ -1,6 +1,6 @@
-"""What is known of a run while it trains: curves, events, the learner's counters, and every actor's newest episode.
+"""State of a run while it trains: curves, events, the learner's counters, and every actor's newest episode.
 
-It takes log messages and the learner's status from whoever receives them; it knows no network and no browser.
+It accepts log messages and the learner's status from any receiver, and is independent of network and browser.
 """
 
 import bisect
@@ -73,16 +73,16 @@ class Actor:
     """Its newest episode."""
     episodes: int = 0
     recent: collections.deque[bool] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=_TREND))
-    """Whether its last episodes succeeded."""
+    """Success of its last episodes."""
     last: dict[str, float] = dataclasses.field(default_factory=dict)
     """Version, rollouts and steps per second as it reported them last."""
 
 
 class TrainingWindow:
-    """Takes what comes from any thread, and gives a page what it shows.
+    """Accepts messages from any thread, and provides their state to a page.
 
     Attributes:
-      live: somebody follows the run; false for one that is read from its recordings alone.
+      live: True if the run is followed; False if it is only read from its recordings.
       damaged: messages that were not what their key says.
     """
 
@@ -199,7 +199,7 @@ class TrainingWindow:
                 "version": None if found is None else found["version"],
                 "rates": {} if found is None else found["rates"],
                 "queue": None if found is None else found["queue"],
-                "counters": {} if found is None else found["ledger"],
+                "counters": {} if found is None else found["counters"],
                 "warnings": [] if found is None else found["warnings"],
                 "curves": {name: self._curves[name].thinned(points) for name in wanted},
                 "names": self._labels_of_all(),
@@ -213,7 +213,7 @@ class TrainingWindow:
             }
 
     def _phase(self) -> str:
-        """Whether the run trains, is finished, cannot be reached, or is read from its recordings."""
+        """Phase of the run: training, finished, unreachable, or read from its recordings."""
         if self._status is not None and self._status["finished"]:
             return "finished"
         if not self.live and self._status is None:
@@ -262,7 +262,7 @@ class TrainingWindow:
         actor.recent.append(bool(message.meta["success"]))
 
     def _row(self, name: str, role: Mapping[str, Any] | None) -> dict[str, Any]:
-        """What a list shows of an actor."""
+        """List entry of an actor."""
         actor = self._actors[name]
         status = role or actor.last
         row: dict[str, Any] = {"id": name, "alive": role is not None, "episodes": actor.episodes}

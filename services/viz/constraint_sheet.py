@@ -6,9 +6,8 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands import get_hand
 from congrasp.common.task.sampling.headings import INWARD
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
+from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, WAYPOINT
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.render import OBJECT_AVOID
 from congrasp.services.viz.scene import Shape
 from congrasp.services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, table_shape
 from congrasp.services.viz.sheets import contact_sheet
@@ -23,7 +22,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
     """Six pictures of the object in one of its resting poses, with some of its constraints drawn by the seed.
 
     Approach arrows end before the surface, two centimetres short of the heading positions;
-    the avoid region is dark red.
+    the graspable region is green, and the avoid region red.
 
     Returns:
       (H, W, 3) uint8.
@@ -61,7 +60,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
             shapes.append(posed_hand(hand, arrays["pose/q"][v, m], position, wrist))
         return shapes
 
-    avoid = arrays["surface/minus"]
+    avoid = arrays["surface/avoid"]
     body = Shape(
         "mesh",
         (0, 0),
@@ -71,7 +70,7 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
         vertices=arrays["visual/vertices"],
         faces=arrays["visual/faces"],
         paint_points=arrays["surface/points"],
-        paint_colours=np.where(avoid[:, None], OBJECT_AVOID, OBJECT),
+        paint_colours=np.where(avoid[:, None], AVOID, GRASPABLE),
     )
     clear = arrays["pose/allowed"][:, rest]
     whole, region = some(clear[0], _PATHS), some(clear[1], _PATHS)

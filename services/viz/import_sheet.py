@@ -1,4 +1,4 @@
-"""What an import made of a mesh, as a picture: before and after, beside a hand at true scale."""
+"""Picture of a mesh's import: before and after, with a hand at true scale."""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from congrasp.common.objects.spec import Colours, GraspObject
 from congrasp.services.assets.objects.repair import with_few_faces
 from congrasp.services.assets.objects.sizes import length, size_in_words
 from congrasp.services.assets.objects.sources import Source, read_mesh
-from congrasp.services.record.palette import OBJECT, PIECES
+from congrasp.services.record.palette import AVOID, GRASPABLE, OBJECT, PIECES
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.scene import Shape
 from congrasp.services.viz.shapes import fit, posed_hand, shape_points, upright
@@ -37,13 +37,16 @@ class Body(NamedTuple):
     """Colours of its own."""
 
 
-def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -> np.ndarray:
+def import_sheet(
+    hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None, avoid: np.ndarray | None = None
+) -> np.ndarray:
     """Pictures, each beside the open hand: the file, the object on the table, and its convex pieces.
 
     Args:
       hand: the hand.
       obj: what the import made.
       before: the mesh of the file, in the file's unit, if it is to be drawn.
+      avoid: (P,) bool, the surface points that must not be touched, if there is an affordance.
 
     Returns:
       (H, W, 3) uint8.
@@ -65,6 +68,11 @@ def import_sheet(hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None) -
             obj.colours and obj.colours._replace(points=rest.apply(obj.colours.points)),
         )
     ]
+    if avoid is not None:
+        colours = np.round(255 * np.where(avoid[:, None], AVOID, GRASPABLE)).astype(np.uint8)
+        regions = Colours(rest.apply(obj.points), colours)
+        label = "the affordance: green may be grasped, red must not be touched"
+        parts[label] = [Body(rest.apply(obj.visual_vertices), obj.visual_faces, OBJECT, regions)]
     pieces = enumerate(map(tessellate, obj.pieces))
     count = len(obj.pieces)
     parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [

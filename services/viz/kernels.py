@@ -19,7 +19,7 @@ _SMALL = 1e-6  # samples: a triangle of a smaller area covers nothing
 
 
 def _kept() -> bool:
-    """Whether machine code can be kept in the user's cache; a process that may write nowhere compiles for itself."""
+    """True if machine code can be cached in the user's cache; otherwise each process compiles it."""
     folder = cache_folder("kernels")
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
@@ -112,7 +112,7 @@ def shade(
       corners: (V, 2) columns and rows of points, in samples.
       nearness: (V,) one over their depths.
       faces: (F, 3) the triangles.
-      values: (V, 12) place, normal, linear colour, shares of key light and sky, and strength of the highlight.
+      values: (V, 13) place, normal, linear colour, shares of key light and sky, strength of the highlight, opacity.
       owner: (height, width) the triangle that a sample shows, or `NOTHING`.
       eye: (3,) where the camera is.
       key: (3,) unit direction towards the key light.
@@ -136,9 +136,10 @@ def shade(
             facing = max(_dot(normal, key) / length, 0.0)
             light = _KEY_STRENGTH * lit * facing + _SKY_STRENGTH * sky * (0.6 + 0.4 * normal[2] / length) + _BOUNCE
             gloss = shine * lit * max(_dot(normal, half) / length / np.sqrt(_dot(half, half)), 0.0) ** _HIGHLIGHT
+            cover = alpha * here[12]
             for n in range(3):
                 srgb = min(max(colour[n] * light + gloss, 0.0), 1.0) ** (1 / GAMMA)
-                image[row, column, n] = alpha * srgb + (1 - alpha) * image[row, column, n]
+                image[row, column, n] = cover * srgb + (1 - cover) * image[row, column, n]
 
 
 @_compiled

@@ -1,20 +1,33 @@
-"""How much of a soft lamp and of the sky reaches a surface: both are many lamps, from each of which bodies are seen."""
+"""Visibility of a soft lamp and of the sky from a surface: both are sets of lamps, each with visible bodies."""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from congrasp.services.viz.kernels import add_light, cover
 from congrasp.services.viz.triangles import Triangles
 
-MANY, FEW = (24, 48), (10, 20)
-"""Lamps of the key light and of the sky: for large pictures, and for small ones and videos."""
+
+class Lamps(NamedTuple):
+    """How finely a soft light is drawn."""
+
+    key: int
+    """Lamps that stand for the key light."""
+    sky: int
+    """Lamps that stand for the sky."""
+    grid: int
+    """Samples along each side of what a lamp sees."""
+
+
+MANY, FEW = Lamps(24, 48, 160), Lamps(12, 24, 160)
+"""For bodies in large pictures, and in small ones."""
+ON_TABLE = Lamps(48, 160, 64)
+"""For a table top: a far body's shadow is as wide as the light, so that few lamps would show as bands."""
 _KEY_SIZE = 0.12  # radius of the key light at a distance of one
-_GRID = 160  # samples along each side of what a lamp sees
 _SKIN = 1.5  # how far above the surface its light is looked up, in samples
 
 
-def light_on(
-    points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np.ndarray, lamps: tuple[int, int]
-) -> np.ndarray:
+def light_on(points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np.ndarray, lamps: Lamps) -> np.ndarray:
     """(n, 2) shares of the key light and of the sky that bodies let through to points of surfaces.
 
     Args:
@@ -22,14 +35,14 @@ def light_on(
       normals: (n, 3) of the surfaces there.
       bodies: what casts shadows.
       key: (3,) unit direction towards the key light.
-      lamps: how many stand for the key light and for the sky.
+      lamps: how many there are.
     """
     light, whole = np.zeros((2, len(points))), np.full(len(points), 1e-6)
-    for lamp in _disc(key, lamps[0], _KEY_SIZE):
-        _add(lamp, np.full(len(points), 1 / lamps[0]), points, normals, bodies, light[0])
-    for lamp in _dome(lamps[1]):
+    for lamp in _disc(key, lamps.key, _KEY_SIZE):
+        _add(lamp, lamps.grid, np.full(len(points), 1 / lamps.key), points, normals, bodies, light[0])
+    for lamp in _dome(lamps.sky):
         facing = np.clip(0.75 * (normals @ lamp) + 0.25, 0, None)  # a lamp of the sky stands for a patch of it
-        _add(lamp, facing, points, normals, bodies, light[1])
+        _add(lamp, lamps.grid, facing, points, normals, bodies, light[1])
         whole += facing
     light[1] /= whole
     return light.T
@@ -37,6 +50,7 @@ def light_on(
 
 def _add(
     lamp: np.ndarray,
+    grid: int,
     strength: np.ndarray,
     points: np.ndarray,
     normals: np.ndarray,
@@ -51,10 +65,10 @@ def _add(
     side = side / np.linalg.norm(side)
     axes = np.stack([side, np.cross(lamp, side), lamp])  # right, up, towards the lamp
     x, y, height = axes @ bodies.points.T
-    sample = max(np.ptp(x), np.ptp(y)) / (_GRID - 3)
+    sample = max(np.ptp(x), np.ptp(y)) / (grid - 3)
     # One empty sample on each side: what is beyond the picture is in the light.
     left, upper = x.min() - sample, y.max() + sample
-    top, owner = np.full((_GRID, _GRID), -np.inf, np.float32), np.empty((_GRID, _GRID), np.int32)
+    top, owner = np.full((grid, grid), -np.inf, np.float32), np.empty((grid, grid), np.int32)
     corners = np.stack([x - left, upper - y], -1) / sample
     cover(corners, height, bodies.faces, bodies.closed, top, owner)
     lifted = points + np.float32(_SKIN * sample) * normals

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from congrasp.services.viz.kernels import NOTHING, averaged, cover, shade
-from congrasp.services.viz.light import FEW, MANY, light_on
+from congrasp.services.viz.light import FEW, MANY, ON_TABLE, light_on
 from congrasp.services.viz.scene import Camera, Shape
 from congrasp.services.viz.triangles import Triangles, joined, triangles_of
 
@@ -28,16 +28,14 @@ def render_scene(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int] 
       (height, width, 3) uint8 sRGB.
     """
     solid = [shape for shape in shapes if shape.alpha >= 1]
-    table = triangles_of(shape for shape in solid if shape.kind == "cylinder")
-    bodies = _turned(triangles_of(shape for shape in solid if shape.kind != "cylinder"), camera)
+    table = triangles_of(shape for shape in solid if shape.kind == "table")
+    bodies = _turned(triangles_of(shape for shape in solid if shape.kind != "table"), camera)
     casting = triangles_of((shape for shape in solid if shape.shadow), fine=False)
-    lit = joined([table, bodies])
-    lamps = MANY if size[0] * size[1] > _LARGE else FEW
-    light = light_on(lit.points, lit.normals, casting, camera.key_light(), lamps)
-    coarse = _Picture.empty(camera, *size)  # the table has hardly an edge: one sample a pixel is enough
-    coarse.add(table, light[: len(table.points)])
+    key, lamps = camera.key_light(), MANY if size[0] * size[1] > _LARGE else FEW
+    coarse = _Picture.empty(camera, *size)  # the table has no edge: one sample a pixel is enough
+    coarse.add(table, light_on(table.points, table.normals, casting, key, ON_TABLE))
     picture = coarse.finer()
-    picture.add(bodies, light[len(table.points) :])
+    picture.add(bodies, light_on(bodies.points, bodies.normals, casting, key, lamps))
     for alpha in sorted({shape.alpha for shape in shapes if shape.alpha < 1}):
         glass = _turned(triangles_of(shape for shape in shapes if shape.alpha == alpha), camera)
         picture.add(glass, np.ones((len(glass.points), 2), np.float32), alpha)
@@ -84,7 +82,8 @@ class _Picture:
         """Draws triangles where they are nearest, with the light (V, 2) at their points."""
         corners, nearness = self._projected(triangles.points)
         top, owner = self._covered(corners, nearness, triangles)
-        values = np.concatenate([*triangles[:3], light, triangles.shine[:, None]], -1, dtype=np.float32)
+        more = triangles.shine[:, None], triangles.opacity[:, None]
+        values = np.concatenate([*triangles[:3], light, *more], -1, dtype=np.float32)
         key = self._camera.key_light()
         shade(corners, nearness, triangles.faces, values, owner, self._camera.position, key, alpha, self.image)
         if alpha >= 1:

@@ -1,4 +1,4 @@
-"""What a picture is made of: shapes in the world, and a camera that sees them."""
+"""Scene of a picture: shapes in the world frame, and a camera."""
 
 import dataclasses
 from typing import Literal
@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-Kind = Literal["sphere", "capsule", "cylinder", "mesh"]
+Kind = Literal["sphere", "capsule", "table", "mesh"]
 
 _KEY = np.array([-0.45, -0.55, 1.0])  # towards the key light: right, away from the camera, up
 

@@ -8,13 +8,14 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.hands.skin import Skin, skin_of
+from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import Hand, capsule_ends
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
-from congrasp.services.record.palette import FLESH, JOINT, OBJECT, SKIN, TABLE, Colour
+from congrasp.services.record.palette import MATERIALS as MATERIAL_COLOURS
+from congrasp.services.record.palette import OBJECT, SKIN, TABLE, Colour
 from congrasp.services.viz.scene import Camera, Shape, between
 
-_TABLE_RADIUS, _TABLE_HALF_HEIGHT = 0.28, 0.008  # m
+_TABLE_RADIUS = 0.6  # m
 FIELD_OF_VIEW = 26.0
 """Degrees, of cameras that `fit` makes."""
 _SPACE = 1.06  # free space at the picture's edges
@@ -57,7 +58,7 @@ def skin_shape(
 
 def skin_colours(skin: Skin) -> np.ndarray:
     """(V, 3) a skin's own colours."""
-    return np.where(skin.joint[:, None], JOINT, FLESH if skin.flesh else SKIN).astype(np.float32)
+    return np.array([MATERIAL_COLOURS[name] for name in MATERIALS], np.float32)[skin.material]
 
 
 def capsule_shapes(hand: Hand, position: np.ndarray, quaternion: np.ndarray) -> list[Shape]:
@@ -119,9 +120,8 @@ def object_shape(
 
 
 def table_shape(below: np.ndarray) -> Shape:
-    """A round table top at height zero under a point (3,)."""
-    position = np.array([below[0], below[1], -_TABLE_HALF_HEIGHT], float)
-    return Shape("cylinder", (_TABLE_RADIUS, _TABLE_HALF_HEIGHT), TABLE, position, shine=0.0, shadow=False)
+    """A table top at height zero under a point (3,), whose edge fades away."""
+    return Shape("table", (_TABLE_RADIUS, 0.0), TABLE, np.array([below[0], below[1], 0.0]), shine=0.0, shadow=False)
 
 
 def arrow(start: np.ndarray, end: np.ndarray, radius: float, colour: Colour) -> list[Shape]:

@@ -16,7 +16,9 @@ CREASE = np.cos(np.radians(35.0))
 """Faces whose normals differ by more than this angle (given as its cosine) meet in a sharp edge."""
 _Size = tuple[float, int]
 _PLAIN, _PAINTED = (0.005, 12_000), (0.0025, 40_000)  # longest side of a mesh's triangles, m, and about how many
-_RINGS, _SECTIONS = 110, 256  # of a cylinder's faces
+_RINGS, _SECTIONS = 72, 160  # of a table top
+_DENSER = 1.6  # exponent: how much denser its rings are around the middle
+_FADES = 0.55  # share of its radius from which it fades into the background
 
 
 class Triangles(NamedTuple):
@@ -34,6 +36,8 @@ class Triangles(NamedTuple):
     """(F, 3) indices of their corners."""
     closed: np.ndarray
     """(F,) bool: part of a closed surface that winds outwards, so that only its outside can be seen."""
+    opacity: np.ndarray
+    """(V,) float32 share of what is behind that each point covers."""
 
     @property
     def corners(self) -> np.ndarray:
@@ -50,12 +54,14 @@ class _Surface(NamedTuple):
     closed: bool
     paint: np.ndarray | None = None
     """(V, 3) linear light, if it is painted."""
+    opacity: np.ndarray | None = None
+    """(V,) if it is not the same everywhere."""
 
 
 def triangles_of(shapes: Iterable[Shape], *, fine: bool = True) -> Triangles:
     """The triangles of shapes in the world, one shape after the other; small ones if they are `fine`."""
     none = np.zeros((0, 3), np.float32)
-    found = [Triangles(none, none, none, none[:, 0], none.astype(int), none[:, 0] > 0)]
+    found = [Triangles(none, none, none, none[:, 0], none.astype(int), none[:, 0] > 0, none[:, 0])]
     return joined([*found, *(_triangles(shape, fine) for shape in shapes)])
 
 
@@ -80,7 +86,7 @@ def _triangles(shape: Shape, fine: bool) -> Triangles:
             fine,
         )
     else:
-        surface = (_cylinder if shape.kind == "cylinder" else _capsule)(*shape.size, fine)
+        surface = (_table_top if shape.kind == "table" else _capsule)(*shape.size, fine)
     turn = Rotation.from_quat(shape.quaternion, scalar_first=True).as_matrix().astype(np.float32)
     points = surface.points @ turn.T + np.asarray(shape.position, np.float32)
     even = np.broadcast_to(_linear(np.asarray(shape.colour)), points.shape)
@@ -91,6 +97,7 @@ def _triangles(shape: Shape, fine: bool) -> Triangles:
         np.full(len(points), shape.shine, np.float32),
         surface.faces,
         np.full(len(surface.faces), surface.closed),
+        np.ones(len(points), np.float32) if surface.opacity is None else surface.opacity,
     )
 
 
@@ -124,13 +131,24 @@ def _capsule(radius: float, half_length: float, fine: bool) -> _Surface:
 
 
 @functools.lru_cache(maxsize=8)
-def _cylinder(radius: float, half_length: float, fine: bool) -> _Surface:
-    """A cylinder along z."""
-    outline = [(0.0, -half_length), (radius, -half_length), (radius, half_length), (0.0, half_length)]
-    if fine:
-        outline[-1:] = [(r, half_length) for r in radius * np.linspace(1, 0, _RINGS)[1:]]
-    mesh = trimesh.creation.revolve(outline, sections=_SECTIONS)
-    return _surface(*smooth_corners(mesh.vertices, mesh.faces), True, None)
+def _table_top(radius: float, half_length: float, fine: bool) -> _Surface:
+    """A disc at the upper end, finest in the middle, whose edge fades away; plain and few triangles if not `fine`."""
+    rings, sections = (_RINGS, _SECTIONS) if fine else (1, 96)
+    angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
+    share = (np.arange(1, rings + 1) / rings) ** _DENSER
+    flat = share[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    flat = np.concatenate([np.zeros((1, 2)), flat.reshape(-1, 2)])
+    points = np.column_stack([radius * flat, np.full(len(flat), half_length)]).astype(np.float32)
+    here = np.arange(sections)
+    after = (here + 1) % sections
+    faces = [np.stack([np.zeros_like(here), 1 + here, 1 + after], -1)]
+    for first in 1 + sections * np.arange(rings - 1):
+        a, b, c, d = first + here, first + after, first + sections + here, first + sections + after
+        faces += [np.stack([a, c, d], -1), np.stack([a, d, b], -1)]
+    fading = np.clip((1 - np.linalg.norm(flat, axis=-1)) / (1 - _FADES), 0, 1)
+    opacity = (fading**2 * (3 - 2 * fading)).astype(np.float32) if fine else None
+    up = np.broadcast_to(np.array([0, 0, 1], np.float32), points.shape)
+    return _Surface(points, up, np.concatenate(faces), True, opacity=opacity)
 
 
 def _surface(corners: np.ndarray, normals: np.ndarray, closed: bool, size: _Size | None) -> _Surface:

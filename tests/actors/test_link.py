@@ -20,9 +20,9 @@ TICKET = Ticket("t", 0)
 class Learner:
     """Answers as told, and remembers what it was asked."""
 
-    def __init__(self, hub, *, epoch="e", life="1"):
+    def __init__(self, hub, *, run_id="e", session_id="1"):
         self.transport = MemoryTransport(hub)
-        self.state = {"version": 0, "epoch": epoch, "life": life, "finished": False}
+        self.state = {"version": 0, "run_id": run_id, "session_id": session_id, "finished": False}
         self.granted = True
         self.outcomes = []  # what rollouts are told, the last one for ever
         self.received = []
@@ -42,9 +42,12 @@ class Learner:
 
     def on_weights(self, key, message):
         self.pulls += 1
-        if (message.meta["newer_than"], message.meta["life"]) == (self.state["version"], self.state["life"]):
+        if (message.meta["newer_than"], message.meta["session_id"]) == (
+            self.state["version"],
+            self.state["session_id"],
+        ):
             return self.reply()
-        return Message({"w": np.ones(2)}, {"version": self.state["version"], "epoch": self.state["epoch"]})
+        return Message({"w": np.ones(2)}, {"version": self.state["version"], "run_id": self.state["run_id"]})
 
     def on_rollout(self, key, message):
         self.received.append(message)
@@ -112,7 +115,7 @@ def test_identity_is_added_and_counts(ends):
     assert other.incarnation != link.incarnation
     for n, message in enumerate(learner.received):
         assert message.arrays["reward"][0] == n
-        expected = {"actor": "a", "incarnation": link.incarnation, "sequence": n, "epoch": "e", "ticket": f"t{n}"}
+        expected = {"actor": "a", "incarnation": link.incarnation, "sequence": n, "run_id": "e", "ticket": f"t{n}"}
         assert message.meta == {"version": 0, "schema": "s", "steps": 3, **expected}
 
 
@@ -164,9 +167,9 @@ def test_weights_are_pulled_only_when_there_are_others(ends):
     assert link.weights(1) is None
     link.acquire_ticket(5)
     assert link.weights(1).meta["version"] == 2
-    learner.announce(version=1, life="2")  # it resumed from a checkpoint
+    learner.announce(version=1, session_id="2")  # it resumed from a checkpoint
     assert eventually(lambda: link.weights(2)).meta["version"] == 1
-    learner.announce(version=1, life="3")
+    learner.announce(version=1, session_id="3")
     assert eventually(lambda: link.weights(1)).meta["version"] == 1
     assert link.weights(1) is None
 
@@ -189,7 +192,7 @@ def test_rollout_survives_a_restart_of_the_learner(ends):
     assert link.acquire_ticket(0.2) is None and link.weights(-1) is None
     time.sleep(0.3)
     assert not outcome.done()
-    second = Learner(hub, life="2")
+    second = Learner(hub, session_id="2")
     assert outcome.result(10) == "accepted"
     assert second.received[0].meta["sequence"] == 0
     assert link.weights(0).meta["version"] == 0  # the number is the same, the learner is not
@@ -199,7 +202,7 @@ def test_another_training_is_told_to_the_caller_who_starts_over(ends):
     hub, make = ends
     learner, link = Learner(hub), make()
     link.config(5)
-    learner.state["epoch"] = "f"
+    learner.state["run_id"] = "f"
     outcome = link.upload(rollout(), TICKET)
     with pytest.raises(RunRestarted, match="run id f after e"):
         outcome.result(5)
@@ -217,8 +220,8 @@ def test_another_training_is_noticed_by_every_way(ends, by):
     learner, link = Learner(hub), make()
     link.config(5)
     if by == "announcement":
-        learner.announce(epoch="f")
-    learner.state["epoch"] = "f"
+        learner.announce(run_id="f")
+    learner.state["run_id"] = "f"
     with pytest.raises(RunRestarted):
         link.acquire_ticket(1) if by == "ticket" else link.weights(-1)
 

@@ -35,6 +35,33 @@ def pieces(
     return 0
 
 
+def gallery(
+    scans: pathlib.Path,
+    work: pathlib.Path = pathlib.Path("runs/gallery"),
+    out: pathlib.Path = pathlib.Path("docs/gallery"),
+    attempts: int = 16,
+) -> int:
+    """Grasps of 24 objects as one contact sheet and three short films.
+
+    Args:
+      scans: Folder of the scanned objects; the others come with the repository.
+      work: Folder for the grasps; those that are finished in it are drawn again, not made again.
+      out: Folder for the pictures.
+      attempts: Grasps that are simulated side by side, for each object.
+
+    Examples:
+      python -m tests.benchmarks gallery --scans my-objects
+      python -m tests.benchmarks gallery --scans my-objects --out pictures
+    """
+    from tests.benchmarks.gallery import make_gallery
+
+    results = []
+    for result in make_gallery(scans, work, out, attempts):
+        print(f"{result.name}: {result.line()}", flush=True)
+        results.append(result)
+    return 0 if all(result.held for result in results) else 1
+
+
 def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int = 0, repeats: int = 5) -> int:
     """Seconds of an evaluation's episodes with measures of plausibility beside the same without them.
 
@@ -234,6 +261,7 @@ def arms(
 
 COMMANDS = {
     "pieces": pieces,
+    "gallery": gallery,
     "measures": measures,
     "shutdown": shutdown,
     "security": security,

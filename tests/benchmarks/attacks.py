@@ -277,7 +277,7 @@ def _learn(endpoint: str, updates: Any) -> None:
     sizes = {"observation": (_FORM.observation,), "value": ()}
     arrays: dict[str, Any] = {f"{kind}/{m}": np.zeros(size) for kind, size in sizes.items() for m in ("mean", "m2")}
     arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(())}
-    meta = {"epoch": _RUN_ID, "schema": _SCHEMA, "hand": "human", "layout": [], "format": 1, "action_size": 26}
+    meta = {"run_id": _RUN_ID, "schema": _SCHEMA, "hand": "human", "layout": [], "format": 1, "action_size": 26}
     with urls.listen(endpoint, "learner") as transport:
         hub = LearnerHub(
             transport, run=_RUN, config_json="{}", run_id=_RUN_ID, schema=_SCHEMA, form=_FORM, staleness=staleness

@@ -120,7 +120,7 @@ class RunUnderTest:
 
     def accepted(self) -> int:
         """Rollouts so far."""
-        return int(until(self.status)["ledger"]["accepted"])
+        return int(until(self.status)["counters"]["accepted"])
 
     def _argument(self, role: str, name: str) -> str | None:
         """An option's value in the command line of the oldest process of a role."""

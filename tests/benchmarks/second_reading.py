@@ -52,7 +52,7 @@ def read_again(run_dir: pathlib.Path) -> Verdict:
             if "made" in line:
                 made[*who, line["made"]] = line["version"], line["checksum"]
             if line.get("outcome") in ("accepted", "duplicate"):
-                kept_by.setdefault(line["life"], set()).add((*who, line["answer"]))
+                kept_by.setdefault(line["session_id"], set()).add((*who, line["answer"]))
     lost: set[Rollout] = set()
     used: dict[Rollout, list[str]] = {}
     for book in books:
@@ -94,20 +94,20 @@ def _walk(book: list[dict[str, Any]], actors: _Actors, used: dict[Rollout, list[
     newest, falls_back = -1, False
     begun: dict[str, Any] = {}
     for line in book:
-        if "life" in line:
+        if "session_id" in line:
             uses = [use for use in uses if use[0] < line["version"]]
             begun, falls_back = line, line["version"] < newest
             newest = line["version"]
         if "taken" in line:  # the first line of a session that was not killed as it started
             over = _named(line, "taken") | _named(line, "dropped") | _named(line, "spoilt")
             missing = hand - over - settled - unwritten - {rollout for _, rollout, _ in uses}
-            if session.get("kept") and session["epoch"] == begun.get("epoch") and not falls_back:
+            if session.get("kept") and session["run_id"] == begun.get("run_id") and not falls_back:
                 near = {r for r in missing if abs(actors.made[r][0] - begun["version"]) <= begun["max_staleness"]}
                 lost |= near
             session, unwritten = begun, set()
             before = settled | {rollout for _, rollout, _ in uses}
             hand = (
-                actors.kept_by.get(begun.get("life", ""), set()) | _named(line, "taken")
+                actors.kept_by.get(begun.get("session_id", ""), set()) | _named(line, "taken")
             ) & actors.made.keys() - before
         newest = line.get("saved", newest)
         unwritten |= _named(line, "unwritten")

@@ -134,7 +134,7 @@ def _bundle(version: int, parameters: np.ndarray) -> Message:
     sizes = {"observation": (_FORM.observation,), "value": ()}
     arrays: dict[str, Any] = {f"{kind}/{m}": np.zeros(size) for kind, size in sizes.items() for m in ("mean", "m2")}
     arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": parameters}
-    meta = {"version": version, "epoch": _RUN_ID, "schema": _SCHEMA, "hand": "human", "layout": [], "format": 1}
+    meta = {"version": version, "run_id": _RUN_ID, "schema": _SCHEMA, "hand": "human", "layout": [], "format": 1}
     return Message(arrays, {**meta, "action_size": _FORM.action})
 
 

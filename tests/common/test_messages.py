@@ -30,7 +30,7 @@ def rollout(arrays=None, **meta):
         "episode/success": np.zeros(E, np.float32),
         "term/distance": np.zeros(E, np.float32),
     } | (arrays or {})
-    header = {"actor": "a", "incarnation": "0f", "sequence": 0, "version": 2, "epoch": "e", "schema": "s"}
+    header = {"actor": "a", "incarnation": "0f", "sequence": 0, "version": 2, "run_id": "e", "schema": "s"}
     return Message(
         {name: array for name, array in all_arrays.items() if array is not None}, {**header, "steps": T * B, **meta}
     )
@@ -92,7 +92,7 @@ def test_bad_array_is_named_with_its_rule(arrays, match):
         ({"sequence": "0"}, "'sequence' is '0', not int"),
         ({"sequence": True}, "'sequence' is True, not int"),
         ({"version": 1.0}, "'version' is 1.0, not int"),
-        ({"epoch": None}, "'epoch' is None, not str"),
+        ({"run_id": None}, "'run_id' is None, not str"),
         ({"actor": "../x"}, "actor"),
         ({"incarnation": "x" * 65}, "incarnation"),
         ({"steps": 5}, r"'steps' is 5, not T\*B = 3\*2"),
@@ -150,7 +150,7 @@ def bundle(**arrays):
                   for name in ("mean", "m2")}  # fmt: skip
     counts = {"observation/count": np.zeros(()), "value/count": np.zeros(())}
     weights = {"actor/trunk/0/kernel": np.zeros((5, 3), np.float32), "critic/head/bias": np.zeros(1, np.float32)}
-    meta = {"version": 1, "epoch": "e", "schema": "s", "hand": "human", "layout": [["state", 5]], "action_size": 4}
+    meta = {"version": 1, "run_id": "e", "schema": "s", "hand": "human", "layout": [["state", 5]], "action_size": 4}
     all_arrays = {**statistics, **counts, **weights, **arrays}
     return Message({name: array for name, array in all_arrays.items() if array is not None}, {**meta, "format": 1})
 

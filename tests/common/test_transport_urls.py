@@ -158,7 +158,7 @@ def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_pat
             assert time.monotonic() < deadline
         (message,) = batch
         assert (message.arrays["reward"] == 3.0).all() and message.meta["actor"] == "a"
-        assert hub.status()["ledger"]["accepted"] == 1
+        assert hub.status()["counters"]["accepted"] == 1
         actor.join(10)
         assert not actor.is_alive() and getattr(actor, "exitcode", 0) == 0
         hub.close()

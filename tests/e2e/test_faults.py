@@ -43,7 +43,7 @@ def test_a_killed_learner_costs_nobody_a_rollout(cluster):
     final, counts = cluster.stop(learner)
     assert counts["used"] + counts.get("waiting", 0) + counts.get("dropped", 0) == counts["accepted"]
     # What a learner refused as stale before it died is a gap for the next one.
-    assert final["ledger"]["missing"] <= counts["made"] - counts["accepted"]
+    assert final["counters"]["missing"] <= counts["made"] - counts["accepted"]
 
 
 def taken_up(folder):
@@ -116,7 +116,7 @@ def test_updates_that_die_before_a_checkpoint_are_undone_and_counted(cluster):
     cluster.wait_for_updates(3)
     final, counts = cluster.stop(learner)
     assert counts["undone"] >= 4
-    assert final["ledger"]["undone"] >= counts["undone"]  # some of them were sent again in time
+    assert final["counters"]["undone"] >= counts["undone"]  # some of them were sent again in time
 
 
 def test_actors_and_learner_stopped_for_fifteen_seconds(cluster):
@@ -127,8 +127,8 @@ def test_actors_and_learner_stopped_for_fifteen_seconds(cluster):
     stopped.send_signal(signal.SIGSTOP)
     began = time.monotonic()
     status = cluster.wait(lambda status: names(status) == {"b"})
-    before = status["ledger"]["accepted"]
-    cluster.wait(lambda status: status["ledger"]["accepted"] >= before + 4)  # nobody waits for it
+    before = status["counters"]["accepted"]
+    cluster.wait(lambda status: status["counters"]["accepted"] >= before + 4)  # nobody waits for it
     learner.send_signal(signal.SIGSTOP)
     time.sleep(15)
     learner.send_signal(signal.SIGCONT)
@@ -155,8 +155,8 @@ def test_a_link_that_goes_silent_is_noticed_and_comes_back(cluster, proxy):
     cluster.wait(lambda status: contributions(status).get("a", 0) > 3 and "b" in contributions(status))
     proxy.silence()
     status = cluster.wait(lambda status: names(status) == {"b"})
-    before = status["ledger"]["accepted"]
-    status = cluster.wait(lambda status: status["ledger"]["accepted"] >= before + 4)
+    before = status["counters"]["accepted"]
+    status = cluster.wait(lambda status: status["counters"]["accepted"] >= before + 4)
     proxy.restore()
     came = cluster.wait(lambda status: "a" in contributions(status))
     cluster.wait(lambda status: contributions(status).get("a", 0) > contributions(came)["a"])
@@ -174,7 +174,7 @@ def test_a_slow_link_slows_its_actor_alone(cluster, proxy):
     cluster.wait_for_updates(3)  # for which nobody has to wait
     status = cluster.wait(lambda status: cluster.outcomes("slow"))
     assert {entry["outcome"] for entry in cluster.outcomes("slow")} <= {"accepted", "stale"}
-    assert status["ledger"]["duplicate"] == 0  # once is enough
+    assert status["counters"]["duplicate"] == 0  # once is enough
     cluster.stop(learner)
 
 
@@ -185,16 +185,16 @@ def test_wall_clocks_do_not_matter(cluster):
     cluster.start_actor("b")
     cluster.wait_for_updates(10)
     status = cluster.wait(lambda status: min(contributions(status).values(), default=0) > 3)
-    assert status["ledger"]["expired"] == 0
+    assert status["counters"]["expired"] == 0
     cluster.stop(learner)
 
 
 def test_replayed_rollouts_and_tickets_of_others_change_nothing(cluster):
     learner = cluster.start_learner(pause=0.2)
     cluster.start_actor()
-    cluster.wait(lambda status: status["ledger"]["accepted"] >= 4)
+    cluster.wait(lambda status: status["counters"]["accepted"] >= 4)
     (who,) = (role for role in cluster.status()["roles"] if role["id"] == "a")
-    mine = {"actor": "a", "incarnation": who["incarnation"], "epoch": "e", "ticket": "x"}
+    mine = {"actor": "a", "incarnation": who["incarnation"], "run_id": "e", "ticket": "x"}
 
     def replay(**meta):
         other = rollout(T, 77, cluster.status()["version"])  # under the name of one that was accepted
@@ -202,15 +202,15 @@ def test_replayed_rollouts_and_tickets_of_others_change_nothing(cluster):
         return cluster.observer.query(KEYS.rollout("a"), message, timeout=5).meta["outcome"]
 
     assert [replay(sequence=sequence) for sequence in range(3)] == ["duplicate"] * 3
-    assert replay(sequence=0, epoch="another") == "stale"
+    assert replay(sequence=0, run_id="another") == "stale"
     asked = {"actor": "b", "incarnation": "01", "ticket": "y"}
     cluster.wait(
         lambda status: cluster.observer.query(KEYS.ticket("b"), Message(meta=asked), timeout=5).meta["granted"]
     )
     for thief in ({**asked, "actor": "c"}, {**asked, "incarnation": "02"}):
         cluster.observer.query(KEYS.ticket(thief["actor"]), Message(meta={**thief, "give_back": True}), timeout=5)
-    assert cluster.status()["ledger"]["returned"] == 0
+    assert cluster.status()["counters"]["returned"] == 0
     cluster.observer.query(KEYS.ticket("b"), Message(meta={**asked, "give_back": True}), timeout=5)
-    assert cluster.status()["ledger"]["returned"] == 1
+    assert cluster.status()["counters"]["returned"] == 1
     final, _ = cluster.stop(learner)
-    assert final["ledger"]["duplicate"] == 3
+    assert final["counters"]["duplicate"] == 3

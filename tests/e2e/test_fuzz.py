@@ -161,13 +161,13 @@ def memory():
 def requests():
     """A valid message for every key that is asked, and for every one that is published under."""
     who = {"actor": "NAME", "incarnation": "01"}
-    rollout = {**who, "sequence": 0, "version": 0, "epoch": "e", "schema": "s", "steps": 6, "ticket": "t"}
+    rollout = {**who, "sequence": 0, "version": 0, "run_id": "e", "schema": "s", "steps": 6, "ticket": "t"}
     named = {**random_arrays(FORM), "episode/success": np.ones(1, np.float32)}
     vector = np.zeros((2, LAYOUT.size), np.float32)
     asked = {
         KEYS.config: Message(),
         KEYS.status: Message(),
-        KEYS.weights: Message(meta={"newer_than": 3, "life": "x"}),
+        KEYS.weights: Message(meta={"newer_than": 3, "session_id": "x"}),
         KEYS.ticket("NAME"): Message(meta={**who, "ticket": "t", "give_back": False}),
         KEYS.rollout("NAME"): Message({name: np.clip(a, -1, 1) for name, a in named.items()}, rollout),
         KEYS.act: Message(query_arrays(), QUERY),
@@ -177,11 +177,11 @@ def requests():
     told = {
         KEYS.log("metrics", "actor", "NAME"): Message(meta={"time": 1.0, "update": 1, "values": {"a/b": 1.0, "c": 2}}),
         KEYS.log("event", "actor", "NAME"): Message(meta={"time": 1.0, "level": "info", "text": "x"}),
-        KEYS.log("version", "actor", "NAME"): Message(meta={"version": 1, "epoch": "e"}),
+        KEYS.log("version", "actor", "NAME"): Message(meta={"version": 1, "run_id": "e"}),
         KEYS.log("episode", "actor", "NAME"): episode(3),
         KEYS.log("rollout", "actor", "NAME"): Message(named, {"actor": "a", "version": 1}),
         KEYS.log("odd", "actor", "NAME"): Message(),
-        KEYS.announcement: Message(meta={"version": 1, "epoch": "e", "life": "x", "finished": False}),
+        KEYS.announcement: Message(meta={"version": 1, "run_id": "e", "session_id": "x", "finished": False}),
     }
     return [*asked.items(), (KEYS.act, packed)], list(told.items())
 

@@ -27,9 +27,9 @@ def test_the_run_goes_on_beside_an_attacker(cluster, what):
     attacker = subprocess.Popen(command, env=environment, stderr=(cluster.folder / "attacker.log").open("ab"))
     cluster.processes.append(attacker)
     works = {
-        "hold_tickets": lambda status: status["ledger"]["running"] >= 2,
+        "hold_tickets": lambda status: status["counters"]["running"] >= 2,
         "show_tokens": lambda status: status["unlisted"] > 3000,
-        "send_nonsense": lambda status: status["ledger"]["turned_away"] > 20,
+        "send_nonsense": lambda status: status["counters"]["turned_away"] > 20,
         "publish_logs": bool,
     }
     cluster.wait(works[what], timeout=60.0)  # it has what it wants before the honest one comes
@@ -39,4 +39,4 @@ def test_the_run_goes_on_beside_an_attacker(cluster, what):
     attacker.kill()
     final, _ = cluster.stop(learner)
     assert {actor for actor, *_ in final["history"]} == {"0.a"}
-    assert (final["ledger"]["damaged"] > 0) == (what == "send_nonsense")
+    assert (final["counters"]["damaged"] > 0) == (what == "send_nonsense")

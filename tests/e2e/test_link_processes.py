@@ -20,7 +20,7 @@ def actors(status):
 
 
 def assert_books_balance(final):
-    ledger = final["ledger"]
+    ledger = final["counters"]
     assert ledger["accepted"] == ledger["consumed"] + ledger["dropped"] + ledger["queued"]
     assert ledger["granted"] == ledger["running"] + ledger["redeemed"] + ledger["returned"] + ledger["expired"]
     assert ledger["consumed"] == len(final["history"])
@@ -32,13 +32,13 @@ def test_actor_killed_while_it_uploads_leaves_nothing_behind(cluster):
     learner = cluster.start_learner()
     for _ in range(3):
         actor = cluster.start_actor()
-        before = cluster.wait(lambda status: len(actors(status)) == 1)["ledger"]["accepted"]
-        cluster.wait(lambda status, before=before: status["ledger"]["accepted"] >= before + 4)
+        before = cluster.wait(lambda status: len(actors(status)) == 1)["counters"]["accepted"]
+        cluster.wait(lambda status, before=before: status["counters"]["accepted"] >= before + 4)
         time.sleep(random.uniform(0, 0.05))
         actor.send_signal(signal.SIGKILL)
         status = cluster.wait(lambda status: not actors(status))
-        assert status["ledger"]["running"] == 0
-    assert cluster.status()["ledger"]["damaged"] == 0
+        assert status["counters"]["running"] == 0
+    assert cluster.status()["counters"]["damaged"] == 0
     final, _ = cluster.stop(learner)
     assert_books_balance(final)
     history = {tuple(identity[1:]) for identity in final["history"]}
@@ -46,7 +46,7 @@ def test_actor_killed_while_it_uploads_leaves_nothing_behind(cluster):
         (entry["incarnation"], entry["sequence"]) for entry in cluster.outcomes() if entry["outcome"] == "accepted"
     }
     # All that was acknowledged was learnt from, or waited at the end.
-    assert len(acknowledged - history) <= final["ledger"]["queued"] + final["ledger"]["dropped"]
+    assert len(acknowledged - history) <= final["counters"]["queued"] + final["counters"]["dropped"]
     assert len({incarnation for incarnation, _ in history}) == 3
 
 
@@ -75,20 +75,20 @@ def test_learner_killed_and_restarted_counts_every_rollout_once(cluster):
     acknowledged, unknown = by_outcome["accepted"] | by_outcome["duplicate"], by_outcome["unknown"]
     assert len(unknown) <= 2  # on their way when the learner ended
     assert {identity[2] for identity in final["history"]} <= acknowledged | unknown
-    ledger = final["ledger"]
+    ledger = final["counters"]
     counted = sum(ledger[name] for name in ("consumed", "dropped", "queued", "stale", "missing"))
     assert len(outcomes) - len(unknown) <= counted <= len(outcomes)
 
 
 def test_learner_started_from_scratch_makes_actors_start_over(cluster):
-    learner = cluster.start_learner(epoch="e")
+    learner = cluster.start_learner(run_id="e")
     actor = cluster.start_actor()
     cluster.wait(lambda status: status["version"] >= 3)
     learner.send_signal(signal.SIGKILL)
     learner.wait(5)
     cluster.checkpoint.unlink()
-    learner = cluster.start_learner(epoch="f")
-    cluster.wait(lambda status: status["version"] >= 3 and status["epoch"] == "f")
+    learner = cluster.start_learner(run_id="f")
+    cluster.wait(lambda status: status["version"] >= 3 and status["run_id"] == "f")
     final, _ = cluster.stop(learner)
     assert actor.wait(10) == 0
     assert_books_balance(final)
@@ -98,13 +98,13 @@ def test_learner_started_from_scratch_makes_actors_start_over(cluster):
 def test_stopped_actor_is_noticed_and_comes_back(cluster):
     learner = cluster.start_learner()
     actor = cluster.start_actor()
-    cluster.wait(lambda status: status["ledger"]["accepted"] >= 4)
+    cluster.wait(lambda status: status["counters"]["accepted"] >= 4)
     actor.send_signal(signal.SIGSTOP)
     status = cluster.wait(lambda status: not actors(status))
-    assert status["ledger"]["running"] == 0
+    assert status["counters"]["running"] == 0
     actor.send_signal(signal.SIGCONT)
-    accepted = status["ledger"]["accepted"]
-    cluster.wait(lambda status: actors(status) and status["ledger"]["accepted"] >= accepted + 4)
+    accepted = status["counters"]["accepted"]
+    cluster.wait(lambda status: actors(status) and status["counters"]["accepted"] >= accepted + 4)
     assert_books_balance(cluster.stop(learner)[0])
     assert actor.wait(10) == 0
 
@@ -112,8 +112,8 @@ def test_stopped_actor_is_noticed_and_comes_back(cluster):
 def test_hostile_messages_harm_nobody_else(cluster):
     learner = cluster.start_learner()
     cluster.start_actor()
-    cluster.wait(lambda status: status["ledger"]["accepted"] >= 2)
-    header = {"actor": "evil", "incarnation": "66", "sequence": 0, "epoch": "e", "ticket": "x"}
+    cluster.wait(lambda status: status["counters"]["accepted"] >= 2)
+    header = {"actor": "evil", "incarnation": "66", "sequence": 0, "run_id": "e", "ticket": "x"}
 
     def evil(arrays=None, **meta):
         good = rollout(T, 0, cluster.status()["version"])
@@ -152,9 +152,9 @@ def test_hostile_messages_harm_nobody_else(cluster):
         cluster.observer.query("congrasp/chaos/shutdown", Message(), timeout=5)
     replayed = cluster.observer.query(KEYS.rollout("evil"), evil(version=10**6), timeout=5).meta
     assert replayed["outcome"] == "stale"
-    ledger = cluster.status()["ledger"]
+    ledger = cluster.status()["counters"]
     assert ledger["damaged"] == len(refused) + len(damaged)
-    cluster.wait(lambda status: status["ledger"]["accepted"] >= ledger["accepted"] + 4)
+    cluster.wait(lambda status: status["counters"]["accepted"] >= ledger["accepted"] + 4)
     final, _ = cluster.stop(learner)
     assert_books_balance(final)
     assert {identity[0] for identity in final["history"]} == {"a"}

@@ -50,7 +50,7 @@ def rollout(number, bundle):
         "truncated": terminal & (rng.random((STEPS, WORLDS)) < 0.5),
     }
     who = {"actor": "a", "incarnation": "01", "sequence": number, "ticket": ""}
-    return Message(arrays, {**who, **{name: bundle.meta[name] for name in ("version", "epoch", "schema")}, "steps": 8})
+    return Message(arrays, {**who, **{name: bundle.meta[name] for name in ("version", "run_id", "schema")}, "steps": 8})
 
 
 def feed(hub):

@@ -139,7 +139,7 @@ def test_with_the_right_certificates_a_run_works_from_end_to_end(run):
         wait_for(lambda: (received := logs.receive(5)) and received[0] == key)
         status = wait_for(lambda: (now := observer.query(KEYS.status, Message(), timeout=5).meta) and now)
         assert ("actor", ME) in {(role["role"], role["id"]) for role in status["roles"]}
-        assert status["ledger"]["accepted"] == 2 and status["ledger"]["turned_away"] == 0
+        assert status["counters"]["accepted"] == 2 and status["counters"]["turned_away"] == 0
     assert (
         server.query(KEYS.weights_for("server", "0.s"), Message(meta={"newer_than": -1}), timeout=5).meta["version"]
         == 1
@@ -264,10 +264,10 @@ def test_actors_do_not_speak_for_or_listen_to_one_another(run):
     assert {key.split("/")[-1] for key in seen} <= {"66"}
     # Its key is its own, but the message says another's name.
     forged = Message(rollout(T, 0, 0).arrays, {**rollout(T, 0, 0).meta, "actor": OTHER, "incarnation": "01",
-                     "sequence": 0, "epoch": "e", "ticket": "t"})  # fmt: skip
+                     "sequence": 0, "run_id": "e", "ticket": "t"})  # fmt: skip
     reply = actor.query(KEYS.rollout(ME), forged, timeout=5).meta
     assert reply["outcome"] == "refused" and "came under the key" in reply["why"]
-    assert run.hub.status()["ledger"]["accepted"] == 0
+    assert run.hub.status()["counters"]["accepted"] == 0
 
 
 def test_a_client_hears_no_logs(run):
@@ -298,7 +298,7 @@ def test_another_mode_of_connecting_gives_no_more(run, mode):
         time.sleep(0.5)
         run.transport.publish(KEYS.log("metrics", "learner", "0"), Message())
         observer = run.connect("observer.0")
-        assert "ledger" in observer.query(KEYS.status, Message(), timeout=5).meta
+        assert "counters" in observer.query(KEYS.status, Message(), timeout=5).meta
         assert answers(run.transport, KEYS.act) is None
         assert logs.try_recv() is None and all(one.try_recv() is None for one in stolen)
         for key in (KEYS.status, KEYS.ticket(OTHER), "congrasp/**"):
@@ -560,7 +560,7 @@ def test_a_flood_is_turned_away_and_the_others_go_on(run):
     for thread in threads:
         thread.start()
     try:
-        wait_for(lambda: run.hub.status()["ledger"]["turned_away"] > 50, 30.0)
+        wait_for(lambda: run.hub.status()["counters"]["turned_away"] > 50, 30.0)
         with ActorLink(run.connect("actor.0"), "safe", ME, request_timeout=5.0) as link:
             link.config(10)
             for version in range(20):
@@ -572,7 +572,7 @@ def test_a_flood_is_turned_away_and_the_others_go_on(run):
         stop.set()
         for thread in threads:
             thread.join(10)
-    ledger = run.hub.status()["ledger"]
+    ledger = run.hub.status()["counters"]
     assert ledger["accepted"] == ledger["consumed"] == 40
     assert ledger["damaged"] < ledger["turned_away"] + 1000
 

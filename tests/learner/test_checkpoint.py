@@ -62,9 +62,9 @@ def tree(value: float) -> dict:
 
 def test_leaves_come_back_where_and_what_they_were(tmp_path):
     checkpoints = Checkpoints(tmp_path)
-    checkpoints.save(tree(1.0), {"hub": {"seen": [1, 2]}, "epoch": "e"}, 1)
+    checkpoints.save(tree(1.0), {"hub": {"seen": [1, 2]}, "run_id": "e"}, 1)
     loaded, meta = checkpoints.load(tree(0.0))
-    assert meta == {"hub": {"seen": [1, 2]}, "epoch": "e"}
+    assert meta == {"hub": {"seen": [1, 2]}, "run_id": "e"}
     jax.tree.map(np.testing.assert_array_equal, loaded, tree(1.0))
     assert isinstance(loaded["device"]["half"], jax.Array)
     assert isinstance(loaded["host"], np.ndarray) and loaded["host"].dtype == np.float64

@@ -33,15 +33,15 @@ FORM = RolloutForm(T, B, D, A, half=True)
 
 def rollout(sequence=0, version=0, **meta):
     arrays = {**FORM.zeros(), "reward": np.full((T, B), sequence, np.float32)}
-    header = {"actor": "a", "incarnation": "01", "sequence": sequence, "version": version, "epoch": "e", "schema": "s"}
+    header = {"actor": "a", "incarnation": "01", "sequence": sequence, "version": version, "run_id": "e", "schema": "s"}
     return Message(arrays, {**header, "steps": T * B, **meta})
 
 
-def bundle(version, epoch="e"):
+def bundle(version, run_id="e"):
     arrays = {f"{kind}/{name}": np.zeros(shape) for kind, shape in (("observation", D), ("value", ()))
               for name in ("mean", "m2")}  # fmt: skip
     arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": np.full(3, float(version))}
-    meta = {"version": version, "epoch": epoch, "schema": "s", "hand": "human", "layout": [], "action_size": A}
+    meta = {"version": version, "run_id": run_id, "schema": "s", "hand": "human", "layout": [], "action_size": A}
     return Message(arrays, {**meta, "format": 1})
 
 
@@ -66,7 +66,7 @@ class Bench:
         return self.ask(KEYS.ticket("a"), {"actor": "a", "incarnation": "01", "ticket": name, **meta})
 
     def ledger(self):
-        return self.ask(KEYS.status)["ledger"]
+        return self.ask(KEYS.status)["counters"]
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def sequences(batch):
 
 def test_config(bench):
     reply = bench(config_json='{"name": "x"}').ask(KEYS.config)
-    assert (reply["config"], reply["epoch"], reply["schema"], reply["version"]) == ('{"name": "x"}', "e", "s", -1)
+    assert (reply["config"], reply["run_id"], reply["schema"], reply["version"]) == ('{"name": "x"}', "e", "s", -1)
     assert reply["arrays"] == list(FORM.arrays)
 
 
@@ -194,7 +194,7 @@ def test_too_old_is_refused_on_arrival_and_dropped_in_the_queue(bench):
     reply = b.send(2, version=0)
     assert reply["outcome"] == "stale" and "version 0" in reply["why"] and "at 2" in reply["why"]
     assert b.send(3, version=3)["outcome"] == "stale"
-    assert b.send(4, epoch="other")["outcome"] == "stale"
+    assert b.send(4, run_id="other")["outcome"] == "stale"
     b.send(5, version=2)
     assert sequences(b.hub.next_batch(2, 1)) == [1, 5]
     texts = [events.receive(1)[1].meta["text"] for _ in range(2)]
@@ -253,7 +253,7 @@ def test_floods_are_turned_away_and_cost_the_others_nothing(bench, monkeypatch):
     b = bench()
     b.hub.publish_weights(bundle(0), 0)
     events = b.peer.subscribe(KEYS.logs, depth=8)
-    outcomes = [b.send(0, actor="1.b", epoch="of another training")["outcome"] for _ in range(2500)]
+    outcomes = [b.send(0, actor="1.b", run_id="of another training")["outcome"] for _ in range(2500)]
     stale = outcomes.count("stale")
     assert outcomes == ["stale"] * stale + ["retry"] * (2500 - stale) and 1990 <= stale <= 2000
     reply = b.ask(KEYS.ticket("1.c"), {"actor": "1.c", "incarnation": "01", "ticket": "t"})
@@ -370,7 +370,7 @@ def test_weights_are_pulled_by_version(bench):
     notices = b.peer.subscribe(KEYS.announcement, depth=4)
     b.hub.publish_weights(bundle(0), 0)
     assert notices.receive(5)[1].meta == {
-        "version": 0, "epoch": "e", "life": b.hub.session_id, "finished": False,
+        "version": 0, "run_id": "e", "session_id": b.hub.session_id, "finished": False,
     }  # fmt: skip
     pulled = b.peer.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=5)
     assert pulled.meta == bundle(0).meta and pulled.arrays["actor/w"][0] == 0
@@ -380,7 +380,7 @@ def test_weights_are_pulled_by_version(bench):
     assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 0}), timeout=5).meta["version"] == 1
     # A learner that resumed from a checkpoint has an older version, or another one of the same number.
     assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 7}), timeout=5).meta["version"] == 1
-    assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 1, "life": "before"}), timeout=5).arrays
+    assert b.peer.query(KEYS.weights, Message(meta={"newer_than": 1, "session_id": "before"}), timeout=5).arrays
 
 
 def test_who_asks_for_weights_without_end_is_put_off_alone(bench):
@@ -398,7 +398,7 @@ def test_only_weights_of_this_run_are_published(bench):
     with pytest.raises(CongraspError, match="not version 1 of run id e"):
         b.hub.publish_weights(bundle(0), 1)
     with pytest.raises(CongraspError, match="run id"):
-        b.hub.publish_weights(bundle(0, epoch="other"), 0)
+        b.hub.publish_weights(bundle(0, run_id="other"), 0)
     bad = bundle(0)
     with pytest.raises(CongraspError, match="not finite"):
         b.hub.publish_weights(Message({**bad.arrays, "actor/w": np.full(3, np.nan)}, bad.meta), 0)
@@ -642,7 +642,7 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     kinds = sorted(path.suffix for path in folder.iterdir())
     assert kinds == [".aside", ".aside", ".aside", ".safetensors", ".safetensors", ".txt"]
     other = bench(log=log(), run_id="f")
-    other.hub.publish_weights(bundle(0, epoch="f"), 0)
+    other.hub.publish_weights(bundle(0, run_id="f"), 0)
     assert not on_disk(other.hub._log) and other.ledger()["queued"] == 0
 
 

@@ -226,12 +226,12 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     job.reach(5)
     words = job.kill(1)
     assert re.findall(r"congrasp: error: .*", words) == [words.strip().splitlines()[-1]]
-    assert "Rank 1 ended. Rank 0 cannot go on alone: start all ranks with --resume." in words
+    assert "Rank 1 ended. Rank 0 cannot continue alone: start all ranks with --resume." in words
 
     job.start(10**6, "resume")
     job.reach(6)
     words = job.kill(0)
-    assert "Rank 0 ended. Rank 1 cannot go on alone: start all ranks with --resume." in words
+    assert "Rank 0 ended. Rank 1 cannot continue alone: start all ranks with --resume." in words
 
     kept = int((job.run_dir / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
     assert kept >= 5  # the first update after a resume has a checkpoint of its own

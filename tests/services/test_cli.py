@@ -8,13 +8,16 @@ import signal
 import socket
 import subprocess
 import sys
+from pathlib import Path
 from unittest import mock
 
 import pytest
 
 import congrasp.services.cli.main as cli
+from congrasp.common.errors import CongraspError
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import COMMANDS, load
+from congrasp.services.ops.logs import announced
 
 
 def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -26,7 +29,7 @@ def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
 def is_one_line(code: int, said: str, words: str) -> None:
     """What was said on the standard error is one line with these words, and the exit code tells of bad input."""
     assert code not in (0, 1), said
-    (line,) = said.splitlines()
+    (line,) = [line for line in said.splitlines() if not line.endswith(" s so far.")]  # how long it works already
     assert line.startswith("congrasp: error: ")
     assert re.search(words, line), line
 
@@ -53,21 +56,21 @@ def test_help_names_every_command_and_every_command_exists():
         (["evaluate", "--method", "graspxl"], "has the method 'ours', not 'graspxl'.*train --method graspxl"),
         (["train", "--task.hand", "paw"], "no hand 'paw'"),
         (["train", "--resume", "--run-dir", "/nonexistent-run"], "is not a run directory"),
-        (["evaluate", "--policy", "/nonexistent.safetensors"], "cannot be read"),
+        (["evaluate", "--policy", "/nonexistent.safetensors"], "--policy: there is no file /nonexistent.safetensors"),
         (["serve", "--hand", "paw"], "no hand 'paw'"),
-        (["serve", "--policy", "a.safetensors", "--connect", "tcp/127.0.0.1:1"], "either a.safetensors or"),
+        (["serve", "--policy", "a", "--connect", "tcp/127.0.0.1:1"], "either a or"),
         (["actor", "--connect", "nonsense"], "endpoint"),
         (["plot", "/nonexistent-run"], "nonexistent-run"),
         (["plot", "x" * 300], "x cannot be used: File name too long"),
         (["export", "motion", "x" * 300], "x cannot be used: File name too long"),
         (["status", "/dev/null"], "/dev/null is not a run directory"),
         (["grasp", "x" * 300 + ".stl"], "x.stl cannot be used: File name too long"),
-        (["grasp", "mug:7", "--policy", "/nonexistent.safetensors"], "/nonexistent.safetensors cannot be read"),
+        (["grasp", "mug:7", "--policy", "/nonexistent.safetensors"], "there is no file /nonexistent.safetensors"),
         (["grasp", "mug:7", "--policy", "/"], "/ is no regular file"),
         (["grasp", "mug:7", "--seed", "-1"], "--seed: a seed is a whole number from 0 to 1e[+]15"),
         (["evaluate", "--seed", "9" * 23], "--seed: a seed is a whole number"),
         (["train", "--objects.seed", "9" * 23], "--objects.seed: a seed is a whole number"),
-        (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It is from 0 to 1024"),
+        (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It must be from 0 to 1024"),
         (["serve", "--metrics-port", "99999999"], "metrics cannot be served at .*:99999999.*--metrics-port"),
         (["view", "--recordings", "/dev/null", "--port", "0"], "/dev/null is no recording"),
         (["learner", "--run-dir", "/nonexistent-run", "--listen", "tcp/0.0.0.0:7447"], "other machines.*--certs"),
@@ -89,7 +92,7 @@ def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words, monkeypatch
     ("arguments", "words"),
     [
         (["train", "--physics", "warp", "--run-dir", "/nonexistent-run"], "NVIDIA GPU"),
-        (["serve", "--policy", "/nonexistent.safetensors"], "cannot be read"),
+        (["serve", "--policy", "/nonexistent"], "cannot be read"),
         (["query", "--connect", "tcp/127.0.0.1:1", "--repeat", "2"], "127.0.0.1:1"),
     ],
 )
@@ -108,7 +111,7 @@ def test_libraries_add_nothing_to_the_line(arguments, words):
         ),
         (
             OSError(errno.EIO, os.strerror(errno.EIO)),
-            "A file could not be read or written: the disk that it is on failed. Try another path.",
+            "A file could not be read or written, because its disk failed. Try another path.",
         ),
     ],
 )
@@ -162,3 +165,23 @@ def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path):
         done = congrasp("learner", "--run-dir", str(run_dir), "--listen", f"tcp/127.0.0.1:{port}")
     assert done.returncode == 2 and f"127.0.0.1:{port} is in use" in done.stderr
     assert not run_dir.exists()
+
+
+def test_a_misspelt_file_is_named_before_anything_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mug.obj").touch()
+    monkeypatch.setattr(cli, "load", lambda name: pytest.fail("the command's module was imported"))
+    with pytest.raises(CongraspError, match=r"There is no file .*mugg\.obj\. Did you mean .*mug\.obj\?"):
+        cli.run(["grasp", str(tmp_path / "mugg.obj"), "--out", "new.obj"])
+    with pytest.raises(CongraspError, match=r"--pose: there is no file .*far\.npz\. Check the path\."):
+        cli.run(["grasp", str(tmp_path / "mug.obj"), "--pose", str(tmp_path / "far.npz:3")])
+
+
+def test_what_takes_long_says_for_how_long_and_what_does_not_says_nothing(capsys: pytest.CaptureFixture) -> None:
+    with announced("Compiling", first=60.0):
+        pass
+    assert not capsys.readouterr().err
+    lines: list[str] = []
+    with announced("Compiling", first=0.01, every=0.01):
+        while len(lines) < 2:
+            lines += capsys.readouterr().err.splitlines()
+    assert set(lines) == {"Compiling: 0 s so far."}

@@ -92,8 +92,8 @@ class Affordance(Constraint):
         Option("avoid", "Part not to touch: a mesh or names of parts, likewise.", "part"),
     )
 
-    needs = ("surface_minus",)
-    invalid = ("An affordance needs surface points on both sides.", "Set some of 'surface_minus'.")
+    needs = ("surface_avoid",)
+    invalid = ("An affordance needs surface points on both sides.", "Set some of 'surface_avoid'.")
 
     def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
         """Nearest-point vectors and forces."""
@@ -179,6 +179,12 @@ class Affordance(Constraint):
         grasped, avoided = given["affordance"], given["avoid"]
         if grasped and avoided:
             region = avoided.distance < grasped.distance
+            if not (grasped.distance < avoided.distance).any():
+                raise CongraspError(
+                    f"--affordance '{grasped.text}' and --avoid '{avoided.text}' contradict each other: all that "
+                    f"may be grasped of '{obj.name}' must not be touched.",
+                    "Leave one of them out, or name different parts.",
+                )
         elif avoided:
             region = avoided.distance < _NEAR
         else:

@@ -72,7 +72,8 @@ class Trajectory(Constraint):
     options = (
         Option(
             "trajectory",
-            "Wrist path: a grasp.npz, a constraint set, JSON with position and quaternion, or CSV (x y z w x y z).",
+            "Wrist path: a grasp.npz, a constraint set, JSON with position and quaternion, CSV (x y z w x y z), "
+            "or BVH (cm, y up; FILE:JOINT, RightHand by default).",
             "path",
         ),
     )

@@ -23,7 +23,7 @@ _LARGEST = 100.0  # tolerance, m or rad
 _MASS = 0.2  # mass in kg of an object whose set was written before sets recorded it
 MEANING = {
     "surface/points": "(P, 3) m, object frame",
-    "surface/minus": "(P,) bool, the point belongs to the avoid region",
+    "surface/avoid": "(P,) bool, the point belongs to the avoid region",
     "rest": "(R, 7) resting poses in the world frame, position (m) and quaternion; the table's top is at z = 0",
     "heading/position": "(V, H, 3) m, object frame: target of the hand's centre",
     "heading/direction": "(V, H, 3) unit, object frame: direction in which the hand moves",
@@ -90,7 +90,7 @@ def _row(made: Message, split: Split) -> ConstraintBank:
     index = np.array([[np.resize(np.flatnonzero(row) if row.any() else [0], count) for row in v] for v in heading])
     return ConstraintBank(
         points=arrays["surface/points"],
-        avoid=arrays["surface/minus"],
+        avoid=arrays["surface/avoid"],
         rest=arrays["rest"][usable],
         heading_position=arrays["heading/position"],
         heading_direction=arrays["heading/direction"],
@@ -103,7 +103,7 @@ def _row(made: Message, split: Split) -> ConstraintBank:
         trajectory_position=arrays["trajectory/position"],
         trajectory_quaternion=arrays["trajectory/quaternion"],
         pose_valid=pose[:, usable],
-        has_affordance=arrays["surface/minus"].any() & heading[1].any(-1),
+        has_affordance=arrays["surface/avoid"].any() & heading[1].any(-1),
         weight=np.float32(1.0),
         mass=np.float32(made.meta.get("object_mass", _MASS)),
         renewable=np.bool_(False),

@@ -88,7 +88,7 @@ def set_of(
         heading_training = for_training(row.heading_position.shape[1], seed)
     arrays = {
         "surface/points": row.points,
-        "surface/minus": row.avoid,
+        "surface/avoid": row.avoid,
         "rest": row.rest[:rests],
         "heading/position": row.heading_position,
         "heading/direction": row.heading_direction,
@@ -158,7 +158,7 @@ def describe(constraints: Message) -> dict[str, str]:
     rows = {
         "hand": f"{meta['hand']}, {len(meta['finger_joints'])} finger joints",
         "object": f"{meta['object']} ({meta['object_digest']}){_scale_text(meta['object_scale'])}",
-        "avoid region": f"{arrays['surface/minus'].mean():.0%} of {len(arrays['surface/points'])} surface points",
+        "avoid region": f"{arrays['surface/avoid'].mean():.0%} of {len(arrays['surface/points'])} surface points",
         "headings": f"{allowed.shape[2]} for each of: {', '.join(meta['variants'])}",
         "reference poses": f"{poses.shape[2]} for each",
         "wrist trajectories": f"equally many, {waypoints.shape[2]} waypoints, "

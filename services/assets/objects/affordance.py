@@ -1,4 +1,4 @@
-"""Which part of an object may be grasped: new partitions into graspable region and avoid region.
+"""New partitions of an object into graspable region and avoid region.
 
 From a mesh of one part, from painted vertices, from a half-space, or from points that were touched. All of them label
 the object's surface points; nothing else about the object changes.

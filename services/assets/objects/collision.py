@@ -1,4 +1,4 @@
-"""The convex pieces that stand for an object in physics: its folder's own, or cut from its mesh if those are coarse."""
+"""Convex collision pieces of an object: those of its folder, or a decomposition of its mesh if those are coarse."""
 
 import contextlib
 from collections.abc import Sequence
@@ -16,21 +16,21 @@ from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.pieces import SQUEEZE, merge, simplify, squeeze
 from congrasp.services.assets.objects.sources import Source
 
-_TOO_LARGE = 0.01  # share of the volume; pieces of thin walls fill the inside of their bends
+_TOO_LARGE = 0.01  # share of the volume; pieces of thin walls fill the inside of bends
 
 
 class Collision(NamedTuple):
-    """Convex pieces and how faithful they are."""
+    """Convex pieces and their errors."""
 
     hulls: list[np.ndarray]
     """Vertices (V, 3) of each piece, m."""
     owners: list[int]
-    """The part of each (0 where the parts are labels)."""
+    """Part of each piece (0 where the parts are labels)."""
     errors: Fidelity
-    """Against the object's mesh."""
+    """Errors relative to the object's mesh."""
 
     def __str__(self) -> str:
-        """How many there are, and their errors."""
+        """Number of pieces, and their errors."""
         count = len(self.hulls)
         return f"{count} convex piece{'s stand' if count > 1 else ' stands'} for it: {self.errors}"
 
@@ -43,15 +43,15 @@ def convex_pieces(
     options: ImportOptions,
     notes: list[str],
 ) -> Collision:
-    """The given pieces where they are within the budget of errors; else a decomposition, or they where they are closer.
+    """Returns the given pieces if their errors are small enough; else a decomposition, or the given ones if closer.
 
     Args:
       source: the object's files.
       meshes: its surface, m: one of the whole, or one of each part.
       whole: all of them as one.
-      given: vertices (V, 3) of the convex pieces that its folder brings, m; its surface, where that has no file.
+      given: vertices (V, 3) of the convex pieces in its folder, m; the surface if that has no file.
       options: how meshes become objects.
-      notes: which pieces were taken and how far they are off is added to it.
+      notes: the selected pieces and their errors are appended.
 
     Raises:
       CongraspError: the object has no volume.

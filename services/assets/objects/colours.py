@@ -1,4 +1,4 @@
-"""Colours of an imported object: what its files' textures, materials and colours look like at points of its surface."""
+"""Colours of an imported object: textures, materials and colours of its files at points of its surface."""
 
 import pathlib
 from collections.abc import Sequence
@@ -12,15 +12,15 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import COLOUR_POINTS, Colours
 from congrasp.services.assets.objects.sources import kind_of, load_geometry
 
-_UNSAID = (102, 102, 102)  # what trimesh takes for the colour of a material without one
+_UNSAID = (102, 102, 102)  # default colour of a material in trimesh
 
 
 def sample_colours(paths: Sequence[pathlib.Path], seed: int) -> Colours | None:
-    """Points spread evenly over the surfaces that some mesh files show, and the colours there.
+    """Samples points evenly over the surfaces of mesh files, with their colours.
 
     Args:
       paths: the files.
-      seed: draws the points.
+      seed: seed of the points.
 
     Returns:
       `COLOUR_POINTS` of them, in the files' frame and unit; None if no file has any colour.
@@ -44,26 +44,26 @@ def sample_colours(paths: Sequence[pathlib.Path], seed: int) -> Colours | None:
 
 
 def _meshes(path: pathlib.Path) -> list[trimesh.Trimesh]:
-    """The meshes that a file's scene shows, where it shows them."""
+    """Meshes of a file's scene, placed as in the scene."""
     loaded = load_geometry(path, "Export it without textures.", file_type=kind_of(path)[1:])
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
     return [part for part in parts if isinstance(part, trimesh.Trimesh) and part.area > 0]
 
 
 def _has_colours(visual: Any) -> bool:
-    """Whether a file says how a mesh looks; an image that cannot be read says nothing."""
+    """True if a file specifies the look of a mesh; an unreadable image does not count."""
     if visual is None or visual.kind != "texture":
         return visual is not None and visual.defined
     return _image(visual.material) is not None or tuple(visual.material.main_color[:3]) != _UNSAID
 
 
 def _image(material: Any) -> Any:
-    """The picture of a material's colour, if it has one."""
+    """Image of a material's colour, if it has one."""
     return getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
 
 
 def _sampled(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) on a mesh, and their colours (count, 3)."""
+    """Samples points (count, 3) on a mesh, and their colours (count, 3)."""
     points, faces, weights = trimesh.sample.sample_surface(mesh, count, return_barycentric=True, seed=rng)
     corners = mesh.faces[faces]
     visual: Any = mesh.visual

@@ -1,8 +1,8 @@
-"""Convex pieces of a mesh: its hull where that is the shape, else CoACD under limits, V-HACD where it fails, the hull.
+"""Convex pieces of a mesh: its hull if it is convex, else CoACD under limits, V-HACD if that fails, or the hull.
 
-The decomposers are native code that cannot be interrupted, so that they run in a child process
-(`python -m congrasp.services.assets.objects.decompose`) with limits of memory and of processor time: how busy the
-machine is changes when a shape is ready, not which one it is.
+The decomposers are native code that cannot be interrupted, so they run in a child process (`python -m
+congrasp.services.assets.objects.decompose`) with limits of memory and of processor time: the load of the machine
+affects the time, but not the result.
 """
 
 import os
@@ -25,9 +25,9 @@ from congrasp.common.objects.spec import MAX_MESH_PIECES
 from congrasp.services.assets.objects.pieces import DEPTH, GROWTH, deepest, merge, solid_hull
 
 FALLBACK_LIMIT = 30.0
-"""Seconds of processor time that V-HACD may take."""
+"""Limit of V-HACD's processor time, s."""
 STARVED = 20.0
-"""Seconds of the clock for each second of processor time after which the machine counts as too busy."""
+"""Ratio of wall-clock to processor time above which the machine counts as too busy."""
 _MEMORY = 6 << 30  # bytes of address space
 _FINEST = 0.01  # the smallest threshold that CoACD takes, of half the longest side
 _ROOT = pathlib.Path(congrasp.__file__).parents[1]
@@ -41,7 +41,7 @@ class Decomposition(NamedTuple):
     method: str
     """"convex", "coacd", "vhacd" or "hull"."""
     notes: list[str]
-    """What the user should know."""
+    """Notes for the user."""
 
 
 def decompose(
@@ -52,17 +52,17 @@ def decompose(
     time_limit: float,
     max_pieces: int = MAX_MESH_PIECES,
 ) -> Decomposition:
-    """Convex pieces of a triangle mesh: as few as keep its shape, if `max_pieces` suffice for that.
+    """Decomposes a triangle mesh into as few convex pieces as preserve its shape, at most `max_pieces`.
 
     Args:
       vertices: (V, 3), m, not all in a plane.
       faces: (F, 3).
-      volume: what the mesh encloses if it is closed, m^3; one that is nearly its hull needs no decomposition.
-      time_limit: seconds of processor time for CoACD; V-HACD gets half a minute after it.
+      volume: volume of a closed mesh, m^3; one close to that of the hull needs no decomposition.
+      time_limit: processor time for CoACD, s; V-HACD gets half a minute after it.
       max_pieces: most pieces.
 
     Raises:
-      CongraspError: the machine is too busy for the child to come to its limit.
+      CongraspError: the machine is too busy for the child to reach its limit.
     """
     hull = shapes.hull_of(vertices)
     whole = [hull.points[hull.vertices]]
@@ -81,7 +81,7 @@ def decompose(
 def _in_child(
     method: str, vertices: np.ndarray, faces: np.ndarray, volume: float | None, max_pieces: int, limit: float
 ) -> tuple[list[np.ndarray], str]:
-    """The pieces, or none and why."""
+    """Returns the pieces, or none and the reason."""
     with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
         mesh, result = os.path.join(folder, "mesh.npz"), os.path.join(folder, "pieces.npz")
         np.savez(mesh, vertices=vertices, faces=faces, volume=volume or 0.0)
@@ -114,7 +114,7 @@ def _in_child(
 
 
 def _child(method: str, mesh: str, result: str, max_pieces: str, limit: str) -> None:
-    """Decomposes one mesh file into another; ends by itself at the limit, or when the parent is gone."""
+    """Decomposes one mesh file into another; ends at the limit, or when the parent is gone."""
     signal.setitimer(signal.ITIMER_PROF, float(limit))  # of processor time; its signal ends the process
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))

@@ -1,10 +1,10 @@
-"""How faithful convex pieces are to the mesh that they stand for: volume of their union, distance of the surfaces.
+"""Errors of convex pieces relative to their mesh: volume of their union, distance of the surfaces.
 
-Both bodies are cut by parallel rays along each axis, the same for both. A ray is inside where the winding number of
-the triangles around it is above zero: bodies may overlap, walls inside of others do not count, and neither does a gap
-along a ray that is narrower than `_SEAM`. What the rays are inside of is the volume; where they enter and leave, the
-outer surface. The inside of a cup is outside. Of that surface counts what a ball of radius `REACH` can touch: no finger
-gets into a crack.
+Both bodies are cut by parallel rays along each axis, the same for both. A ray is inside where the winding number of the
+triangles around it is above zero: bodies may overlap, walls inside of others do not count, and neither does a gap along
+a ray that is narrower than `_SEAM`. The rays' interior length gives the volume; their entries and exits give the outer
+surface. The inside of a cup is outside. Only the part of the surface that a ball of radius `REACH` can touch counts: no
+finger reaches into a crack.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from congrasp.common.objects import shapes
 
 POINTS = 50_000
-"""Most points of a surface whose distances from the other are taken, to the nearest of all points of that one."""
+"""Most points of a surface whose distances from the other one are computed."""
 MOST_SURFACE, MOST_VOLUME = 3e-3, 0.05
 """Errors that are small enough: m, and share of the volume."""
 REACH = 2e-3
@@ -28,7 +28,7 @@ _OFF_GRID = np.array([0.1236068, 0.4142136, 0.7320508])  # of the rays' spacing:
 
 
 class Fidelity(NamedTuple):
-    """Errors of an object's convex pieces against its mesh."""
+    """Errors of an object's convex pieces relative to its mesh."""
 
     volume: float | None
     """(Volume of the pieces' union - the mesh's) / the mesh's; None for an open mesh, which encloses no volume."""
@@ -37,11 +37,11 @@ class Fidelity(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """The larger of both errors as a share of what is small enough."""
+        """The larger of both errors as a share of the tolerance."""
         return max(self.surface / MOST_SURFACE, abs(self.volume or 0.0) / MOST_VOLUME)
 
     def __str__(self) -> str:
-        """Both errors as a phrase."""
+        """Formats both errors as a phrase."""
         surface = f"their surface is at most {1000 * self.surface:.1f} mm off the mesh's"
         if self.volume is None:
             return f"{surface}; their volume has nothing to compare with, because the mesh is open"
@@ -54,7 +54,7 @@ def fidelity(mesh: np.ndarray, pieces: list[np.ndarray], closed: bool) -> Fideli
     Args:
       mesh: (F, 3, 3) corners of its triangles, m; they wind outwards where it is closed.
       pieces: (V, 3) vertices of each piece, in the same frame.
-      closed: whether the mesh encloses a volume; otherwise all of it counts as surface.
+      closed: True if the mesh encloses a volume; otherwise all of it counts as surface.
     """
     union = np.concatenate([np.asarray(shapes.triangulate(piece).triangles) for piece in pieces])
     corners = np.concatenate([mesh, union]).reshape(-1, 3)
@@ -111,7 +111,7 @@ def _cut(triangles: np.ndarray, low: np.ndarray, spacing: float) -> tuple[float,
 
 
 def _crossings(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where rays through the integers of the first two axes, along the third, go through triangles (F, 3, 3).
+    """Intersections of rays through the integers of the first two axes, along the third, with triangles (F, 3, 3).
 
     Returns:
       (N, 2) the rays, (N,) places on them, (N,) the triangles, and (F, 3) unit normals of all triangles.

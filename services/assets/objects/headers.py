@@ -1,4 +1,4 @@
-"""What a mesh file says of its size, compared with its size, before anything is read of it."""
+"""Checks the announced sizes in a mesh file's header against its length, before it is read."""
 
 import json
 import pathlib
@@ -21,7 +21,7 @@ _BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 
 
 def check_header(path: pathlib.Path, kind: str, remedy: str) -> None:
-    """Nothing, where a mesh file of a kind (".stl", ".obj", ".ply", ".glb") can be read in bounded memory and time.
+    """Checks that a mesh file of a kind (".stl", ".obj", ".ply", ".glb") can be read in bounded memory and time.
 
     Raises:
       CongraspError: it is too large, or announces more than it holds.

@@ -1,4 +1,4 @@
-"""The kind of a mesh file by its content, whatever its name says; what is no mesh is refused with a remedy."""
+"""Determines the kind of a mesh file by its content; other files are refused with a remedy."""
 
 import pathlib
 import zipfile
@@ -27,10 +27,10 @@ _START = 4096
 
 
 def kind_of(path: pathlib.Path) -> str:
-    """The suffix that fits a file's content, or that of its name where the content does not tell.
+    """Returns the suffix for a file's content, or that of its name if the content is ambiguous.
 
     Raises:
-      CongraspError: it cannot be read, is empty, or is something else; the remedy says how to come to a mesh.
+      CongraspError: it cannot be read, is empty, or is not a mesh; the remedy describes how to get one.
     """
     try:
         with path.open("rb") as file:
@@ -77,7 +77,7 @@ def _supported(start: bytes, size: int) -> str | None:
 
 
 def _inside(path: pathlib.Path) -> str:
-    """What a zip archive holds, for an error's text."""
+    """Content of a zip archive, for an error message."""
     try:
         names = [name for name in zipfile.ZipFile(path).namelist() if name.lower().endswith(SUFFIXES)]
     except (OSError, zipfile.BadZipFile):

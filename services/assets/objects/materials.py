@@ -1,4 +1,4 @@
-"""Masses by material: densities, and which things of a material are hollow."""
+"""Masses by material: densities, and conditions for hollow objects."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

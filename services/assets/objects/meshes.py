@@ -99,7 +99,7 @@ def import_sources(
 
 
 def _cache_folder(options: ImportOptions) -> pathlib.Path:
-    """Where finished imports are kept."""
+    """Cache folder of finished imports."""
     return pathlib.Path(options.cache_dir) if options.cache_dir else cache_folder("objects")
 
 

@@ -1,4 +1,4 @@
-"""Objects that a user points to: object files, folders of them, meshes to import, names, and seeds of the generator."""
+"""Objects named by a user: object files, folders of them, meshes to import, names, and seeds of the generator."""
 
 import hashlib
 import logging
@@ -21,7 +21,7 @@ _METRES_OR_ASK = ImportOptions()
 
 
 class ObjectAt(NamedTuple):
-    """An object that a path holds, read or imported only when it is wanted."""
+    """An object at a path, read or imported on demand."""
 
     name: str
     path: pathlib.Path
@@ -50,7 +50,7 @@ class ObjectAt(NamedTuple):
 
 
 def objects_at(path: pathlib.Path) -> list[ObjectAt]:
-    """What a path holds: an object file, the object files of a folder, or else meshes (see `find_sources`).
+    """Objects at a path: an object file, the object files of a folder, or else meshes (see `find_sources`).
 
     FAMILY:SEED, such as mug:7, is an object of the generator, and FAMILY:FIRST-LAST are many of them, where no file has
     that name; the families of a group, such as all:0-999, take turns.
@@ -72,12 +72,12 @@ def objects_of(
     *,
     track: Callable[[str, int | None], Callable[[int], None]] | None = None,
 ) -> list[GraspObject]:
-    """Every object of a path; what an import has to say goes to the log.
+    """Loads every object of a path; notes of imports go to the log.
 
     Args:
       path: see `objects_at`.
       options: how meshes become objects.
-      track: (what is done, how much) -> what is told how much is done; import may take long.
+      track: (label, total) -> function to call with the number done; imports may take long.
 
     Raises:
       CongraspError: there is nothing of the kind, or it cannot be read or imported.
@@ -99,13 +99,14 @@ def load_each(
     on_error: Callable[[ObjectAt, CongraspError], None] = _refuse,
     progress: Callable[[int], None] = lambda done: None,
 ) -> list[GraspObject]:
-    """Objects in the order given; meshes are imported side by side, and what an import has to say goes to the log.
+    """Loads objects in the given order; meshes are imported in parallel, and notes of imports go to the log.
 
     Args:
       found: see `objects_at`.
       options: how meshes become objects.
-      on_error: is given what cannot be read or imported, and why; such an object is left out unless this raises.
-      progress: is told how many meshes are done.
+      on_error: called with each object that cannot be read or imported, and the error; the object is skipped unless
+        this raises.
+      progress: called with the number of finished meshes.
     """
     sources = {i: one.source for i, one in enumerate(found) if one.source}
     indices, objects = list(sources), dict[int, GraspObject]()

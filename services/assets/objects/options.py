@@ -1,4 +1,4 @@
-"""How meshes become objects: what a user may set, apart from what does it, so that the command line starts at once."""
+"""Options for converting meshes to objects, separate from their use, so that the command line starts quickly."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from congrasp.services.assets.objects.sizes import Unit
 
 @dataclasses.dataclass(frozen=True)
 class ImportOptions:
-    """How meshes become objects; the string under a field is its help on the command line."""
+    """Options for converting meshes to objects; the string under a field is its help on the command line."""
 
     unit: Unit = "auto"
     """Unit of the files' numbers; auto takes metres if that makes an object of 1 to 60 cm, and asks otherwise; guess

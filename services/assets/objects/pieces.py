@@ -23,11 +23,11 @@ _LEAST = 1e-11  # m^3; a piece below is dust of the cutting
 
 
 class _Join(NamedTuple):
-    """What joining two pieces costs."""
+    """Cost of joining two pieces."""
 
     cost: float
     checked: bool
-    """Whether `depth` counts what stands out from the surface, too: that takes long, and is done for the cheapest."""
+    """True if `depth` includes parts that stand out from the surface; this is slow, and done for the cheapest joins."""
     first: int
     second: int
     depth: float
@@ -182,7 +182,7 @@ def squeeze(vertices: np.ndarray, factor: float) -> np.ndarray:
 
 
 def _touch(a: ConvexHull, b: ConvexHull) -> bool:
-    """Whether the boxes around two hulls touch."""
+    """True if the boxes around two hulls touch."""
     return bool((a.min_bound < b.max_bound + _NEAR).all() and (b.min_bound < a.max_bound + _NEAR).all())
 
 

@@ -1,4 +1,4 @@
-"""Mends what can be mended of a mesh, and says so in a line that needs no expert."""
+"""Repairs a mesh, and describes the repairs for non-experts."""
 
 import numpy as np
 import trimesh
@@ -176,5 +176,5 @@ def _wound_alike(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _was(count: int) -> str:
-    """The verb for so many."""
+    """Verb for a number of items."""
     return "was" if count == 1 else "were"

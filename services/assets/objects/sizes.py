@@ -1,4 +1,4 @@
-"""Sizes: what the numbers of a mesh file mean in metres, and how long that is compared with common things."""
+"""Sizes: conversion of a mesh file's numbers to metres, and comparison with common objects."""
 
 from collections.abc import Sequence
 from typing import Literal

@@ -1,4 +1,4 @@
-"""What a path offers for import: single meshes, decomposed objects, objects in part files; and reading one mesh."""
+"""Sources of objects at a path: single meshes, decomposed objects, objects in part files; and a mesh reader."""
 
 import dataclasses
 import os
@@ -29,7 +29,7 @@ class MeshFile:
     part: str = ""
     """Name of the part that it shows."""
     graspable: bool = True
-    """Whether that part may be grasped."""
+    """True if that part may be grasped."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Source:
 
     @property
     def parts_are_pieces(self) -> bool:
-        """Whether the part files together are the object, so that no collision piece spans two of them."""
+        """True if the part files together are the object, so that no collision piece spans two of them."""
         return bool(self.parts) and self.visuals == self.parts
 
     def files(self) -> tuple[MeshFile, ...]:
@@ -56,7 +56,7 @@ class Source:
 
 
 def find_sources(path: str | os.PathLike[str]) -> list[Source]:
-    """The objects that a path holds.
+    """Finds the objects at a path.
 
     * A mesh file (STL, OBJ, PLY, GLB) is one object.
     * A folder with `graspable.*` and `non_graspable.*` (or `top*` and `bottom*`) is one object of two parts.
@@ -86,8 +86,8 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Tri
     """Reads one mesh, in the file's own unit, with merged vertices and without degenerate triangles.
 
     Args:
-      path: the file; its content counts, not its name.
-      notes: what was mended is added to it.
+      path: the file; its content determines the kind, not its name.
+      notes: repairs are appended.
 
     Raises:
       CongraspError: not a mesh, empty, or not finite.
@@ -127,7 +127,7 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None) -> trimesh.Tri
 
 
 def load_geometry(path: pathlib.Path, remedy: str, **options: Any) -> Any:
-    """What trimesh finds in a file, be it a mesh or a point cloud, as it is.
+    """Loads a file with trimesh, as a mesh or a point cloud, unchanged.
 
     Raises:
       CongraspError: it cannot be read; the line ends with the remedy.

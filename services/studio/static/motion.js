@@ -62,7 +62,7 @@ export class Motion {
   // Each vertex has the label of the surface point nearest to it.
   #labels(arrays) {
     const { data: points } = arrays.surface_points;
-    const { data: avoid } = arrays.surface_minus;
+    const { data: avoid } = arrays.surface_avoid;
     const labels = new Uint8Array(this.vertices.length / 3);
     for (let v = 0; v < labels.length; v++) {
       let nearest = Infinity;

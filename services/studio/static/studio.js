@@ -23,6 +23,8 @@ export class StudioPanel {
     $("hand").addEventListener("change", () => this.act("hand", { name: $("hand").value }));
     $("object").addEventListener("change", () => this.act("object", { name: $("object").value }));
     $("unit").addEventListener("change", () => this.act("unit", { unit: $("unit").value }));
+    $("mass").addEventListener("change", () => this.act("weigh", { mass_g: Number($("mass").value) }));
+    $("material").addEventListener("change", () => this.act("weigh", { material: $("material").value }));
     for (const name of ["undo", "redo"]) $(name).addEventListener("click", () => this.act(name, {}));
     addEventListener("keydown", (event) => this.#key(event));
     $("file").addEventListener("change", () => {
@@ -128,6 +130,8 @@ export class StudioPanel {
     this.state = state;
     fill($("hand"), state.hands.map((name) => [name, name]), state.hand);
     fill($("object"), state.objects.map((name) => [name, name]), state.chosen);
+    fill($("material"), [["", "as it is"], ...state.weight.materials.map((name) => [name, name])], state.weight.material);
+    $("mass").value = state.weight.mass_g || "";
     this.#rests(state);
     this.#unit(state.upload);
     const { size_cm: size, mass_g: mass, faces } = studio.object;
@@ -245,10 +249,10 @@ export class StudioPanel {
     this.watching = false;
   }
 
-  // "3. mug: held"
+  // "3. mug, affordance, from above: held"
   #name(id) {
     const motion = this.state.motions.find((other) => other.id === id);
-    return motion ? `${motion.id}. ${motion.object}: ${outcomeOf(motion.success, motion.held).outcome}` : "";
+    return motion ? `${motion.id}. ${motion.object}, ${motion.asked}: ${outcomeOf(motion.success, motion.held).outcome}` : "";
   }
 
   #motions(motions) {

@@ -384,7 +384,7 @@ def test_the_command_and_the_example_make_the_benchmarks_files(tmp_path, capsys)
     volume = 4 / 3 * np.pi * 0.02**3
     assert coefficient * data["obj_scale"] ** 3 == pytest.approx(volume, rel=0.1)
     assert sum(piece.volume for piece in pieces) == pytest.approx(coefficient, rel=1e-5)
-    with pytest.raises(CongraspError, match="is there already"):
+    with pytest.raises(CongraspError, match="exists already"):
         run(["export", "grasp", str(tmp_path / "grasps"), "--out", str(out)])
 
 

@@ -24,7 +24,14 @@ from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.cli.main import main
 from congrasp.services.export import bvh, frames, glb, lerobot, motion_formats, ros2, urdf, usd
 from congrasp.services.export.camera import camera_for, pictures
-from congrasp.services.export.motion_file import GraspMotion, hand_arrays, load_motion, motion_of_episode, save_motion
+from congrasp.services.export.motion_file import (
+    GraspMotion,
+    at_rate,
+    hand_arrays,
+    load_motion,
+    motion_of_episode,
+    save_motion,
+)
 from congrasp.services.record.channels import Entry
 from congrasp.services.record.entries import Converter
 from congrasp.services.record.writer import LogWriter
@@ -161,6 +168,17 @@ def test_a_single_frame_is_a_motion(human: GraspMotion, kind: str, tmp_path: pat
     assert export([dataclasses.replace(human, **cut)], kind, tmp_path)[1] < 0.01
 
 
+def test_a_usd_has_the_rate_that_is_asked_for(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    slower = at_rate(human, 24.0)
+    assert len(slower.time) == int((T - 1) * 24 / 100) + 1
+    motion_formats.export_motions([slower], "usd", tmp_path / "m.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "m.usda"))
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(24) and stage.GetEndTimeCode() == len(slower.time) - 1
+    np.testing.assert_array_equal(slower.object_position[1], human.object_position[4])  # 1/24 s is 4.2 steps
+    with pytest.raises(CongraspError, match="--fps is 200"):
+        at_rate(human, 200.0)
+
+
 def test_numbers_that_are_no_poses_are_refused(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     for name, value, words in (
         ("link_position", np.nan, "link_position has values that are not finite"),
@@ -183,7 +201,7 @@ def test_a_glb_is_y_up_for_others_and_names_its_units(human: GraspMotion, tmp_pa
     assert root["extras"]["unit"] == "m" and root["extras"]["quaternion"] == "x, y, z, w"
     assert root["extras"]["joints"] == human.joint_names.tolist()
     assert all("matrix" not in node for node in file["nodes"])
-    assert [m["pbrMetallicRoughness"]["metallicFactor"] for m in file["materials"]] == [0.0, 0.0]
+    assert [m["pbrMetallicRoughness"]["metallicFactor"] for m in file["materials"]] == [0.0] * 4
 
 
 def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pathlib.Path) -> None:
@@ -433,7 +451,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     changed = tmp_path / "cylinder-0.glb"
     changed.write_bytes(b"mine")
     assert run("mug.npz") == 2
-    assert changed.read_bytes() == b"mine" and "cylinder-0.glb is there already" in capsys.readouterr().err
+    assert changed.read_bytes() == b"mine" and "cylinder-0.glb exists already" in capsys.readouterr().err
     assert run("mug.npz", "--force") == 0 and changed.read_bytes().startswith(b"glTF")
     (tmp_path / "cylinder-0.bvh").rename(tmp_path / "taken.bvh")
     assert run("mug.npz", "--to", "bvh") == 2  # what goes beside the file is there already, too
@@ -445,12 +463,12 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
     capsys.readouterr()
     for arguments, words in (
         (["mug.npz", "logs", "--to", "glb"], "one motion, and 2 were named"),
-        (["mug.npz", "--to", "lerobot"], "is there already"),
+        (["mug.npz", "--to", "lerobot"], "exists already"),
         (["mug.npz", "--to", "usd", "--out", "x.glb"], "ends in .usda, and x.glb does not"),
         (["mug.npz", "--out", "logs"], "Use --out logs/grasp.glb"),
         (["nothing.npz"], "There is no nothing.npz"),
         (["logs", "--index", "4"], "holds 1 episodes"),
-        ([], "No motion was named"),
+        ([], "No motion was given"),
     ):
         assert run(*arguments) == 2
         said = capsys.readouterr().err

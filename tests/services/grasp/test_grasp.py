@@ -72,7 +72,7 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     assert motion.constraints == ("heading", "affordance") and motion.about["attempts"] == found.attempts
     assert len(motion.time) == steps and motion.table.sum() == steps - 26  # gone with its last step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
-    np.testing.assert_array_equal(motion.surface_minus, minus[:256])
+    np.testing.assert_array_equal(motion.surface_avoid, minus[:256])
     # The hand came along the block's own z axis: from its start to its end the wrist moved mostly that way.
     way = motion.wrist_position[48] - motion.wrist_position[0]
     axis = np.asarray(rotate(motion.object_quaternion[0], np.array([0.0, 0.0, -1.0])))
@@ -230,7 +230,7 @@ def test_what_is_not_held_is_told_by_the_exit_code(tmp_path, capsys, monkeypatch
     assert command(folder / "loose.stl", "--out", tmp_path / "out") == 1
     assert "not held" in capsys.readouterr().out
     assert command(tmp_path / "nothing.stl", "--out", tmp_path / "out") == 2
-    assert "There is no file or folder" in capsys.readouterr().err
+    assert "There is no file" in capsys.readouterr().err
     assert command(folder / "loose.stl", "--out", tmp_path / "out", "--heading", "up there", "--again") == 2
     assert "--heading is 'up there', not 3 numbers" in capsys.readouterr().err
 
@@ -253,7 +253,7 @@ def test_nothing_to_grasp(tmp_path):
     with pytest.raises(CongraspError, match="nothing to grasp"):
         command()
     for option, value in (("--approach", "-1"), ("--approach", "11"), ("--lift", "0.6"), ("--lift", "nan")):
-        with pytest.raises(CongraspError, match=f"{option} is .* It is from 0 to"):
+        with pytest.raises(CongraspError, match=f"{option} is .* It must be from 0 to"):
             command(tmp_path, option, value)
     with pytest.raises(CongraspError, match="--attempts is 0"):
         command(tmp_path, "--attempts", "0")

@@ -1,5 +1,6 @@
 """Constraints as people write them down."""
 
+import dataclasses
 import json
 import os
 
@@ -9,6 +10,7 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.export.motion_file import motion_of_episode, save_motion
@@ -66,6 +68,8 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
     trimesh.PointCloud(np.asarray(upper.sample(4000))).export(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(asked(block, avoid=str(tmp_path / "cloud.ply")).avoid[clear], high[clear])
     np.testing.assert_array_equal(asked(block, affordance="near half").avoid, block.labels == 1)
+    with pytest.raises(CongraspError, match=r"--affordance 'near half' and --avoid 'near half' contradict each other"):
+        asked(block, affordance="near half", avoid="near half")
     with pytest.raises(CongraspError, match=r"no constraint option 'colour'\. Known: heading, at, affordance, avoid"):
         asked(block, colour="red")
     with pytest.raises(CongraspError, match=r"has no part 'handle'\. Its parts are: near half, far half"):
@@ -180,3 +184,13 @@ def test_a_motion_has_no_numbers(block):
     for name in ("pose", "trajectory"):
         with pytest.raises(CongraspError, match=r"grasp\.npz is one motion and has no number 3. Leave the number out"):
             asked(block, **{name: "grasp.npz:3"})
+
+
+def test_a_joint_of_a_skeleton_leads_to_where_it_is_nearest_to_the_object():
+    mug = dataclasses.replace(generate(7, "mug"), origin=(0.03, 0.0, -0.05))
+    path = asked(mug, trajectory="examples/reach.bvh").constraints["trajectory"]
+    distance = np.linalg.norm(path["position"], axis=-1)
+    assert path["position"].shape == (15, 3) and distance.argmin() == 14
+    assert distance[0] - distance[-1] > 0.1  # it comes from at least a decimetre farther away
+    with pytest.raises(CongraspError, match="LeftHand"):
+        asked(mug, trajectory="examples/reach.bvh:LeftHand")

@@ -25,7 +25,7 @@ def run_dir(tmp_path):
     actor.write(actor="a", incarnation="1")
     for sequence, checksum in enumerate(CONTENT):
         actor.write(made=sequence, version=sequence, checksum=checksum)
-        actor.write(answer=sequence, outcome="accepted", life="x")
+        actor.write(answer=sequence, outcome="accepted", session_id="x")
     return tmp_path
 
 
@@ -36,7 +36,7 @@ def learner(run_dir, *lines):
 
 
 def life(name="x", version=0):
-    return {"life": name, "epoch": "e", "version": version, "max_staleness": 1, "kept": True, "taken": []}
+    return {"session_id": name, "run_id": "e", "version": version, "max_staleness": 1, "kept": True, "taken": []}
 
 
 def used(*sequences, version=None, checksum=None, lag=0, incarnation="1"):
@@ -117,7 +117,7 @@ def test_empty_and_malformed_journals_are_damage_and_no_traceback(run_dir, capsy
         path.write_bytes(content)
         assert faults(run_dir) == {"not in the journals": 6}
         assert command(run_dir) in (0, 6)
-    odd = ({"life": "x"}, {"used": 7, "version": 0}, {"used": [[1]], "version": 0}, {"end": [["a", "1", 10**30]]})
+    odd = ({"session_id": "x"}, {"used": 7, "version": 0}, {"used": [[1]], "version": 0}, {"end": [["a", "1", 10**30]]})
     path.write_text("".join(f"{json.dumps(line)}\n" for line in odd))
     (run_dir / AUDIT / "b.jsonl").write_text('{"actor": 5}\n{"made": [1]}\n{"answer": 0}\n')
     assert (faults(run_dir), audit(run_dir).damaged) == ({"not in the journals": 6}, 7)
@@ -143,7 +143,7 @@ def test_what_a_torn_line_told_is_no_surplus(run_dir):
     path.write_bytes(b"".join([*lines[:5], lines[5][:20]]))
     journal = Journal(path)
     journal._lost = 2
-    journal.write(answer=1, outcome="accepted", life="x", actor="a", incarnation="1")
+    journal.write(answer=1, outcome="accepted", session_id="x", actor="a", incarnation="1")
     report = audit(run_dir)
     assert (report.holes, report.damaged, report.faults) == (2, 0, [])
     assert report.counts["used, not in the journals"] == 4
@@ -184,9 +184,9 @@ def whole_run(folder):
         actor.write(**who)
         for sequence, checksum in enumerate(CONTENT[:4]):
             actor.write(**who, made=sequence, version=sequence, checksum=checksum)
-            actor.write(**who, answer=sequence, outcome="accepted", life="x" if incarnation == "1" else "y")
+            actor.write(**who, answer=sequence, outcome="accepted", session_id="x" if incarnation == "1" else "y")
             if incarnation == "1" and sequence >= 2:
-                actor.write(**who, answer=sequence, outcome="accepted", life="y")
+                actor.write(**who, answer=sequence, outcome="accepted", session_id="y")
     learner(
         folder, life(), used(0), used(1), used(2), used(3),
         life("y", version=2), used(2, version=5), used(3, version=6),

@@ -55,7 +55,7 @@ def test_keys_are_secret_and_nothing_is_overwritten_unasked(folder):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     with pytest.raises(CongraspError, match=r"already holds an authority.*--force"):
         create_authority(folder)
-    with pytest.raises(CongraspError, match=r"there already.*--force"):
+    with pytest.raises(CongraspError, match=r"exists already.*--force"):
         issue(folder, "actor", number=0)
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     issue(folder, "actor", number=0, force=True)

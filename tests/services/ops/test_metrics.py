@@ -25,7 +25,7 @@ STATUS = {
     "warnings": [],
     "queue": {"length": 1, "limit": 64},
     "rates": {"rollouts_per_second": 0.5, "steps_per_second": 100.0},
-    "ledger": {"granted": 9, "redeemed": 8, "accepted": 8, "consumed": 7, "running": 1, "queued": 1, "capacity": 3},
+    "counters": {"granted": 9, "redeemed": 8, "accepted": 8, "consumed": 7, "running": 1, "queued": 1, "capacity": 3},
     "roles": [
         {"role": "actor", "id": "a", "incarnation": "1", "version": 6, "lag": 1, "rollouts": 8, "steps_per_second": 9},
         {"role": "learner", "id": "0", "incarnation": "2"},

@@ -57,7 +57,7 @@ def endpoint():
 def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
     assert status(connect=endpoint, run="r", json=True) == 0
     found = json.loads(capsys.readouterr().out)
-    assert (found["run"], found["version"], found["ledger"]["accepted"]) == ("r", 0, 1)
+    assert (found["run"], found["version"], found["counters"]["accepted"]) == ("r", 0, 1)
     assert [(role["role"], role["id"]) for role in found["roles"]] == [("actor", "worker-7"), ("learner", "0")]
     actor = found["roles"][0]
     assert (actor["rollouts"], actor["version"], actor["lag"]) == (1, 0, 0)
@@ -97,10 +97,10 @@ def test_counters_that_do_not_add_up_are_named(endpoint):
         found = ask(transport, "r")
     assert found["warnings"] == []
     lost = copy.deepcopy(found)
-    lost["ledger"]["accepted"] += 1
+    lost["counters"]["accepted"] += 1
     (words,) = warnings(lost)
     assert words == "The counters are inconsistent: accepted 2 is not consumed 0 + dropped 0 + queued 1."
-    lost["ledger"]["queued"] += 1
+    lost["counters"]["queued"] += 1
     (words,) = warnings(lost)
     assert words == "2 rollouts are counted as queued, but the queue holds 1."
 

@@ -122,7 +122,7 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
     messages = {
         "metrics": metrics(loss=1.0),
         "event": Message({}, {"time": 1.0, "level": "info", "text": "x"}),
-        "version": Message({}, {"version": 1, "epoch": "e", "schema": "s"}),
+        "version": Message({}, {"version": 1, "run_id": "e", "schema": "s"}),
         "episode": whole,
         "rollout": Message({"reward": np.zeros((2, 2), np.float32)}, {"actor": "a"}),
     }
@@ -142,7 +142,7 @@ def test_odd_values_in_every_entry_of_every_log_message_are_one_line(tmp_path):
     ("change", "why"),
     [
         ({"object_position": np.zeros((2001, 3))}, "shape"),
-        ({"visual_faces": np.array([[0, 1, 10**6]])}, "vertices that are not there"),
+        ({"visual_faces": np.array([[0, 1, 10**6]])}, "vertices that do not exist"),
         ({"goal/heading_direction": np.zeros(20_000)}, "more than 10000 values"),
         ({f"reward/{i}": np.zeros(12) for i in range(200)}, "more than 128 rewards"),
         ({"link_position": np.zeros((12, 3, 3), np.float32)}, "has shape"),

@@ -113,7 +113,7 @@ def test_what_is_no_motion_is_named(tmp_path):
     [
         ("time", lambda x: x[:3], r"table has shape \(12,\), where \(T,\) is \(3,\)"),
         ("object_vertices", lambda x: x[:0], "object_vertices is empty"),
-        ("object_faces", lambda x: x + 1000, "names vertices that are not there"),
+        ("object_faces", lambda x: x + 1000, "names vertices that do not exist"),
         ("wrist_quaternion", lambda x: x[:, :3], r"wrist_quaternion has shape \(12, 3\), where \(T, 4\) is \(12, 4\)"),
     ],
 )

@@ -25,7 +25,6 @@ from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record.channels import Entry
 from congrasp.services.record.entries import Converter
 from congrasp.services.record.goals import active_blocks, active_constraints
-from congrasp.services.record.palette import FLESH
 from congrasp.services.record.scene import SPACING
 from congrasp.services.record.surface import surface_parts
 from congrasp.services.record.writer import LogWriter
@@ -140,7 +139,7 @@ def test_surface_points_are_coloured_by_region(entries: list[Entry]) -> None:
     points = np.stack([raw[:, offsets[a] : offsets[a] + 4].copy().view("<f4")[:, 0] for a in "xyz"], -1)
     np.testing.assert_array_equal(points, arrays["surface_points"])
     red, green = raw[:, offsets["red"]].astype(int), raw[:, offsets["green"]].astype(int)
-    np.testing.assert_array_equal(red > green, arrays["surface_minus"])
+    np.testing.assert_array_equal(red > green, arrays["surface_avoid"])
 
 
 def test_points_of_every_link_lie_on_its_surface_in_its_frame(entries: list[Entry]) -> None:
@@ -151,11 +150,11 @@ def test_points_of_every_link_lie_on_its_surface_in_its_frame(entries: list[Entr
         assert cloud.frame_id == f"a0/{link.name}" and entry.channel.latched
         raw = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
         points = raw[:, :12].copy().view("<f4")
-        (part,) = parts
-        mesh = trimesh.Trimesh(part.points, part.faces, process=False)
+        mesh = trimesh.util.concatenate([trimesh.Trimesh(part.points, part.faces, process=False) for part in parts])
         assert np.abs(trimesh.proximity.closest_point_naive(mesh, points[::20])[1]).max() < 1e-6
         assert np.linalg.norm(np.ptp(points, axis=0)) > 0.01
-        np.testing.assert_array_equal(raw[:, 12:], np.tile([*np.multiply(FLESH, 255).astype(int), 255], (len(raw), 1)))
+        colours = {tuple(np.multiply(part.colour, 255).astype(int)) for part in parts}
+        assert set(map(tuple, raw[:, 12:15])) == colours and (raw[:, 15] == 255).all()
         count += len(points)
     assert 2000 < count < 2100
 
@@ -177,9 +176,9 @@ def test_a_reader_that_knows_nothing_finds_the_skin_where_the_simulation_had_it(
     frame = [message for topic, message in found if topic.endswith("tf")][step].transforms[k + 1]
     (entity,) = [e for e in scene.entities if e.id == "hand/thumb_distal"]
     assert frame.child_frame_id == entity.frame_id == "a0/thumb_distal" and frame.parent_frame_id == "a0"
-    (mesh,) = entity.triangles
+    mesh, nail = entity.triangles
     w, axis = frame.rotation.w, vector(frame.rotation)
-    local = np.array([vector(point) for point in mesh.points])
+    local = np.array([vector(point) for point in [*mesh.points, *nail.points]])
     world = (
         local + 2 * w * np.cross(axis, local) + 2 * np.cross(axis, np.cross(axis, local)) + vector(frame.translation)
     )

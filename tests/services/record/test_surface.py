@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.skin import Skin, skin_of
+from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record import surface
-from congrasp.services.record.palette import FLESH, JOINT, SKIN
+from congrasp.services.record.palette import JOINT, SKIN
+from congrasp.services.record.palette import MATERIALS as COLOURS
 from congrasp.services.record.surface import surface_parts, surface_points
 
 
@@ -51,7 +52,9 @@ def test_a_human_hands_parts_are_its_skin_at_zero_and_near_it_in_a_grasp() -> No
     points = trimesh.sample.sample_surface(mesh, 60_000, seed=0)[0]
     distance = cKDTree(points).query(whole.mean(1))[0]
     assert np.percentile(distance, 95) < 0.004
-    assert {part.colour for own in surface_parts(hand) for part in own} == {FLESH}
+    assert {part.colour for own in surface_parts(hand) for part in own} == {
+        COLOURS[name] for name in ("flesh", "nail", "sleeve")
+    }
 
 
 def test_detailed_meshes_are_made_lighter_and_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +67,7 @@ def test_detailed_meshes_are_made_lighter_and_stay_where_they_are(monkeypatch: p
         points=np.concatenate([b.vertices + o for b, o in zip(balls, skin.origins, strict=True)]).astype(np.float32),
         faces=np.concatenate([b.faces + count * k for k, b in enumerate(balls)]).astype(np.int32),
         weights=np.eye(len(balls), dtype=np.float32)[own],
-        joint=np.zeros(len(own), bool),
+        material=np.full(len(own), MATERIALS.index("link")),
     )
     monkeypatch.setattr(surface, "skin_of", lambda hand: fine)
     parts = surface_parts(dataclasses.replace(hand, name="fine"))

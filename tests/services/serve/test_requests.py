@@ -31,7 +31,7 @@ def arrays(**changes):
     given_arrays = {name: rng.normal(size=LAYOUT.shapes[name]).astype(np.float32) for name in (*state, "base_position")}
     given_arrays |= dict.fromkeys(("object_quaternion", "object_quaternion_initial", "base_quaternion"), IDENTITY)
     given_arrays |= {"time": np.float32(7), "table": np.bool_(True)}
-    given_arrays |= {"surface_points": rng.normal(size=(8, 3)), "surface_minus": np.arange(8) < 3}
+    given_arrays |= {"surface_points": rng.normal(size=(8, 3)), "surface_avoid": np.arange(8) < 3}
     given_arrays |= {"heading_position": rng.normal(size=3), "heading_direction": np.array([0.0, 0.0, -1.0])}
     return {name: value for name, value in {**given_arrays, **changes}.items() if value is not None}
 
@@ -76,10 +76,10 @@ def test_the_cross_direction_is_made_unit_and_orthogonal_to_the_heading(directio
 @pytest.mark.parametrize("count", [3, 8, 20])
 def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks_at(count):
     points = np.arange(count)[:, None] * np.ones(3)
-    _, received = parse(surface_points=points, surface_minus=np.arange(count) >= count // 2)
+    _, received = parse(surface_points=points, surface_avoid=np.arange(count) >= count // 2)
     kept = received["surface_points"][:, 0]
     assert kept[0] == 0 and np.all(np.diff(kept) >= 0) and len(set(kept)) == min(count, 8)
-    np.testing.assert_array_equal(received["surface_minus"], kept >= count // 2)
+    np.testing.assert_array_equal(received["surface_avoid"], kept >= count // 2)
 
 
 @pytest.mark.parametrize(
@@ -87,15 +87,15 @@ def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks
     [
         (["flight"], {}, "no constraint 'flight'"),
         (["affordance"], {}, "nothing that guides the wrist. Add one of: heading, pose, trajectory"),
-        (["heading", "affordance"], {"surface_minus": np.zeros(8, bool)}, "both sides"),
-        (["heading", "affordance"], {"surface_minus": None}, "lacks the field 'surface_minus'"),
+        (["heading", "affordance"], {"surface_avoid": np.zeros(8, bool)}, "both sides"),
+        (["heading", "affordance"], {"surface_avoid": None}, "lacks the field 'surface_avoid'"),
         (["heading"], {"q": None}, "lacks the field 'q'"),
         (["heading"], {"q": np.zeros(22)}, r"'q' has shape \(22,\); it must be \(20,\)"),
         (["heading"], {"weight": np.zeros(1)}, "unknown field 'weight'"),
         (["heading"], {"asked": np.ones(4)}, "unknown field 'asked'"),
         (["heading"], {"u": np.full(6, np.inf)}, "'u' is not finite"),
         (["heading"], {"surface_points": np.zeros((0, 3))}, "surface_points"),
-        (["heading"], {"surface_minus": np.zeros(5, bool)}, r"must be \(8,\)"),
+        (["heading"], {"surface_avoid": np.zeros(5, bool)}, r"must be \(8,\)"),
         (["heading"], {"base_quaternion": np.zeros(4)}, "'base_quaternion' has length 0.000, not 1"),
         (["trajectory"], {"trajectory_position": np.zeros((3, 3))}, "lacks the field 'trajectory_quaternion'"),
     ],

@@ -1,6 +1,7 @@
 """The policy behind the studio: newest weights, and which of the grasps near what was drawn is shown."""
 
 import dataclasses
+import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -14,6 +15,7 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.services.studio import grasping
 from congrasp.services.studio.grasping import ATTEMPTS, PolicyGrasping
+from congrasp.services.studio.jobs import SECONDS, Jobs
 from congrasp.services.studio.state import Studio
 from tests.studio import objects
 
@@ -99,3 +101,13 @@ def test_what_was_drawn_is_shown_unless_another_is_clearly_better(
     assert grasping._best(found, (), removal) == index
     assert says in grasping._note(found, index, np.full(ATTEMPTS, 0.004))
     assert bool(says) == bool(grasping._note(found, index, np.full(ATTEMPTS, 0.004)))
+
+
+def test_a_job_says_for_how_long_it_runs() -> None:
+    jobs, done = Jobs(), threading.Event()
+    jobs.start(f"compiling, {SECONDS} s of about 60", lambda progress: done.wait(60) and None)
+    assert jobs.state()["text"] == "compiling, 0 s of about 60"
+    with pytest.raises(CongraspError, match="Please wait: compiling, 0 s"):
+        jobs.require_idle()
+    done.set()
+    jobs.close()

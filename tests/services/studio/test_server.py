@@ -118,6 +118,22 @@ def test_too_much_or_of_no_length_is_refused_before_it_is_read(page: Page) -> No
         assert page.ask("POST", "/api/upload?name=a.stl", b"", Content_Length=length)[0] == 413
 
 
+def test_an_object_weighs_what_it_is_said_to(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+    def mass() -> float:
+        return json.loads(page.ask("GET", "/api/state")[1])["studio"]["object"]["mass_g"]
+
+    own = mass()
+    page.do("weigh", mass_g=500)
+    page.do("grasp")
+    assert page.wait()["error"] == "" and grasping.asked[-1][0].mass == 0.5 and mass() == 500
+    page.do("weigh", material="steel")
+    assert mass() not in (500, own)
+    code, found = page.ask("POST", "/api/do", json.dumps({"action": "weigh", "mass_g": 9e9}).encode())
+    assert code == 200 and "The mass is 9e+09 g" in json.loads(found)["error"]
+    page.do("weigh")
+    assert mass() == own
+
+
 def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasping, tmp_path: pathlib.Path) -> None:
     page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, avoid=True)
     page.do("grasp")
@@ -125,6 +141,7 @@ def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasp
     assert tuple(grasping.asked[-1][1].constraints) == ("heading", "affordance")
     motions = json.loads(page.ask("GET", "/api/state")[1])["motions"]
     assert motions[0]["held"] and motions[0]["steps"] == made_up.STEPS
+    assert motions[0]["asked"].endswith("from the side")
     played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])
     assert played.arrays["lane/affordance/met"].shape == (made_up.STEPS,)
     for kind in ("npz", "mcap"):

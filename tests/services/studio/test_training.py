@@ -97,7 +97,7 @@ def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_g
     hub = MemoryHub()
     learner, mine = MemoryTransport(hub), MemoryTransport(hub)
     learner.serve(KEYS.status, lambda key, request: Message({}, made_up.status(2) | {"queue": {"length": 0, "limit": 4}}
-                  | {"ledger": dict.fromkeys(("granted", "running", "redeemed", "returned", "expired", "accepted",
+                  | {"counters": dict.fromkeys(("granted", "running", "redeemed", "returned", "expired", "accepted",
                                               "consumed", "dropped", "queued"), 0)}))  # fmt: skip
     window = TrainingWindow("made-up")
     follower = Follower(mine, window, every=0.05)

@@ -19,29 +19,26 @@ from congrasp.common.hands.skin import skin_of
 from congrasp.common.wire.codec import encode
 from congrasp.services.cli.main import load
 from congrasp.services.record.channels import Entry, opaque_channel
-from congrasp.services.record.palette import FLESH, OBJECT
+from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.record.writer import LogWriter
+from congrasp.services.viz.episode import TOUCHING, episode_shapes
 from congrasp.services.viz.hand_sheets import hand_sheet
 from congrasp.services.viz.raster import render_scene, visible
 from congrasp.services.viz.render import (
-    OBJECT_AVOID,
-    TOUCHING,
     Film,
-    best_camera,
-    episode_shapes,
     episode_sheet,
     episode_title,
     grasp_picture,
     key_steps,
     render_episode_frames,
     save_episode_video,
-    thumb_camera,
 )
 from congrasp.services.viz.scene import Camera, Shape, between
-from congrasp.services.viz.shapes import arrow, beads, fit
+from congrasp.services.viz.shapes import arrow, beads, capsule_shapes, fit, skin_colours
 from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
 from congrasp.services.viz.triangles import cut, smooth_corners
+from congrasp.services.viz.views import View, camera_of, view_of, views
 from tests.cluster import ROOT
 from tests.episodes import CONTROL_DT, episode, older
 
@@ -106,7 +103,7 @@ def test_what_is_seen_through_takes_its_share_of_the_colour() -> None:
 
 
 def test_a_ball_darkens_the_ground_beneath_it() -> None:
-    ground = Shape("cylinder", (1, 0.01), WHITE, np.array([0, 0, -0.01]), shine=0.0, shadow=False)
+    ground = Shape("table", (1, 0.01), WHITE, np.array([0, 0, -0.01]), shine=0.0, shadow=False)
     above = Camera(np.array([0.5, 0.0, 0.5]), np.zeros(3), 40.0)
     bare = render_scene([ground], above, (80, 80)).astype(int).sum(-1)
     shaded = render_scene([ground, ball(0.05, at=(0, 0, 0.05))], above, (80, 80)).astype(int).sum(-1)
@@ -203,21 +200,21 @@ def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
     skinned, body, *_ = episode_shapes(episode(), 11)
     hand = get_hand("human")
     assert skinned.colours is not None
-    changed = np.abs(skinned.colours - FLESH).max(-1) > 1e-3
+    changed = np.abs(skinned.colours - skin_colours(skin_of(hand))).max(-1) > 1e-3
     owner = skin_of(hand).weights.argmax(1)
     assert set(owner[changed & (skin_of(hand).weights.max(1) > 0.9)]) == set(hand.tip_links)
     thumb = skinned.colours[skin_of(hand).weights[:, hand.tip_links[0]] > 0.99]
     # FORCE of 1.5 N is three quarters of the full contact colour's 2 N: 0.3 + 0.3 * 0.75 of it.
     np.testing.assert_allclose(thumb[0], np.array(FLESH) + 0.525 * np.subtract(TOUCHING, FLESH), atol=0.01)
     assert body.paint_colours is not None
-    minus = episode().arrays["surface_minus"]
-    np.testing.assert_allclose(body.paint_colours, np.where(minus[:, None], OBJECT_AVOID, OBJECT))
+    minus = episode().arrays["surface_avoid"]
+    np.testing.assert_allclose(body.paint_colours, np.where(minus[:, None], AVOID, GRASPABLE))
     assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint_points is None
 
 
 def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_through() -> None:
     def flat(step: int) -> bool:
-        return any(shape.kind == "cylinder" for shape in episode_shapes(episode(), step))
+        return any(shape.kind == "table" for shape in episode_shapes(episode(), step))
 
     assert flat(7) and not flat(8)
     (ghost,) = [shape for shape in episode_shapes(episode(mask=(0, 1, 1, 0)), 11) if shape.alpha < 1]
@@ -226,25 +223,37 @@ def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_thr
 
 
 def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
-    camera = best_camera(episode(), [0, 6, 11], 1.0)
+    camera = camera_of(episode(), [0, 6, 11], 1.0)
     for step in (0, 11):
         assert np.abs(projected(camera, episode().arrays["link_position"][step].astype(float))).max() < 1
     frames = list(render_episode_frames(episode(), [0, 11], (64, 48)))
     fallen = episode()
     fallen.arrays["object_position"][-1, 2] -= 5.0
-    np.testing.assert_allclose(
-        best_camera(fallen, [0, 11]).target[2], best_camera(episode(), [0, 11]).target[2], atol=0.1
-    )
+    np.testing.assert_allclose(camera_of(fallen, [0, 11]).target[2], camera_of(episode(), [0, 11]).target[2], atol=0.1)
     assert [frame.shape for frame in frames] == [(48, 64, 3)] * 2
     picture = grasp_picture(episode(), 11, (96, 54))
     assert picture.shape == (54, 96, 3)
-    side = thumb_camera(episode(), 11, 32 / 54)
-    hand = get_hand("human")
-    names = [link.name for link in hand.links]
-    roots = episode().arrays["link_position"][11][[names.index(root) for root in hand.finger_roots]]
-    depth = (roots - side.position) @ side.axes()[2]
-    assert depth[0] < depth[1:].min()  # the thumb is nearest
     assert np.abs(frames[0].astype(int) - frames[1]).max() > 50
+
+
+def test_a_view_shows_what_touches_and_the_second_one_is_from_its_side() -> None:
+    best, aside = views(episode(), [11])
+    assert abs((best.azimuth - aside.azimuth + 180) % 360 - 180) >= 75
+    hand, arrays = get_hand("human"), episode().arrays
+    capsules = capsule_shapes(hand, arrays["link_position"][11], arrays["link_quaternion"][11])
+    shapes = [*capsules, *episode_shapes(episode(), 11, overlays=False)[1:2]]
+    tips = np.isin([*hand.capsule_links, -1], hand.tip_links)  # what touches
+
+    def shown(view: View) -> int:
+        seen = visible(shapes, camera_of(episode(), [11], view=view), (192, 144))
+        return int(tips[seen[seen >= 0]].sum())
+
+    others = [shown(View(float(azimuth), best.elevation)) for azimuth in range(0, 360, 30)]
+    assert shown(best) > 1.2 * min(others) and shown(best) > np.median(others)
+    assert view_of("") is None and view_of("-30, 20") == View(-30.0, 20.0)
+    for text in ("30", "30 95", "left 20"):
+        with pytest.raises(CongraspError, match="--camera is"):
+            view_of(text)
 
 
 def test_sheets(tmp_path: pathlib.Path) -> None:

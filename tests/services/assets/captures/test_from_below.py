@@ -49,9 +49,10 @@ def test_the_report_names_them(capsys):
     _print_report(Report(kept), "human", pathlib.Path("sets"), pathlib.Path("objects"))
     said = capsys.readouterr().out
     assert "room for 1 of 4" in said
-    assert "after the first touch in 2 of 4, and the reference is taken then: 4 frames later on average" in said
-    assert "of 2 lay inside one another, 4.0 mm deep at most (scoop)" in said
-    assert "by 0.15 rad on average, 0.20 rad at most (push)" in said
+    assert "In 2 of 4, thumb and fingers oppose only after the first touch" in said
+    assert "the reference is taken then, 4 frames later on average" in said
+    assert "of 2 overlapped, by up to 4.0 mm (scoop)" in said
+    assert "by 0.15 rad on average, at most 0.20 rad (push)" in said
     assert "No episode is drawn from 2, whose hand comes from below, which no episode does: scoop, dig." in said
     assert "No episode is drawn from 1, whose hand comes too near to the table: push." in said
     assert "3 sequences are for training, 1 held out." in said

@@ -62,7 +62,7 @@ def test_a_known_answer_comes_back_from_the_subjects_own_template(run_import, tm
     sets, report = run_import("grab", tmp_path, "--mano", mano)
     assert not report.dropped and report.kept[0]["residual_rad"] < 1e-3 and report.kept[0]["residual_tip_m"] < 1e-4
     known.check(sets["box"].arrays, 0, case)
-    assert not sets["box"].arrays["surface/minus"].any()  # no labelled parts: everything may be grasped
+    assert not sets["box"].arrays["surface/avoid"].any()  # no labelled parts: everything may be grasped
 
 
 def test_without_a_mano_file_the_human_hands_bones_stand_in(run_import, tmp_path):
@@ -113,5 +113,5 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
 
 
 def test_a_folder_of_another_kind_is_refused(run_import, tmp_path):
-    with pytest.raises(CongraspError, match=r"holds no sequence of grab\. Name the folder that holds s1/"):
+    with pytest.raises(CongraspError, match=r"holds no sequence of grab\. Pass the folder with s1/"):
         run_import("grab", tmp_path)

@@ -130,7 +130,7 @@ def test_a_known_answer_comes_back_with_its_affordance(run_import, tmp_path):
     arrays = sets["A01001-grip"].arrays
     known.check(arrays, 0, case)
     below = arrays["surface/points"][:, 2] < border
-    assert (arrays["surface/minus"] == below).mean() > 0.98 and 0.2 < below.mean() < 0.8
+    assert (arrays["surface/avoid"] == below).mean() > 0.98 and 0.2 < below.mean() < 0.8
 
 
 def test_an_affordance_of_less_than_a_tenth_is_dropped(run_import, tmp_path):

@@ -94,7 +94,7 @@ def test_the_command_stores_the_new_object(box, folder, tmp_path, capsys):
     for name in ("low", "also-low"):
         obj = catalogue.get(name)
         assert obj.points[~obj.non_graspable_points][:, 2].max() < 0.009
-    with pytest.raises(CongraspError, match="Set one of"):
+    with pytest.raises(CongraspError, match="Pass one of"):
         load("objects")([*run])()
     with pytest.raises(CongraspError, match="--colour is 'pink'"):
         load("objects")([*run, "--painted", str(folder / "painted.ply"), "--colour", "pink"])()

@@ -19,8 +19,8 @@ from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.sources import find_sources
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.record.scene import check_episode
+from congrasp.services.viz.episode import _object
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.render import _object
 from congrasp.services.viz.scene import Camera
 from tests.episodes import episode
 
@@ -97,7 +97,7 @@ def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(tm
     shown = episode()
     shown.arrays.update(_geometry(obj))
     picture = render_scene(
-        [_object(shown, 0)],
+        [_object(shown, 0, painted=False)],
         Camera(shown.arrays["object_position"][0] + [0, -0.5, 0.0], shown.arrays["object_position"][0]),
         (60, 60),
     )

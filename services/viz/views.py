@@ -1,0 +1,137 @@
+"""Cameras for recorded episodes: those that show most of fingers, contacts and object."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import known_hand
+from congrasp.common.hands.skin import MATERIALS, skin_of
+from congrasp.common.task.constraints.markers import Polyline
+from congrasp.common.wire.codec import Message
+from congrasp.services.record.goals import markers
+from congrasp.services.viz.episode import TOUCH, episode_shapes
+from congrasp.services.viz.raster import visible
+from congrasp.services.viz.scene import Camera, Shape
+from congrasp.services.viz.shapes import capsule_shapes, fit
+
+_AZIMUTHS, _ELEVATIONS = np.arange(0, 360, 30), (16, 28, 40)  # degrees, of the cameras that are compared
+_ASIDE = 75.0  # degrees between the two views of a picture
+_ROWS = 72  # of the pictures that cameras are compared by
+_CONTACT, _FINGER, _OBJECT, _BEHIND, _BEFORE = 2.0, 1.0, 1.0, 1.5, 0.8
+"""What the seen share of touching links, of all fingers and of the object counts, and a view along the forearm from
+behind it and from before the hand."""
+_FALL = 0.1  # how far the camera follows a falling object, m
+
+
+class View(NamedTuple):
+    """A direction from which a scene is seen, degrees."""
+
+    azimuth: float
+    """Around the vertical: 0 looks from +x, 90 from +y."""
+    elevation: float
+    """Above the table."""
+
+    @property
+    def direction(self) -> np.ndarray:
+        """(3,) from the scene to the camera."""
+        azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
+        return np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+
+
+def view_of(text: str) -> View | None:
+    """The view that a user names as AZIMUTH,ELEVATION; None where nothing is named.
+
+    Raises:
+      CongraspError: the text is no view.
+    """
+    if not text:
+        return None
+    try:
+        azimuth, elevation = map(float, text.replace(",", " ").split())
+        if abs(azimuth) <= 360 and -10 <= elevation <= 85:
+            return View(azimuth, elevation)
+    except ValueError:
+        pass
+    raise CongraspError(
+        f"--camera is '{text}'.",
+        'Write degrees around the table, from -360 to 360, and above it, from -10 to 85: --camera "120 25"',
+    )
+
+
+def views(episode: Message, steps: Sequence[int]) -> tuple[View, View]:
+    """The view that shows most of fingers, contacts and object in some steps, and the best of those from its side."""
+    pictured = [_Pictured(episode, steps[i]) for i in sorted({len(steps) // 2, len(steps) - 1})]
+    options = [View(float(azimuth), elevation) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS]
+    scores = [sum(step.score(view) for step in pictured) for view in options]
+    best = options[int(np.argmax(scores))]
+    aside = [abs((view.azimuth - best.azimuth + 180) % 360 - 180) >= _ASIDE for view in options]
+    return best, options[int(np.argmax(np.where(aside, scores, -np.inf)))]
+
+
+def camera_of(episode: Message, steps: Sequence[int], aspect: float = 4 / 3, view: View | None = None) -> Camera:
+    """A camera that holds everything that happens in the steps, from a view or from the best one."""
+    points = np.concatenate([_extent(episode, step) for step in steps])
+    points = points[ConvexHull(points).vertices]  # what holds these holds all
+    return fit(points, (view or views(episode, steps)[0]).direction, aspect)
+
+
+class _Pictured:
+    """A step, the hand as capsules, as views are compared by it."""
+
+    def __init__(self, episode: Message, step: int):
+        arrays = episode.arrays
+        hand = known_hand(episode.meta["hand"])
+        links = arrays["link_position"][step], arrays["link_quaternion"][step]
+        self._capsules = capsule_shapes(hand, *links)
+        self._shapes = [*self._capsules, *episode_shapes(episode, step, overlays=False)[1:2]]
+        self._areas = np.array([2 * r * (2 * half + 2 * r) for r, half in (c.size for c in self._capsules)])
+        self._finger = hand.capsule_links > 0
+        self._touching = np.linalg.norm(arrays["contact_force"][step], axis=-1)[hand.capsule_links] > TOUCH
+        self._points = _extent(episode, step)
+        wrist = Rotation.from_quat(links[1][0], scalar_first=True)
+        back = -hand.keypoints[len(hand.links) :].mean(0)
+        self._back = wrist.apply(back / np.linalg.norm(back))
+
+    def score(self, view: View) -> float:
+        """How much of touching links, fingers and object a view shows, each from 0 to about 1."""
+        camera = fit(self._points, view.direction, 4 / 3)
+        size = (_ROWS * 4 // 3, _ROWS)
+        counts = _counts(self._shapes, camera, size)
+        unhidden = _counts(self._shapes[-1:], camera, size)[0]
+        across = 2 * np.tan(np.radians(camera.field_of_view) / 2) * np.linalg.norm(camera.target - camera.position)
+        seen = np.minimum(counts[:-1] / (self._areas * (_ROWS / across) ** 2), 1.0)
+        contact = seen[self._touching].mean() if self._touching.any() else 0.0
+        along = float(self._back @ view.direction)
+        hidden = (_BEHIND if along > 0 else _BEFORE) * along**2
+        whole = counts[-1] / max(unhidden, 1)
+        return float(_CONTACT * contact + _FINGER * seen[self._finger].mean() + _OBJECT * whole - hidden)
+
+
+def _counts(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:
+    """(n,) samples that show each shape."""
+    seen = visible(shapes, camera, size)
+    return np.bincount(seen[seen >= 0], minlength=len(shapes))
+
+
+def _extent(episode: Message, step: int) -> np.ndarray:
+    """(N, 3) points that a picture of a step must hold: skin without sleeve, the object's box and a trajectory.
+
+    An object that has fallen far may leave the picture.
+    """
+    arrays = episode.arrays
+    hand = known_hand(episode.meta["hand"])
+    turns = Rotation.from_quat(arrays["link_quaternion"][step], scalar_first=True)
+    skin = skin_of(hand)
+    around = skin.posed(arrays["link_position"][step], turns.as_matrix())[0]
+    around = around[skin.material != MATERIALS.index("sleeve")]
+    if arrays["object_position"][step, 2] < arrays["object_position"][0, 2] - _FALL:
+        return around
+    turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
+    low, high = arrays["visual_vertices"].min(0), arrays["visual_vertices"].max(0)
+    points = [np.where(np.indices((2, 2, 2)).reshape(3, -1).T, high, low)]
+    points += [marker.points for _, marker in markers(arrays) if isinstance(marker, Polyline)]
+    return np.concatenate([around, turn.apply(np.concatenate(points)) + arrays["object_position"][step]])
