@@ -104,14 +104,14 @@ def dataset(
     pools = pools_of(recipe)
     shards = Shards(out, len(pools.make))
     finished = shards.finished(recipe.about)
-    wanted = [number for number in range(turn, shards.count, parts) if number not in finished]
+    wanted = [number for number in range(turn, shards.total, parts) if number not in finished]
     with tracked() as track:
         total = min(len(found), pools.size * len(wanted)) * per_object
         make(recipe, shards, pools, wanted, track("Episodes", total))
     card = write_card(shards, recipe.about, {"licence": licence, **provenance()})
     episodes, kept = (sum(own[name] for own in card["counts"].values()) for name in ("episodes", "kept"))
     made = card["shards"]["finished"]
-    print(f"{kept:,} of {episodes:,} episodes are kept, in {made} of {shards.count} shards in {out}.")
+    print(f"{kept:,} of {episodes:,} episodes are kept, in {made} of {shards.total} shards in {out}.")
     return 0
 
 

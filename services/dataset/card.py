@@ -30,7 +30,7 @@ def write_card(shards: Shards, about: Mapping[str, Any], facts: Mapping[str, Any
     card = {
         **about,
         **facts,
-        "shards": {"finished": len(found), "of": shards.count},
+        "shards": {"finished": len(found), "of": shards.total},
         "left_out": sorted(name for said in found.values() for name in said["left_out"]),
         "counts": counts,
         "columns": {kind: _columns(shards, kind, found) for kind in ("grasps", "objects")},
@@ -96,5 +96,5 @@ Columns, with shapes, units and frames, are in `card.json` and in the schema of 
 
 
 def _kept(keep: list[str]) -> str:
-    """Describes the selection of episodes in the files."""
+    """Sentence on the episodes that are in the files."""
     return f"The files hold those that are {' and '.join(keep)}." if keep else "The files hold all of them."

@@ -58,7 +58,7 @@ class Recipe:
     objects: Sequence[ObjectAt]
     """Of different names."""
     options: ImportOptions
-    """Conversion of meshes to objects."""
+    """Options of the import of meshes."""
     per_object: int
     """Episodes of each object, evenly over the constraints."""
     constraints: tuple[str, ...]
@@ -87,7 +87,7 @@ class Recipe:
 
     @functools.cached_property
     def about(self) -> dict[str, Any]:
-        """Description of the dataset in every shard, as JSON values; equal for datasets with equal contents."""
+        """Description of the dataset in every shard, as JSON; equal for datasets with equal contents."""
         contents = json.dumps(
             [dataclasses.asdict(dataclasses.replace(self.options, cache_dir="")), [at.digest() for at in self.objects]]
         )
@@ -142,7 +142,8 @@ def make(
     with contextlib.ExitStack() as stack:
         running: Episodes | None = None
         for pool in stack.enter_context(one_ahead(prepared(hand, task, pools, recipe.seed, wanted, True))):
-            columns, counts = grasp_columns(hand, task), {}
+            columns = grasp_columns(hand, task)
+            counts: dict[str, collections.Counter[str]] = {}
             rows = [{column.name: np.zeros((0, *column.shape), column.kind) for column in columns}]
             if pool.bank is not None:
                 if running is None:

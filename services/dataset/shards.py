@@ -17,12 +17,12 @@ class Shards(NamedTuple):
     """Places of the shards of one dataset."""
 
     folder: pathlib.Path
-    count: int
+    total: int
     """N, of the whole dataset, whichever of them are here."""
 
     def file(self, kind: str, number: int) -> pathlib.Path:
         """Place of a shard of `grasps` or of `objects`."""
-        return self.folder / kind / f"{number:05d}-of-{self.count:05d}.parquet"
+        return self.folder / kind / f"{number:05d}-of-{self.total:05d}.parquet"
 
     def write(self, number: int, grasps: pa.Table, objects: pa.Table) -> None:
         """Writes a shard; that of the grasps comes last, so that where it is everything is."""
@@ -32,7 +32,7 @@ class Shards(NamedTuple):
             write_atomically(self.file(kind, number), buffer.getvalue())
 
     def finished(self, about: Mapping[str, Any]) -> dict[int, dict[str, Any]]:
-        """Metadata of the finished shards, by their numbers.
+        """Returns the descriptions of the finished shards by their numbers.
 
         Raises:
           CongraspError: the folder holds a shard of another dataset than `about` describes, or a damaged one.
@@ -51,7 +51,7 @@ class Shards(NamedTuple):
 
 
 def _said(path: pathlib.Path) -> dict[str, Any]:
-    """Metadata of a shard."""
+    """Returns the description in a shard's metadata."""
     try:
         said = json.loads(pq.read_schema(path).metadata[b"congrasp"])
     except (OSError, ValueError, LookupError, TypeError) as error:

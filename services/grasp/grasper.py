@@ -18,8 +18,8 @@ from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common import mirror
 from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, ContradictionError
-from congrasp.common.hands import get_hand, known_hand
-from congrasp.common.hands.left import left_hand, right_name
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.left import LEFT, right_name
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
@@ -162,7 +162,7 @@ class Grasper:
         """
         self._arm = arm
         self._hand, self._left = get_hand(policy.spec.hand), left
-        self.hand = left_hand(self._hand) if left else self._hand
+        self.hand = get_hand(self._hand.name + LEFT) if left else self._hand
         self.task = dataclasses.replace(policy.task, end_when_fallen=False)
         self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
         self._compiled = False
@@ -309,7 +309,7 @@ class Grasper:
         if self._approach:
             episode = with_reach(episode, self._hand, self._reach(obj, episode))
         if self._left:
-            episode = _mirrored(episode)
+            episode = _mirrored(episode, self.hand)
         asked = tuple(request.constraints)
         active = explain(asked, bool(outcome.redirected[index]))
         written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
@@ -399,10 +399,10 @@ def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
     )
 
 
-def _mirrored(episode: Message) -> Message:
-    """The episode of the left hand, of one of the right hand with the mirrored object."""
-    hand, origin = known_hand(episode.meta["hand"]), mirror.vector(episode.meta["object_file_origin"]).tolist()
-    meta = {**episode.meta, "hand": left_hand(hand).reference, "object_file_origin": origin}
+def _mirrored(episode: Message, hand: Hand) -> Message:
+    """Returns the episode of the left hand, from one of the right hand with the mirrored object."""
+    origin = mirror.vector(episode.meta["object_file_origin"]).tolist()
+    meta = {**episode.meta, "hand": hand.reference, "object_file_origin": origin}
     return Message(mirror.fields(episode.arrays), meta)
 
 

@@ -91,6 +91,7 @@ def test_a_left_hand_with_its_own_model_does_what_the_mirrored_right_one_did(blo
     initial = grasper._attempts._initial
     monkeypatch.setattr(grasper._attempts, "_initial", lambda request: begun.append(initial(request)) or begun[-1])
     monkeypatch.setattr(grasper, "_left", True)
+    monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
     found = grasper.grasp(block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}}))
     arrays = {name: np.asarray(value) for name, value in found.episode.arrays.items()}
     assert found.motion.hand == "human_left" and found.success
