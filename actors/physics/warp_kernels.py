@@ -1,6 +1,7 @@
 """Additional kernels for MuJoCo Warp: they fill the environments and measure the occupancy of their buffers."""
 
-# mypy: ignore-errors (Kernels are a language with Python's syntax, checked by Warp's compiler.)
+# mypy: ignore-errors
+# (Kernels are a language with Python's syntax, checked by Warp's compiler.)
 
 import warp as wp
 from mujoco.mjx.third_party.mujoco_warp._src.types import vec10f
