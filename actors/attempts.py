@@ -17,12 +17,12 @@ from congrasp.actors.episode import episode_message
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker, Trace
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, act_by_mean
 from congrasp.common.task import plausibility
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
 

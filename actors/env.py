@@ -16,10 +16,10 @@ from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics.engine import Physics, PhysicsState, ResetState, where_environments
 from congrasp.actors.stress import Frame, Protocol
 from congrasp.actors.success import Success
-from congrasp.common.config import ControlConfig, RewardWeights, TaskConfig
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import metrics, privileged, sensing
+from congrasp.common.task.config import ControlConfig, RewardWeights, TaskConfig
 from congrasp.common.task.constraints import blocks
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.control import decode, track_load, wrist_load

@@ -9,11 +9,11 @@ import numpy as np
 
 from congrasp.actors.rollout import Trace
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.kinematics import link_poses
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import metrics
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.reward import terms
 from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.wire.codec import Message

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 
 from congrasp.actors.physics.engine import where_environments
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.spec import Hand
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, optional
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.sampling.bank import ConstraintBank

@@ -10,10 +10,10 @@ import numpy as np
 
 from congrasp.actors.physics.engine import ResetState
 from congrasp.common import rotations
-from congrasp.common.config import SensingConfig, TaskConfig
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.closure import MARGIN, preshape
 from congrasp.common.hands.spec import Hand
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import known, optional
 from congrasp.common.task.constraints.force import least_force
 from congrasp.common.task.constraints.priority import Resolution, active_blocks, resolve

@@ -19,10 +19,10 @@ from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics.engine import Physics, PhysicsState
 from congrasp.actors.stress import Frame
-from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import metrics
+from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.observation import observe
 from congrasp.common.task.sampling.bank import ConstraintBank

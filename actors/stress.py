@@ -17,10 +17,10 @@ import numpy as np
 
 from congrasp.actors.physics.engine import PhysicsState
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import plausibility
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.plausibility import Sample
 from congrasp.common.task.types import Array
 

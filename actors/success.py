@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from congrasp.common.config import TaskConfig
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.reward import fallen
 from congrasp.common.task.types import Array

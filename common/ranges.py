@@ -5,8 +5,9 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from congrasp.common.config import NetworkConfig, TaskConfig
+from congrasp.common.config import NetworkConfig
 from congrasp.common.objects.spec import SURFACE_POINTS
+from congrasp.common.task.config import TaskConfig
 
 MAX_SPEED = 400.0
 """A joint speed above this (m/s or rad/s) marks a diverged environment."""

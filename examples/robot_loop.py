@@ -22,13 +22,13 @@ import tyro
 import congrasp
 from congrasp.actors.physics.physics_state import physics_state
 from congrasp.actors.physics.scene import TABLE_AWAY, addresses, compile_scene
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import scale_objects
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.ports import local_url
 from congrasp.services.serve.load import example_episode
 

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.ports import free_port

@@ -46,8 +46,9 @@ def _quickly_compiled_kernels():
 @pytest.fixture(scope="session")
 def paper_policy(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """File of a human policy that knows the paper's four constraints and has learnt nothing."""
-    from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+    from congrasp.common.config import NetworkConfig, RunConfig
     from congrasp.common.policy import bundle
+    from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.constraints import PAPER
     from congrasp.services.train.command import untrained
 

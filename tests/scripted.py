@@ -7,10 +7,10 @@ import numpy as np
 
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.observation import layout
 from congrasp.common.task.sampling.build import build_bank
 

@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.channels import JsonChannels

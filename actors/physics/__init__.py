@@ -7,11 +7,11 @@ from typing import Any
 import jax
 
 from congrasp.actors.physics.engine import Physics
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import ENGINES, Engine, PhysicsName
+from congrasp.common.task.config import TaskConfig
 
 _NVIDIA = ("gpu", "cuda")
 

@@ -8,11 +8,11 @@ import numpy as np
 
 from congrasp.actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, finish_spec, object_contact, scene_spec
 from congrasp.actors.physics.slots import empty_slots, fill_body, fill_primitives
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.mjcf import add_object
 from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.common.task.config import TaskConfig
 
 _PLACEHOLDER = 0.001 * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
 _SLOT_FIELDS = ("geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_aabb", "geom_dataid")

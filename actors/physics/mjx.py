@@ -17,11 +17,11 @@ from congrasp.actors.physics.engine import PhysicsState, ResetState, where_envir
 from congrasp.actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
 from congrasp.actors.physics.scene import GAINS, MASS_POWERS, SENSOR_WIDTH, TABLE_AWAY, addresses
 from congrasp.actors.physics.slots import Pool
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.mjcf import CONTACT
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
 

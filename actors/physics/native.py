@@ -15,10 +15,10 @@ import psutil
 from congrasp.actors.physics.engine import PhysicsState, ResetState
 from congrasp.actors.physics.physics_state import has_diverged, physics_state
 from congrasp.actors.physics.scene import GAINS, MASS_POWERS, TABLE_AWAY, addresses, compile_scene
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 
 _ENVIRONMENT = 860_000  # bytes of a stepped environment: model, data and their stack
 

@@ -5,11 +5,11 @@ import dataclasses
 import mujoco
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.mjcf import HAND_CONTYPE, WRIST_JOINTS, add_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.mjcf import CONTACT, ContactSettings, add_object
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import CONTACTS_PER_LINK
 
 OBJECT_CONTYPE = 2

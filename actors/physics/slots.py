@@ -12,11 +12,11 @@ import mujoco
 import numpy as np
 
 from congrasp.actors.physics.scene import HAND_CONTYPE, OBJECT_CONTYPE, finish_spec, object_contact, scene_spec
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.mjcf import GEOM_TYPES, add_object
 from congrasp.common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
+from congrasp.common.task.config import TaskConfig
 
 _UNUSED = 0.0004
 _NO_CONTACT = -1000.0

@@ -18,9 +18,9 @@ from congrasp.actors.physics.engine import PhysicsState, ResetState, where_envir
 from congrasp.actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
 from congrasp.actors.physics.scene import SENSOR_WIDTH, addresses
 from congrasp.actors.physics.warp_buffers import WarpBuffers, control_step, meshes_on, objects_on, register
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
 wp.config.log_level = wp.LOG_WARNING  # no log line for each of some 50 loaded modules

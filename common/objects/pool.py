@@ -3,12 +3,13 @@
 import pathlib
 from collections.abc import Sequence
 
-from congrasp.common.config import ObjectsConfig, TaskConfig
+from congrasp.common.config import ObjectsConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.store import Catalogue
+from congrasp.common.task.config import TaskConfig
 
 HELD_OUT_SEED = 1_000_000
 """Seeds from here upward are never used for training; those below `FIGURES_SEED` are for development."""

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common.config import NetworkConfig, TaskConfig
+from congrasp.common.config import NetworkConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import check_reference, get_hand
 from congrasp.common.io.files import write_atomically
@@ -29,6 +29,7 @@ from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.ranges import network_faults, task_faults
 from congrasp.common.task import observation as task_observation
 from congrasp.common.task import privileged
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from congrasp.common.config import ControlConfig, TaskConfig
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand
+from congrasp.common.task.config import ControlConfig, TaskConfig
 from congrasp.common.task.constraints import known
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.geometry import wrist_to_joints

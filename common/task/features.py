@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import known
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.constraints.fingers import chosen_fingers

@@ -9,8 +9,9 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from congrasp.common.config import CurriculumConfig, RunConfig, TaskConfig
+from congrasp.common.config import CurriculumConfig, RunConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.task.config import TaskConfig
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 STUDENT = "student"

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 
-from congrasp.common.config import TaskConfig
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks, error_specs, known
 from congrasp.common.task.constraints.base import ErrorSpec, Scene
 from congrasp.common.task.reward import terms

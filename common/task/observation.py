@@ -6,8 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.spec import Hand
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks, known
 from congrasp.common.task.constraints.base import ObservationField, Scene
 from congrasp.common.task.geometry import flat, squash

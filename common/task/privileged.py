@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.measures import tip_forces
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import observation
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.base import ObservationField, Scene
 from congrasp.common.task.sensing import Sensors
 from congrasp.common.task.types import Array

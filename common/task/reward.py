@@ -13,7 +13,7 @@ from congrasp.common.task.geometry import FAR, square
 from congrasp.common.task.types import Array, SceneState
 
 if TYPE_CHECKING:
-    from congrasp.common.config import RewardWeights, TaskConfig
+    from congrasp.common.task.config import RewardWeights, TaskConfig
 
 
 class Earning(NamedTuple):
@@ -128,7 +128,7 @@ GRASP: tuple[Term, ...] = (
     ),
     Term("drop", 1.0, "w_drop: per step with the object fallen.", _drop),
 )
-"""Terms of r^grasp; `RewardWeights` (`common.config`) and the names of all terms derive from them."""
+"""Terms of r^grasp; `RewardWeights` (`common.task.config`) and the names of all terms derive from them."""
 
 
 def terms(task: "TaskConfig") -> tuple[str, ...]:

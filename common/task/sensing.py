@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from congrasp.common import rotations
-from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.resting import resting_mean
 from congrasp.common.task.types import Array, SceneState
 

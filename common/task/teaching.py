@@ -7,8 +7,8 @@ the teacher's residual would move its wrist to another place. Both share the wri
 
 import jax.numpy as jnp
 
-from congrasp.common.config import ControlConfig
 from congrasp.common.hands.spec import Hand
+from congrasp.common.task.config import ControlConfig
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.control import Guided, guided, wrist_lead
 from congrasp.common.task.observation import observe

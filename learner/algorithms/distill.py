@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from congrasp.common.config import ControlConfig, DistillConfig, RunConfig, TaskConfig
+from congrasp.common.config import DistillConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
@@ -27,6 +27,7 @@ from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, Pol
 from congrasp.common.policy.network import Layout, Params
 from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.task.config import ControlConfig, TaskConfig
 from congrasp.common.task.teaching import EXTRA, student_action
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import RECORDABLE, Schema

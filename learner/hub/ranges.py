@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common.config import CurriculumConfig, RewardWeights, TaskConfig
+from congrasp.common.config import CurriculumConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.ranges import MAX_DISTANCE, MAX_SPEED
 from congrasp.common.task import privileged
+from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import known
 from congrasp.common.task.constraints.base import symbol_sizes
 from congrasp.common.task.features import scene_of

@@ -56,9 +56,9 @@ def generate(
       congrasp constraints generate mug:7 box:0
       congrasp constraints generate my-objects --references policy
     """
-    from congrasp.common.config import TaskConfig
     from congrasp.common.hands import get_hand
     from congrasp.common.objects.procedural import generate_many
+    from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.sampling.write_sets import make_sets, save
     from congrasp.services.assets.objects.named import find_object, objects_of
     from congrasp.services.cli.console import tracked

@@ -13,8 +13,8 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 
 if TYPE_CHECKING:
-    from congrasp.common.config import ControlConfig
     from congrasp.common.hands.spec import Hand
+    from congrasp.common.task.config import ControlConfig
     from congrasp.services.client.floor import Floor
 
 _EQUAL = 1e-12
@@ -94,8 +94,8 @@ class JointLimits:
           margin: rad that finger targets keep from the ends of their joints; narrow joints stay in their middle.
           grip: N that a straight finger presses with at its tip; a bent one presses harder, as its lever is shorter.
         """
-        from congrasp.common.config import ControlConfig
         from congrasp.common.hands.motors import motor_limits
+        from congrasp.common.task.config import ControlConfig
 
         wrist, motors, control = hand.wrist, hand.motors, control or ControlConfig()
         allowed = np.array([control.wrist_acceleration, control.wrist_angular_acceleration])

@@ -14,10 +14,10 @@ import pyarrow as pa
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import known
 from congrasp.common.task.constraints.base import symbol_sizes
 from congrasp.common.task.metrics import FORCES

@@ -17,13 +17,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import cores
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.services.assets.objects.named import ObjectAt
 from congrasp.services.assets.objects.options import ImportOptions

@@ -17,13 +17,13 @@ from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import RolloutWorker, Trace, finished_episodes
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.distance import DistanceField
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, act_by_mean
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.task import plausibility
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint
 from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.wire.codec import Message

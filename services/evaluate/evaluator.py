@@ -11,7 +11,6 @@ import jax
 import numpy as np
 
 from congrasp.actors.initial import InitialConditions
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.distance import DistanceField, distance_field
@@ -19,6 +18,7 @@ from congrasp.common.objects.pool import scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank, with_columns
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.wire.codec import Message

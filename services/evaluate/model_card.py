@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from congrasp.common.config import SensingConfig, TaskConfig
 from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import optional
 from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.services.evaluate.scores import Row

@@ -15,10 +15,10 @@ import numpy as np
 
 from congrasp.actors import initial
 from congrasp.actors.initial import InitialConditions, PlannedEpisodes
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, optional, require_known
 from congrasp.common.task.sampling.bank import ConstraintBank
 

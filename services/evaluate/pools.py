@@ -16,7 +16,6 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.outline import Outline, outline
 from congrasp.common.hands.spec import Hand
@@ -26,6 +25,7 @@ from congrasp.common.objects.pool import object_scale, scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import parallel_map
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank, headings_of
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at

@@ -3,11 +3,11 @@
 import dataclasses
 import pathlib
 
-from congrasp.common.config import SensingConfig, TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.mjcf import CONTACT
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.task.config import SensingConfig, TaskConfig
 
 HOLD_SECONDS = 2.0
 """Required hold of a grasp without the table, beyond the paper's quarter of a second."""

@@ -17,7 +17,6 @@ import numpy as np
 
 from congrasp.actors import initial
 from congrasp.actors.initial import PlannedEpisodes
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.io.caches import keep, read_kept
 from congrasp.common.io.files import cache_folder
@@ -27,6 +26,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import reference_file
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import POSES, make_references
 from congrasp.common.task.sampling.closed_poses import Poses

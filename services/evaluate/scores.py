@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from congrasp.actors.stress import ASSESSED, SURVIVAL
-from congrasp.common.config import TaskConfig
 from congrasp.common.io.files import write_atomically
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.services.evaluate.intervals import NORMAL_95, clustered, independent_episodes, standard_error

@@ -10,7 +10,7 @@ import math
 import jax.numpy as jnp
 
 from congrasp.actors.initial import InitialConditions
-from congrasp.common.config import SensingConfig, TaskConfig
+from congrasp.common.task.config import SensingConfig, TaskConfig
 
 CONSTRAINT = "heading"
 """Row evaluated at every level."""

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
@@ -22,6 +21,7 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.evaluator import MEASURED, STRESSED, batch_of, simulate

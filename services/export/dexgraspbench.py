@@ -17,7 +17,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.physics.scene import compile_scene
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand, own_hands
 from congrasp.common.hands.mjcf import add_hand
@@ -27,6 +26,7 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import file_name
 from congrasp.common.io.npz import read_npz
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.export.benchmark_hands import Match, benchmarked, match_hand
 from congrasp.services.export.benchmark_objects import convex_object, write_object
 from congrasp.services.export.frames import TOLERANCE_MM

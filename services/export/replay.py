@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 from congrasp.actors.physics.engine import PhysicsState, ResetState
 from congrasp.actors.physics.native import EnvInstance, NativePhysics
 from congrasp.actors.stress import FARTHEST, MOST_TURNED, PUSH_FORCE
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
 from congrasp.common.runtime.parallel import cores
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.export.benchmark_hands import benchmarked
 from congrasp.services.export.dexgraspbench import STATES, Grasp, State
 

@@ -16,7 +16,6 @@ from congrasp.actors.attempts import Attempts, Outcome
 from congrasp.actors.initial import RequestedEpisodes, handover_speed
 from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common import mirror
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.left import LEFT, right_name
@@ -28,6 +27,7 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime.parallel import cores
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional, require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.task.types import Goal, Surface

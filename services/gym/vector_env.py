@@ -12,11 +12,11 @@ from congrasp.actors import initial
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import Rollout, RolloutWorker
 from congrasp.actors.training_set import training_set
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.metrics import episode_fields
 from congrasp.common.task.observation import layout
 from congrasp.services.gym import ID

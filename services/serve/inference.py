@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.policy.bundle import InferenceParameters, mean_action
 from congrasp.common.task import control, observation
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.priority import explain, resolve
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import seen_by

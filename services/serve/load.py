@@ -91,10 +91,10 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     import jax
 
     from congrasp.actors import initial
-    from congrasp.common.config import TaskConfig
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
     from congrasp.common.objects.pool import scale_objects
+    from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.sampling.build import build_bank
 
     task = TaskConfig(hand=hand, constraints=("heading",))

@@ -23,10 +23,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, LayoutError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import LONGEST_NAME
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import known, require_known
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface

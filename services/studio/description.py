@@ -10,10 +10,10 @@ import numpy as np
 
 from congrasp.actors.initial import initial_hand
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.resting import rest_tilts
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, optional
 from congrasp.common.task.sampling.closed_poses import Poses
 from congrasp.common.task.types import Goal, Surface

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.attempts import Attempts, Outcome
 from congrasp.actors.initial import RequestedEpisodes
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime.parallel import cores
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, known, require_known
 from congrasp.common.task.constraints.priority import explain
 from congrasp.common.wire.codec import Message

@@ -11,13 +11,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.materials import MATERIALS, with_mass
 from congrasp.services.assets.objects.sizes import METRES

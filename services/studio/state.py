@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, goal_of, optional, require_known
 from congrasp.common.task.constraints.priority import Resolution, explain, resolve
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses

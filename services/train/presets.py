@@ -2,9 +2,10 @@
 
 import dataclasses
 
-from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.train.recipe import recipe
 
 FULL = "full"

@@ -20,16 +20,10 @@ docs/training.md compares this with manual tuning. Everything else is the same f
 
 import dataclasses
 
-from congrasp.common.config import (
-    CurriculumConfig,
-    ObjectsConfig,
-    PPOConfig,
-    RewardWeights,
-    RunConfig,
-    TaskConfig,
-)
+from congrasp.common.config import CurriculumConfig, ObjectsConfig, PPOConfig, RunConfig
 from congrasp.common.hands.measures import tip_forces
 from congrasp.common.hands.spec import Hand
+from congrasp.common.task.config import RewardWeights, TaskConfig
 
 HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
 """Families that are hardest to hold by a part, included twice in training."""

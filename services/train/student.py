@@ -3,9 +3,10 @@
 import dataclasses
 import pathlib
 
-from congrasp.common.config import RunConfig, SensingConfig
+from congrasp.common.config import RunConfig
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.task.config import SensingConfig
 from congrasp.common.task.methods import STUDENT, with_method
 
 TRACKERS = SensingConfig(

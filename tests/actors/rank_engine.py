@@ -8,9 +8,9 @@ import warp
 
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.warp import WarpPhysics
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import TaskConfig
 from congrasp.learner.distributed.ranks import Ranks
 
 

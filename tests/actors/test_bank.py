@@ -11,11 +11,11 @@ from congrasp.actors.harvest import Grasps, renew
 from congrasp.actors.physics.engine import where_environments
 from congrasp.actors.process.own_references import save_references, with_kept_references
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.build import POSES, build_bank, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
 

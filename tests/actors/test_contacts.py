@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from congrasp.actors.physics.scene import compile_scene
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import TaskConfig
 
 HAND = get_hand("human")
 TASK = TaskConfig()

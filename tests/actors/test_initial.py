@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from congrasp.actors.initial import initial_hand, sample
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.kinematics import hand_center, keypoints, link_transforms
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import optional
 from congrasp.common.task.constraints.heading import heading_wrist_pose
 from congrasp.common.task.constraints.priority import resolve

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.sampling import kept as kept_banks
 from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.task.sampling.kept import kept_bank

@@ -11,10 +11,11 @@ import pytest
 from congrasp.actors.physics import ENGINES, Engine, make_physics, resolve_physics
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig, run_config_from_json, to_json
+from congrasp.common.config import NetworkConfig, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.train.command import untrained

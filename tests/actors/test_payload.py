@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from congrasp.actors.physics.scene import TABLE_AWAY, scene_spec
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.mjcf import WRIST_JOINTS
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.control import Guided, carried_lead, track_load, wrist_lead, wrist_load
 from tests.scenes import scene
 

@@ -17,11 +17,11 @@ from congrasp.actors.physics.mjx import MjxPhysics
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.physics.slots import LEAVES, Pool
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.build import build_bank
 from tests import draws
 

@@ -13,13 +13,14 @@ from congrasp.actors.env import episode_fields
 from congrasp.actors.process import actor as process
 from congrasp.actors.rollout import Rollout, Trace
 from congrasp.actors.training_set import TrainingSet
-from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, TaskConfig, to_json
+from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import PolicyBundle, policy_spec
 from congrasp.common.request import GraspRequest
 from congrasp.common.task import metrics
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import goal_of
 from congrasp.common.task.reward import terms
 from congrasp.common.task.types import Surface

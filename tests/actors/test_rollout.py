@@ -12,10 +12,10 @@ from congrasp.actors.physics.engine import PhysicsState, where_environments
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker, finished_episodes
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.observation import layout
 from congrasp.common.task.sampling.build import build_bank

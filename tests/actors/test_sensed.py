@@ -9,11 +9,11 @@ import pytest
 
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker
-from congrasp.common.config import SensingConfig, TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import observation, privileged
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.teaching import EXTRA
 

@@ -20,11 +20,12 @@ from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker
 from congrasp.actors.stress import Frame, Protocol
 from congrasp.common import rotations
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.task import plausibility
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS, optional
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.types import Surface

@@ -10,12 +10,13 @@ import pytest
 from congrasp.actors import harvest
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.training_set import training_set
-from congrasp.common.config import ObjectsConfig, RunConfig, Split, TaskConfig
+from congrasp.common.config import ObjectsConfig, RunConfig, Split
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.outline import outline
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import rows_of, stacked
 from congrasp.common.task.sampling.build import headings_of
 from congrasp.common.task.sampling.sets import load_for

@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.table import Table
 
 from congrasp.actors.physics.scene import TABLE_AWAY, addresses, compile_scene
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.objects.fidelity import fidelity
 from congrasp.services.assets.objects.pieces import merge, simplify
 

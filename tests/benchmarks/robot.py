@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 from zenoh.handlers import RingChannel
 
 import congrasp
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural, store
 from congrasp.common.objects.pool import scale_objects
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.ports import free_port
 
 EXAMPLES = pathlib.Path(__file__).resolve().parents[2] / "examples"

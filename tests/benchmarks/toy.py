@@ -9,9 +9,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from congrasp.common.config import NetworkConfig, PPOConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, PPOConfig
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, PolicySpec
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import Array
 from congrasp.learner.algorithms.protocol import TrainState
 

@@ -5,8 +5,9 @@ import json
 
 import pytest
 
-from congrasp.common.config import CurriculumConfig, RewardWeights, RunConfig, run_config_from_json, to_json
+from congrasp.common.config import CurriculumConfig, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
+from congrasp.common.task.config import RewardWeights
 from congrasp.services.train.presets import PRESETS, get_preset
 
 

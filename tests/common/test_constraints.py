@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.initial import InitialConditions, sample
-from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.request import GraspRequest
 from congrasp.common.task import metrics
+from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import (
     CONSTRAINTS,
     OURS,

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.request import GraspRequest
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import goal_of
 from congrasp.common.task.constraints.priority import contradictions
 

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common import rotations
-from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand, kinematics
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import load
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands
 from congrasp.common.task import metrics
+from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import PAPER, get_constraint
 from congrasp.common.task.constraints.fingers import FingersGoal, finger_sets, keypoint_weights
 from congrasp.common.task.features import features, scene_of

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.task import metrics
+from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import PAPER, get_constraint
 from congrasp.common.task.constraints.force import ForceGoal, least_force
 from congrasp.common.task.features import scene_of

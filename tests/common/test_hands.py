@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand
 from congrasp.common.hands.kinematics import grasp_frame, link_poses
@@ -20,6 +19,7 @@ from congrasp.common.hands.mjcf import add_hand, overlapping
 from congrasp.common.hands.spec import link_origin
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import scale_objects
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from tests.mano_file import mano_pickle
 

@@ -6,10 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.common.config import CurriculumConfig, RewardWeights, RunConfig, TaskConfig, run_config_from_json, to_json
+from congrasp.common.config import CurriculumConfig, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import pretrained_file
+from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.control import decode
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.methods import METHODS, evaluated_as, get_method, takes, with_method

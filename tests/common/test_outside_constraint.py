@@ -252,7 +252,7 @@ if __name__ == "__main__":
 
     constraints.CONSTRAINTS = (*constraints.CONSTRAINTS, Level())
 
-    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.config import TaskConfig
 
     TASK = dataclasses.replace(
         TaskConfig(constraints=(*constraints.PAPER, "level")), approach_steps=2, hold_steps=1, hold_steps_max=1

@@ -33,7 +33,7 @@ def test_nothing_else_must_be_changed():
 
 def reward():
     """It is paid with its weight, beside the others."""
-    from congrasp.common.config import RewardWeights, TaskConfig
+    from congrasp.common.task.config import RewardWeights, TaskConfig
     from congrasp.common.task.features import scene_of
     from congrasp.common.task.reward import reward_terms, terms
     from tests.scenes import HAND, scene
@@ -49,7 +49,8 @@ def reward():
 
 def configuration():
     """A run keeps its weight."""
-    from congrasp.common.config import RewardWeights, RunConfig, TaskConfig, run_config_from_json, to_json
+    from congrasp.common.config import RunConfig, run_config_from_json, to_json
+    from congrasp.common.task.config import RewardWeights, TaskConfig
 
     assert RewardWeights().height == 2.0
     config = RunConfig(task=TaskConfig(reward=RewardWeights(height=0.5)))

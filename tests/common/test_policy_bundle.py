@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.bundle import PolicyBundle, PolicySpec
 from congrasp.common.policy.normalizer import Statistics
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.wire.codec import Message, decode, encode
 
 LAYOUT = (

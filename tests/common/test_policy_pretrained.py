@@ -6,7 +6,7 @@ import tomllib
 
 import pytest
 
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text
@@ -20,6 +20,7 @@ from congrasp.common.policy.pretrained import (
     pretrained_file,
     pretrained_hands,
 )
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.evaluate.lineup import read_entrants
 from congrasp.services.train.command import untrained
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.common.config import SensingConfig, TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.measures import tip_forces
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import privileged
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.privileged import Parameters
 from congrasp.common.task.types import SceneState

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common import rotations
-from congrasp.common.config import SensingConfig, TaskConfig
 from congrasp.common.task import observation, sensing
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import Readings, Sensors
 from tests.scenes import HAND, F, L, N, scene

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.config import RewardWeights, TaskConfig
 from congrasp.common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
 from congrasp.common.task import metrics
+from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import PAPER, blocks
 from congrasp.common.task.constraints.heading import heading_wrist_pose
 from congrasp.common.task.constraints.pose import pose_gate

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.common.config import ControlConfig, TaskConfig
 from congrasp.common.hands import get_hand
+from congrasp.common.task.config import ControlConfig, TaskConfig
 from congrasp.common.task.control import decode, guided
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.observation import observe

@@ -17,7 +17,7 @@ import trimesh
 import tyro
 
 from congrasp.actors.env import episode_fields
-from congrasp.common.config import TaskConfig
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.cli import main, parser
 from tests.base_install import run_in_base_install, steady_server

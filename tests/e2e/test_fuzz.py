@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig, run_config_from_json, to_json
+from congrasp.common.config import NetworkConfig, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text, read_hand
@@ -30,6 +30,7 @@ from congrasp.common.objects.procedural import generate
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.common.config import DistillConfig, NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import DistillConfig, NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, PolicySpec, mean_action, policy_spec
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.teaching import EXTRA, student_action
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate, random_policy

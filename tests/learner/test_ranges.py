@@ -7,10 +7,11 @@ import pytest
 
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker, finished_episodes
-from congrasp.common.config import CurriculumConfig, RewardWeights, TaskConfig
+from congrasp.common.config import CurriculumConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.metrics import episode_fields
 from congrasp.common.task.sampling.build import build_bank

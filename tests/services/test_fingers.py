@@ -9,12 +9,13 @@ import onnxruntime
 import pytest
 import trimesh
 
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.task import observation
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.main import load

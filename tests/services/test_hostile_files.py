@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from congrasp.common.config import NetworkConfig, TaskConfig
+from congrasp.common.config import NetworkConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text, read_hand
@@ -22,6 +22,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling import sets as stored_sets
 from congrasp.common.task.sampling import write_sets as constraint_sets
 from congrasp.common.wire.codec import Message, decode, encode

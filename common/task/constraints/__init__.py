@@ -18,7 +18,7 @@ from congrasp.common.task.constraints.trajectory import Trajectory
 from congrasp.common.task.types import Goal
 
 if TYPE_CHECKING:
-    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.config import TaskConfig
 
 CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers(), Force())
 PAPER = ("heading", "affordance", "pose", "trajectory")

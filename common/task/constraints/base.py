@@ -20,7 +20,7 @@ from congrasp.common.task.constraints.markers import Marker
 from congrasp.common.task.types import Array, Goal, SceneState, Surface
 
 if TYPE_CHECKING:
-    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.features import Contacts, Features
     from congrasp.common.task.sampling.bank import ConstraintBank, Draw
     from congrasp.common.task.sensing import Readings

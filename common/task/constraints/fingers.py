@@ -24,7 +24,7 @@ from congrasp.common.task.geometry import flat, share, squash
 from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
-    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.sampling.bank import Draw
 
 MARGIN, SHARPNESS = 0.01, 0.003

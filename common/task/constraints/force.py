@@ -23,7 +23,7 @@ from congrasp.common.task.geometry import FORCE_SCALE
 from congrasp.common.task.types import Array, Surface
 
 if TYPE_CHECKING:
-    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.sampling.bank import Draw
 
 LEAST, MOST = 1.0, 20.0

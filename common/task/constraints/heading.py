@@ -27,7 +27,7 @@ from congrasp.common.task.geometry import flat, hand_center, in_world
 from congrasp.common.task.types import Array, Goal
 
 if TYPE_CHECKING:
-    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.features import Contacts, Features
     from congrasp.common.task.sampling.bank import Draw
 

@@ -28,7 +28,7 @@ from congrasp.common.task.sampling.disturbances import disturbed_fingers, distur
 from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
-    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.features import Contacts, Features
     from congrasp.common.task.sampling.bank import Draw
 

@@ -29,7 +29,7 @@ from congrasp.common.task.sampling.disturbances import disturbed_wrist
 from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
-    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.sampling.bank import Draw
 
 APART = 0.02

@@ -12,7 +12,7 @@ from congrasp.common.task.constraints import known
 from congrasp.common.task.types import Array
 
 if TYPE_CHECKING:
-    from congrasp.common.config import TaskConfig
+    from congrasp.common.task.config import TaskConfig
 
 
 class ConstraintBank(NamedTuple):

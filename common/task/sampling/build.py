@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
@@ -18,6 +17,7 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.runtime.parallel import parallel_map
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.approach_paths import make_trajectories
 from congrasp.common.task.sampling.bank import ConstraintBank, with_columns
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses

@@ -9,12 +9,12 @@ import jax
 import numpy as np
 
 import congrasp.common
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.caches import keep, read_kept, source_digest
 from congrasp.common.io.files import cache_folder
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.wire.codec import Message
 

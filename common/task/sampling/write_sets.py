@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import file_name
 from congrasp.common.objects import store
 from congrasp.common.objects.pool import object_scale, scale_objects
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank, rows_of
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.sampling.sets import FORMAT, MEANING, REGIONS, SUFFIX

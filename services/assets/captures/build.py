@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.outline import CENTER, outline
@@ -18,6 +17,7 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import store
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import (
     HEADINGS,

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors import stress as protocols
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
@@ -29,6 +28,7 @@ from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import HELD_OUT_SEED
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import plausibility
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.grips import Grip, grips
 from congrasp.services.assets.hands.servos import Response, closed_overlap, responses
 

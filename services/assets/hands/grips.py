@@ -19,13 +19,13 @@ from congrasp.actors import stress as protocols
 from congrasp.actors.physics.engine import PhysicsState, ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.common import rotations
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.families import draft
 from congrasp.common.objects.plain import plain_object
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import TaskConfig
 
 OBJECTS = ("ball", "cylinder", "box")
 SIZES = (0.4, 0.3)

@@ -8,11 +8,11 @@ import numpy as np
 
 from congrasp.actors.physics.engine import PhysicsState, ResetState
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands.kinematics import link_transforms
 from congrasp.common.hands.motors import motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import plausibility
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.grips import grip_objects
 
 STEP = 0.1

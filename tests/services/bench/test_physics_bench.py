@@ -4,9 +4,9 @@ import numpy as np
 
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.bench.physics import Recorder, replay, rolled
 
 HAND = get_hand("human")

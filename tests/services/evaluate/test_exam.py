@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate import exam
 from congrasp.services.evaluate.episodes import identity, reference

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling import sets as stored_sets
 from congrasp.common.task.sampling import write_sets as constraint_sets
 from congrasp.common.task.sampling.build import build_bank

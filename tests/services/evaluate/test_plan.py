@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import OURS, PAPER, blocks
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.plan import ALIGNED, batches, plan_row

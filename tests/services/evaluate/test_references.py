@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands, reference_file
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.build import POSES, build_bank
 from congrasp.common.task.sampling.closed_poses import Poses
 from congrasp.services.evaluate import references

@@ -11,11 +11,12 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.config import NetworkConfig, RunConfig, SensingConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.policy import bundle as bundles
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.services.assets.hands.check import Finding, write_findings
 from congrasp.services.cli import main
 from congrasp.services.evaluate.model_card import limits, model_card

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from congrasp.common.config import TaskConfig
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks
 from congrasp.services.evaluate.cells import RATES, rate_cells, tables_of
 from congrasp.services.evaluate.intervals import clustered

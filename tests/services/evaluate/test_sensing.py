@@ -8,10 +8,11 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.task import sensing
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate import evaluator as evaluation
 from congrasp.services.evaluate.evaluator import Evaluator

@@ -11,12 +11,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import keypoints, link_transforms
 from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.hands.spec import Motor
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands import grips
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.assets.objects.decompose import Decomposition

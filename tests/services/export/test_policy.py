@@ -16,7 +16,7 @@ import onnxruntime
 import pytest
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
@@ -26,6 +26,7 @@ from congrasp.common.policy.normalizer import Statistics
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
 from congrasp.common.task import observation
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks, goal_of
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import Readings

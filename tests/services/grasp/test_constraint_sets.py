@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.outline import outline
 from congrasp.common.objects import procedural, store
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling import sets as stored_sets
 from congrasp.common.task.sampling import write_sets as constraint_sets
 from congrasp.common.task.sampling.build import build_bank

@@ -5,9 +5,10 @@ import json
 
 import pytest
 
-from congrasp.common.config import NetworkConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate.lineup import read_entrant
 from congrasp.services.reproduce import evaluation, run

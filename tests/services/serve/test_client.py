@@ -5,10 +5,10 @@ import time
 import numpy as np
 import pytest
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import RefusedError, TransportError
 from congrasp.common.hands import get_hand
 from congrasp.common.request import GraspRequest
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from congrasp.common.config import ControlConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.task.config import ControlConfig
 from congrasp.services.client.floor import Floor
 from congrasp.services.client.limits import JointLimits, Limited, Limiter, as_numbers
 

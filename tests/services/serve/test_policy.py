@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from congrasp.common.config import NetworkConfig, RunConfig, SensingConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError, ContradictionError, RefusedError, UnknownConstraintError
 from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.request import GraspRequest
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.transport import urls
 from congrasp.common.transport.ports import free_port
 from congrasp.services.client.episode import EpisodePolicy

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.wire.codec import Message
 from congrasp.services.serve.requests import Layout

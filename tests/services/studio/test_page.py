@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from congrasp.common.config import TaskConfig
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes

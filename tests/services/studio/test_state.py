@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.objects import procedural
 from congrasp.common.objects.shapes import matrix
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.sampling.headings import BACK_OFF, INWARD
 from congrasp.services.studio.description import describe

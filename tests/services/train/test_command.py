@@ -7,8 +7,9 @@ import types
 import pytest
 from rich.console import Console
 
-from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig, TaskConfig
+from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
 from congrasp.services.train.command import (

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from congrasp.actors.env import metric_names
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.cli.plot import plot
 from congrasp.services.evaluate.plots import cells, plot_evaluation

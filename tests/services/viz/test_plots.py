@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.metrics import episode_fields
 from congrasp.services.cli.plot import plot

@@ -10,7 +10,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.physics.mjx import MjxPhysics
-from congrasp.common.config import TaskConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.files import hand_from_text, hand_text
@@ -23,6 +22,7 @@ from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.plain import plain_object
 from congrasp.common.objects.spec import Piece
 from congrasp.common.task import plausibility
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.model_files import Choices, describe, import_hand
 from congrasp.services.assets.hands.visual import save_meshes
 from congrasp.services.cli import main

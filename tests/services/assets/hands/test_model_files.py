@@ -6,13 +6,14 @@ import pathlib
 import numpy as np
 import pytest
 
-from congrasp.common.config import TaskConfig, run_config_from_json, to_json
+from congrasp.common.config import run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.files import hand_from_text, hand_text, read_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.policy.bundle import policy_spec
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.model_files import Choices, describe, import_hand
 from congrasp.services.cli import main
 from congrasp.services.train.presets import get_preset, with_hand

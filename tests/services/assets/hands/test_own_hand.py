@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from congrasp.actors.physics.scene import scene_spec
-from congrasp.common.config import TaskConfig
 from congrasp.common.hands import HANDS, VARIABLE, get_hand
 from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.task.config import TaskConfig
 
 
 def link(name, parent, joints, start, end, tip=None):
