@@ -18,7 +18,7 @@ def policy(
     """Write a policy as ONNX or StableHLO, and print its largest difference from the original on random inputs.
 
     Normalisation is inside; the file also holds the hand, the meaning and order of every input and output, and the
-    hand's MuJoCo model. docs/exports.md and examples/onnx_grasp.py show its use.
+    hand's MuJoCo model. docs/policy-export.md and examples/onnx_grasp.py show its use.
 
     Args:
       policy: The policy file (.safetensors), or 'allegro-student'; the pretrained one otherwise.

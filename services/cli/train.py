@@ -58,7 +58,7 @@ def train(
         actors. The batch grows with them.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
       teacher: A policy file, or the hand of a pretrained policy, to distil into a policy for robots, which sees the
-        joints, the wrist and a tracker's object poses, no forces and no velocities (docs/robots.md). The task is the
+        joints, the wrist and a tracker's object poses, no forces and no velocities (docs/students.md). The task is the
         teacher's, the algorithm `distill`.
       constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp constraints import'); their
         objects are those of --objects.folder, and --objects.procedural puts others beside them.

@@ -36,7 +36,7 @@ def test_the_shipped_policy_grasps_on_warp_as_on_a_cpu(tmp_path):
     rows = {row["constraint"]: row for row in json.loads((tmp_path / "rows.json").read_text())["rows"]}
     assert len(rows) == 6
     for name, row in rows.items():
-        # Four standard errors of 1,000 episodes below what docs/training.md has for the rarest success, 97.7 %.
+        # Four standard errors of 1,000 episodes below what docs/notes/training.md has for the rarest success, 97.7 %.
         assert row["success"] > 0.958, name
         assert row["diverged"] < 0.005, name
 
