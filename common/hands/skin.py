@@ -5,7 +5,7 @@ A surface is computed once, with every joint at zero, and moved with the links b
 
 import functools
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -80,7 +80,7 @@ def skin_on(skeleton: Skeleton) -> Skin:
     """Returns the surface of the hand with this skeleton; a left hand's is the mirror image of the right hand's."""
     right, left = right_name(skeleton.hand)
     if left:
-        own = _mirrored(skeleton, ("origins", "capsules", "anchors"))
+        own: dict[str, Any] = _mirrored(skeleton, ("origins", "capsules", "anchors"))
         skin = skin_on(skeleton._replace(hand=right, axes=mirror.axial(skeleton.axes), **own))
         return skin._replace(faces=skin.faces[:, ::-1].copy(), **_mirrored(skin, ("points", "normals", "origins")))
     if skeleton.hand in HUMAN_HANDS and _anatomical(skeleton):

@@ -10,7 +10,7 @@ from congrasp.common.errors import CongraspError
 
 if TYPE_CHECKING:
     from congrasp.services.evaluate.lineup import Entrant
-    from congrasp.services.reproduce.plan import Policy
+    from congrasp.services.reproduce.plan import RequiredPolicy
 
 _OUT = "reproduction"
 _QUICK, _FULL = (48, 24), (1000, 64)
@@ -114,12 +114,12 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
         raise CongraspError(f"There is no method '{min(unknown)}'.", f"Choose from: {', '.join(BASELINES)}.")
 
 
-def _given(texts: tuple[str, ...], needed: "list[Policy]") -> "dict[Policy, Entrant]":
+def _given(texts: tuple[str, ...], needed: "list[RequiredPolicy]") -> "dict[RequiredPolicy, Entrant]":
     """Policies by what they are; a CongraspError for one that nothing needs."""
     from congrasp.services.evaluate.lineup import read_entrants
-    from congrasp.services.reproduce.plan import Policy
+    from congrasp.services.reproduce.plan import RequiredPolicy
 
-    found = {Policy(one.hand, one.method): one for one in read_entrants(texts)}
+    found = {RequiredPolicy(one.hand, one.method): one for one in read_entrants(texts)}
     for policy, one in found.items():
         if policy not in needed:
             raise CongraspError(

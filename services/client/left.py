@@ -2,7 +2,9 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
+
+import numpy as np
 
 from congrasp.common import mirror
 from congrasp.common.request import GraspRequest, Pose
@@ -31,6 +33,16 @@ class LeftPolicy(Policy):
     def act_each(self, states: Sequence[State]) -> list[Answer]:
         """See `Policy.act_each`."""
         return [_answer(answer) for answer in self._right.act_each([mirror.fields(state) for state in states])]
+
+    def metadata(self) -> dict[str, Any]:
+        """See `Policy.metadata`; the limits are those of the left hand."""
+        found = self._right.metadata()
+        limits = found["limits"] and dict(found["limits"])
+        if limits:
+            ends = np.array([mirror.wrist(limits[name]) for name in ("lower", "upper")])
+            limits["lower"], limits["upper"] = ends.min(0).tolist(), ends.max(0).tolist()
+            limits["palm"] = [[-x, *rest] for x, *rest in limits["palm"]]
+        return {**found, "hand": f"{found['hand']}:left", "limits": limits}
 
     def close(self) -> None:
         """See `Policy.close`."""

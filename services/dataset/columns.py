@@ -19,7 +19,6 @@ from congrasp.common.objects import store
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import known
-from congrasp.common.task.constraints.base import symbol_sizes
 from congrasp.common.task.metrics import FORCES
 from congrasp.services.evaluate.episodes import Batch
 from congrasp.services.evaluate.plan import ALIGNED
@@ -52,9 +51,9 @@ class Column(NamedTuple):
 
 def grasp_columns(hand: Hand, task: TaskConfig) -> list[Column]:
     """Columns of a grasp: episode, constraints, hand and object at the start and after the hold, outcome."""
-    joints, symbols = (len(hand.joints),), symbol_sizes(hand, task)
+    joints = (len(hand.joints),)
     goals = [
-        Column(f"goal_{c.name}_{name}", array.meaning, tuple(symbols.get(n, n) for n in array.shape))  # type: ignore[misc, call-overload]
+        Column(f"goal_{c.name}_{name}", array.meaning, np.shape(getattr(c.neutral(hand, task), name)))
         for c in known(task)
         for name, array in c.arrays.items()
     ]
@@ -165,7 +164,7 @@ def _array(column: Column, values: np.ndarray) -> pa.Array:
     """A column (B, ...) as Arrow keeps it."""
     if column.kind is str:
         return pa.array(values.tolist(), pa.string())
-    flat = np.asarray(values, column.kind).ravel()
+    flat: np.ndarray = np.asarray(values, column.kind).ravel()
     array = pa.array(flat, _WIDE[flat.dtype])
     return pa.FixedSizeListArray.from_arrays(array, int(np.prod(column.shape))) if column.shape else array
 

@@ -144,7 +144,8 @@ def make(
         for pool in stack.enter_context(one_ahead(prepared(hand, task, pools, recipe.seed, wanted, True))):
             columns = grasp_columns(hand, task)
             counts: dict[str, collections.Counter[str]] = {}
-            rows = [{column.name: np.zeros((0, *column.shape), column.kind) for column in columns}]
+            none: dict[str, np.ndarray] = {c.name: np.zeros((0, *c.shape), c.kind) for c in columns}
+            rows = [none]
             if pool.bank is not None:
                 if running is None:
                     running = stack.enter_context(Episodes(policy, task, pool.objects, field=pool.field, **settings))

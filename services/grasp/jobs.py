@@ -159,8 +159,8 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             "rules": list(found.active),
             "drawn": drawn,
         }
-        drawing = {"film": settings.film, "pictures": settings.pictures, "view": settings.view}
-        save_grasp(folder, found, about=about, **drawing)
+        film, pictures, view = settings.film, settings.pictures, settings.view
+        save_grasp(folder, found, about=about, film=film, pictures=pictures, view=view)
         return Result(at.name, {**found.facts(), **about})
     except CongraspError as error:
         return Result(at.name, {}, str(error))

@@ -1,5 +1,7 @@
 """Left hands: mirror images of right ones in kinematics, surface, objects and policies."""
 
+from unittest import mock
+
 import mujoco
 import numpy as np
 import pytest
@@ -106,3 +108,15 @@ def test_angular_velocities_are_mirrored_as_rotations():
     found = mirror.fields({"object_angular_velocity": [1.0, 2.0, 3.0], "object_velocity": [1.0, 2.0, 3.0]})
     np.testing.assert_array_equal(found["object_angular_velocity"], [1, -2, -3])
     np.testing.assert_array_equal(found["object_velocity"], [-1, 2, 3])
+
+
+def test_limits_of_the_left_hand_are_those_of_the_right_one_mirrored():
+    """By hand: slides along x and hinges about y and z change their sign, so that their bounds change places."""
+    lower, upper = [0.0, -1.0, -2.0, -3.0, -0.1, -0.2, -0.3], [1.0, 4.0, 5.0, 6.0, 0.4, 0.5, 0.6]
+    limits = {"lower": lower, "upper": upper, "palm": [[0.01, 0.02, 0.03, 0.04]]}
+    right = mock.Mock(metadata=lambda: {"hand": "human", "limits": limits, "period": 0.01})
+    found = LeftPolicy(right).metadata()
+    assert found["hand"] == "human:left" and found["period"] == 0.01
+    np.testing.assert_array_equal(found["limits"]["lower"], [0.0, -4.0, -2.0, -3.0, -0.1, -0.5, -0.6])
+    np.testing.assert_array_equal(found["limits"]["upper"], [1.0, 1.0, 5.0, 6.0, 0.4, 0.2, 0.3])
+    assert found["limits"]["palm"] == [[-0.01, 0.02, 0.03, 0.04]]
