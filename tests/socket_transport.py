@@ -95,10 +95,12 @@ class Connection:
     """The listener's side of one connection: carries out its frames on an endpoint of the hub."""
 
     def __init__(self, connection, hub):
-        self.endpoint = MemoryTransport(hub)
+        self.endpoint, self._begun = MemoryTransport(hub), threading.Event()
         self.frames = Frames(connection, self.handle, self.endpoint.close)
+        self._begun.set()
 
     def handle(self, head, message):
+        self._begun.wait()  # the first frame may come before `frames` has its name
         key, name = head["key"], head.get("name")
         if head["do"] == "query":
             return self.endpoint.query(key, message, timeout=head["timeout"])

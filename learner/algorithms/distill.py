@@ -117,7 +117,7 @@ class Distillation:
         transitions = batch["observation"].shape[0] * batch["observation"].shape[1]
         if transitions < config.minibatches:
             raise CongraspError(
-                f"A batch of {transitions} transitions does not make {config.minibatches} minibatches.",
+                f"A batch of {transitions} transitions cannot be split into {config.minibatches} minibatches.",
                 "Use fewer --distill.minibatches, more environments or longer rollouts.",
             )
         arrays = shard({name: batch[name] for name in _SCHEMA}, mesh, _SPECS)

@@ -91,7 +91,7 @@ def test_a_policy_keeps_its_method(tmp_path):
     """One from before there were methods is ours; another one's name is refused in one line."""
     ours = bundles.load(pretrained_file("human"))
     assert ours.task.method == "ours"
-    with pytest.raises(CongraspError, match=r"human\.safetensors is of the method 'ours', not 'no-feedforward'"):
+    with pytest.raises(CongraspError, match=r"human\.safetensors has the method 'ours', not 'no-feedforward'"):
         evaluated_as(ours.task, "no-feedforward", "human.safetensors")
     task = with_method(RunConfig(task=ours.task), "no-feedforward").task
     bundles.save(dataclasses.replace(ours, task=task), tmp_path / "other.safetensors")

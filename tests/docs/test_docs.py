@@ -155,12 +155,13 @@ def test_the_loop_of_the_robots_page_runs_as_printed_with_numpy_and_zenoh_alone(
 
 
 def example_lines():
-    text = "".join(blocks(ROOT / "docs" / "robots.md", "sh")).replace("\\\n", " ")
+    pages = (ROOT / "docs" / name for name in ("robots.md", "ros2.md"))
+    text = "".join(block for page in pages for block in blocks(page, "sh")).replace("\\\n", " ")
     return [line for line in text.splitlines() if line.startswith("python examples/")]
 
 
 @pytest.mark.parametrize("line", example_lines())
-def test_the_examples_of_the_robots_page_take_their_options(line, monkeypatch):
+def test_the_examples_of_the_robots_pages_take_their_options(line, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "examples")
     _, script, *words = shlex.split(line, comments=True)
     tyro.cli(importlib.import_module(pathlib.Path(script).stem).Arguments, args=words)

@@ -470,7 +470,7 @@ def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(f
             for process in processes:
                 _, said = process.communicate(timeout=40)
                 assert process.returncode
-                assert "congrasp: error: The certificate safe.learner.0 of who listens there is revoked" in said
+                assert "congrasp: error: The listener's certificate safe.learner.0 is revoked" in said
                 assert "Traceback" not in said
             assert client.health()["ready"]  # the policy server is another
     finally:
@@ -487,7 +487,7 @@ def test_a_client_of_a_policy_server_that_is_revoked_is_told_so(forgiven, run, c
 
     eventually(client._sessions.closed.is_set)
     for _ in range(2):
-        with pytest.raises(CongraspError, match=r"safe\.server\.0 of who listens there is revoked"):
+        with pytest.raises(CongraspError, match=r"The listener\'s certificate safe\.server\.0 is revoked"):
             client.query(key, Message(), timeout=5)
 
 

@@ -108,7 +108,7 @@ def test_a_batch_that_is_not_finite_changes_nothing(teacher):
     with pytest.raises(NonFiniteUpdate, match="Diverged in the rollouts of update 1: imitation_kl") as caught:
         student.update(state, rows)
     assert caught.value.state is state
-    with pytest.raises(CongraspError, match=r"8 transitions does not make 16 minibatches\. Use fewer --distill"):
+    with pytest.raises(CongraspError, match=r"8 transitions cannot be split into 16 minibatches\. Use fewer --distill"):
         algorithm(dataclasses.replace(run, distill=DistillConfig(teacher=str(teacher)))).update(
             state, batch(run, 0, worlds=1)
         )

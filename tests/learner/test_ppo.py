@@ -197,7 +197,7 @@ def test_a_policy_that_left_its_trust_region_waits_while_the_critic_learns():
 
 
 def test_a_rate_that_is_too_large_for_a_settled_policy_does_not_break_it():
-    """Standard deviations of a hundredth; without the trust region the first update is out of all reason."""
+    """Standard deviations of a hundredth; without the trust region the first update is too large."""
     algorithm, state = changed(learning_rate=1e-3, kl_target=0.012), fresh()
     actor = {**state.params["actor"], "log_std": jnp.full_like(state.params["actor"]["log_std"], np.log(0.01))}
     state = state._replace(params={**state.params, "actor": actor})
@@ -231,7 +231,7 @@ def test_a_value_that_is_not_finite_is_named_and_changes_nothing(field):
     ("wrong", "why"),
     [
         ({"reward_scale": 1e25}, "value loss"),
-        ({"learning_rate": 3.0, "learning_rate_range": (3.0, 3.0)}, "policy .a KL divergence out of all reason"),
+        ({"learning_rate": 3.0, "learning_rate_range": (3.0, 3.0)}, "policy .the KL divergence is too large"),
     ],
 )
 def test_an_optimisation_that_breaks_is_named_and_changes_nothing(wrong, why):
@@ -248,7 +248,7 @@ def test_an_optimisation_that_breaks_is_named_and_changes_nothing(wrong, why):
 
 def test_more_minibatches_than_transitions_are_refused():
     batch = rollout(toy.bundle_of(fresh()), 0, worlds=1)
-    with pytest.raises(CongraspError, match="10 transitions does not make 16 minibatches"):
+    with pytest.raises(CongraspError, match="10 transitions cannot be split into 16 minibatches"):
         changed(minibatches=16).update(fresh(), batch)
 
 

@@ -66,7 +66,7 @@ def test_help_names_every_command_and_every_command_exists():
         (["status", "/dev/null"], "/dev/null is not a run directory"),
         (["grasp", "x" * 300 + ".stl"], "x.stl cannot be used: File name too long"),
         (["grasp", "mug:7", "--policy", "/nonexistent.safetensors"], "there is no file /nonexistent.safetensors"),
-        (["grasp", "mug:7", "--policy", "/"], "/ is no regular file"),
+        (["grasp", "mug:7", "--policy", "/"], "/ is not a regular file"),
         (["grasp", "mug:7", "--seed", "-1"], "--seed: a seed is a whole number from 0 to 1e[+]15"),
         (["evaluate", "--seed", "9" * 23], "--seed: a seed is a whole number"),
         (["train", "--objects.seed", "9" * 23], "--objects.seed: a seed is a whole number"),
@@ -153,7 +153,8 @@ def test_a_reader_that_is_gone_is_no_error():
     command = [sys.executable, "-m", "congrasp", "hands", "list", "--help"]
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
     os.close(writer)
-    assert done.stderr == "" and done.returncode in (0, 128 + signal.SIGPIPE)
+    lines = [line for line in done.stderr.splitlines() if not line.endswith(" s so far.")]  # of a busy machine
+    assert not lines and done.returncode in (0, 128 + signal.SIGPIPE)
 
 
 def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path):

@@ -61,7 +61,7 @@ def test_an_object_that_names_another_folder_is_not_read(tmp_path):
 def test_pipes_and_folders_are_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "a.safetensors")
     for read in (store.load, bundles.load, stored_sets.load, load_motion, read_hand):
-        assert "no regular file" in limited(read, tmp_path / "a.safetensors", seconds=5)
+        assert "not a regular file" in limited(read, tmp_path / "a.safetensors", seconds=5)
     with pytest.raises(CongraspError, match="more than the 3"):
         (tmp_path / "b").write_bytes(b"1234")
         read_file(tmp_path / "b", 3)
@@ -92,7 +92,7 @@ def _with(values, index, value):
         (lambda o: {"visual_faces": o.visual_faces + 10**6}, "visual_faces"),
         (lambda o: {"pieces": o.pieces * 200}, "pieces"),
         (lambda o: {"pieces": (dataclasses.replace(o.pieces[0], size=(-1.0, 1.0, 1.0)),)}, "piece 0 has the size"),
-        (lambda o: {"pieces": (dataclasses.replace(o.pieces[0], pos=(INF, 0.0, 0.0)),)}, "finite numbers"),
+        (lambda o: {"pieces": (dataclasses.replace(o.pieces[0], pos=(INF, 0.0, 0.0)),)}, "numbers that are not finite"),
         (lambda o: {"file_scale": 0.0}, "file_scale"),
     ],
 )
@@ -136,7 +136,7 @@ def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, par
         (lambda h: h["links"][1]["joints"][0].update(lower=2.0, upper=-2.0), "wrong order"),
         (lambda h: h["links"][1]["joints"][0].update(kp=1e300), "not a finite number"),
         (lambda h: h["links"][1].update(capsules=h["links"][1]["capsules"] * 10_000), "more than"),
-        (lambda h: h.update(links=h["links"] * 1000), "more than"),
+        (lambda h: h.update(links=h["links"] * 1000), "the limit is"),
         (lambda h: h.update(name="../../x"), "the name"),
         (lambda h: h.update(object_scale=INF), "not a finite number"),
         (lambda h: h.update(links=h["links"][:1], open_pose={}, closed_pose={}), "it has no joints"),
@@ -172,7 +172,7 @@ def test_json_that_is_no_hand_is_refused(tmp_path, text):
         (lambda m: {"joint_limits": m.joint_limits[:, ::-1]}, "joint_limits are in the wrong order"),
         (lambda m: {"link_parent": m.link_parent + 100}, "link_parent names links"),
         (lambda m: {"capsule_radius": -m.capsule_radius}, "capsule_radius"),
-        (lambda m: {"table": m.table.astype(float)}, "table is of the type"),
+        (lambda m: {"table": m.table.astype(float)}, "table has the type"),
     ],
 )
 def test_motions_with_values_that_none_has_are_named(tmp_path, change, why):
@@ -202,7 +202,7 @@ def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
         (Message({**made.arrays, "pose/q": np.full((2, 3, 2), NAN, np.float32)}, made.meta), "pose/q holds"),
         (
             Message({**made.arrays, "pose/q": np.ones((2, 3, 9), np.float32)}, made.meta),
-            r"pose/q has shape \(2, 3, 9\), where",
+            r"pose/q has shape \(2, 3, 9\), but",
         ),
     ):
         path.write_bytes(encode(change))

@@ -55,12 +55,12 @@ def test_json_is_of_bounded_size_and_depth(tmp_path):
         path.write_text(text)
         refused(lambda path: read_json(path, 10**6), path, "is not JSON")
     path.write_text("[" + "1," * 2000 + "1]")
-    refused(lambda path: read_json(path, 1000), path, "4003 bytes, more than the 1000")
+    refused(lambda path: read_json(path, 1000), path, "4003 bytes; the limit is 1000")
     assert len(read_json(path, 5000)) == 2001
     path.write_bytes(b'"\xff"')
     refused(lambda path: read_json(path, 1000), path, "is not JSON")
     os.mkfifo(pipe := tmp_path / "pipe.json")
-    refused(lambda path: read_json(path, 1000), pipe, "no regular file")
+    refused(lambda path: read_json(path, 1000), pipe, "not a regular file")
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_motions_of_others_are_of_bounded_size(tmp_path, monkeypatch):
     monkeypatch.setattr(wrist_paths, "_LARGEST", 100)
     for name in ("x.bvh", "x.csv"):
         (tmp_path / name).write_text("0,0,0,1,0,0,0\n" * 20)
-        refused(wrist_paths.read_wrist_path, tmp_path / name, "more than the 100 that are read")
+        refused(wrist_paths.read_wrist_path, tmp_path / name, "bytes; the limit is 100")
 
 
 def _recording(folder, *entries):
@@ -131,5 +131,5 @@ def test_recordings_of_others_are_one_line(tmp_path):
 def test_a_pipe_among_recordings_makes_nobody_wait(tmp_path):
     os.mkfifo(tmp_path / "log.mcap")
     began = time.monotonic()
-    refused(lambda path: read_records(log_files(path)[0]), tmp_path, "no regular file")
+    refused(lambda path: read_records(log_files(path)[0]), tmp_path, "not a regular file")
     assert time.monotonic() - began < 15.0

@@ -182,7 +182,7 @@ def test_a_usd_has_the_rate_that_is_asked_for(human: GraspMotion, tmp_path: path
 def test_numbers_that_are_no_poses_are_refused(human: GraspMotion, tmp_path: pathlib.Path) -> None:
     for name, value, words in (
         ("link_position", np.nan, "link_position has values that are not finite"),
-        ("object_quaternion", 0.0, "object_quaternion has quaternions that are not of length one"),
+        ("object_quaternion", 0.0, "object_quaternion has quaternions that are not normalised"),
     ):
         wrong = dataclasses.replace(human, **{name: np.full_like(getattr(human, name), value)})
         with pytest.raises(CongraspError, match=words):
@@ -466,7 +466,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
         (["mug.npz", "--to", "lerobot"], "exists already"),
         (["mug.npz", "--to", "usd", "--out", "x.glb"], "ends in .usda, and x.glb does not"),
         (["mug.npz", "--out", "logs"], "Use --out logs/grasp.glb"),
-        (["nothing.npz"], "There is no nothing.npz"),
+        (["nothing.npz"], "There is no file nothing.npz"),
         (["logs", "--index", "4"], "holds 1 episodes"),
         ([], "No motion was given"),
     ):
@@ -479,5 +479,5 @@ def test_a_motions_file_has_no_other_number(human: GraspMotion, tmp_path: pathli
     path = tmp_path / "grasp.npz"
     save_motion(path, human)
     assert motion_formats.pick_motion(path, 0).object == motion_formats.pick_motion(path).object == human.object
-    with pytest.raises(CongraspError, match=r"grasp\.npz is one motion and has no number 99. Leave --index out"):
+    with pytest.raises(CongraspError, match=r"grasp\.npz is one motion and has no number 99. Remove --index"):
         motion_formats.pick_motion(path, 99)

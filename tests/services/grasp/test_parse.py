@@ -166,7 +166,7 @@ def test_what_is_wrong_with_a_trajectory_is_said(block, tmp_path):
         with pytest.raises(CongraspError, match=complaint):
             asked(block, trajectory=str(path))
     os.mkfifo(tmp_path / "pipe.csv")
-    with pytest.raises(CongraspError, match=r"pipe\.csv is no regular file"):
+    with pytest.raises(CongraspError, match=r"pipe\.csv is not a regular file"):
         asked(block, trajectory=str(tmp_path / "pipe.csv"))
     with pytest.raises(CongraspError, match="cannot be read"):
         asked(block, trajectory=str(tmp_path / "none.csv"))

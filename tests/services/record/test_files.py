@@ -249,7 +249,7 @@ def test_what_is_no_recording_is_refused(tmp_path: pathlib.Path) -> None:
         read_metrics(tmp_path)
     with pytest.raises(CongraspError, match="cannot be read"):
         list(read_records(tmp_path / "absent.mcap"))
-    with pytest.raises(CongraspError, match=r"no file or folder .*absent\. Name a run"):
+    with pytest.raises(CongraspError, match=r"no file or folder .*absent\. Pass a run"):
         log_files(tmp_path / "absent")
     (tmp_path / "file").write_text("")
     with pytest.raises(CongraspError, match="cannot be created"):

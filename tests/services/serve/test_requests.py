@@ -86,7 +86,7 @@ def test_any_number_of_surface_points_is_spread_over_those_that_the_policy_looks
     ("constraints", "changes", "words"),
     [
         (["flight"], {}, "no constraint 'flight'"),
-        (["affordance"], {}, "nothing that guides the wrist. Add one of: heading, pose, trajectory"),
+        (["affordance"], {}, "no constraint that guides the wrist. Add one of: heading, pose, trajectory"),
         (["heading", "affordance"], {"surface_avoid": np.zeros(8, bool)}, "both sides"),
         (["heading", "affordance"], {"surface_avoid": None}, "lacks the field 'surface_avoid'"),
         (["heading"], {"q": None}, "lacks the field 'q'"),

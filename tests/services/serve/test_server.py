@@ -275,7 +275,7 @@ def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(serve
         version = client.health()["version"]
         for other, words in (
             (dataclasses.replace(CONFIG.task, dynamic_center=False), "another task"),
-            (dataclasses.replace(CONFIG.task, trajectory_points=3), "is needed"),
+            (dataclasses.replace(CONFIG.task, trajectory_points=3), "not for hand"),
         ):
             policy = untrained(dataclasses.replace(CONFIG, task=other))
             bundles.save(dataclasses.replace(policy, version=99), path)

@@ -23,17 +23,18 @@ def image(view: dict[str, object], frame: int = 5) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(found.data))).astype(int)
 
 
-def orange(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the object's pixels."""
-    return np.nonzero((seen[..., 0] > 130) & (seen[..., 0] > 1.25 * seen[..., 1]) & (seen[..., 1] > 1.6 * seen[..., 2]))
+def painted(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the object's pixels: the affordance paints it red and green."""
+    red, green, blue = seen[..., 0], seen[..., 1], seen[..., 2]
+    return np.nonzero(((red > 2 * green) & (red > 2 * blue)) | ((green > 1.5 * red) & (green > 1.5 * blue)))
 
 
 def test_a_picture_is_seen_from_where_the_page_looks() -> None:
     seen = image(VIEW)
-    rows, columns = orange(seen)
+    rows, columns = painted(seen)
     assert seen.shape == (720, 1280, 3) and abs(np.median(columns) - 640) < 40
     # From twice as far the object is half as large along each side.
-    assert len(orange(image({**VIEW, "position": [1.0, -1.2, 0.74]}))[0]) == pytest.approx(len(rows) / 4, rel=0.25)
+    assert len(painted(image({**VIEW, "position": [1.0, -1.2, 0.74]}))[0]) == pytest.approx(len(rows) / 4, rel=0.25)
 
 
 def test_a_video_has_a_frame_for_every_40_ms() -> None:

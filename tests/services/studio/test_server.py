@@ -155,7 +155,7 @@ def test_hands_are_known_by_name_and_no_file_is_opened(page: Page, tmp_path: pat
     file = pathlib.Path(__file__).parents[2] / "hands" / "claw.json"
     assert b"skin_points" in page.ask("GET", "/api/hand?name=allegro")[1]
     assert b"skin_points" in page.ask("GET", "/api/hand?name=human")[1]
-    assert b"no hand that a message can name" in page.ask("GET", f"/api/hand?name={file}")[1]
+    assert b"not a hand that a message can name" in page.ask("GET", f"/api/hand?name={file}")[1]
     text = urllib.parse.quote(file.read_text())
     assert b"skin_points" in page.ask("GET", f"/api/hand?name={text}")[1]  # as a motion of it does
 
@@ -338,7 +338,7 @@ def test_a_busy_port_and_an_open_interface_are_refused_in_one_line(
         PageServer({}, {}, "127.0.0.1", page.port)
     for arguments, says in (
         (["--host", "0.0.0.0"], "would be reachable from other machines"),
-        (["--policy", "a.safetensors", "--connect", "tcp/127.0.0.1:1"], "Give one of --policy and --connect"),
+        (["--policy", __file__, "--connect", "tcp/127.0.0.1:1"], "Give one of --policy and --connect"),
         (["--policy", "nowhere.safetensors"], "nowhere.safetensors"),
         (["--objects", "/nowhere"], "/nowhere"),
         (["--recordings", "/nowhere"], "/nowhere"),

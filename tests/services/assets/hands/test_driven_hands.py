@@ -298,7 +298,7 @@ def test_a_mesh_in_another_unit_is_left_out_of_the_import(tmp_path):
     spec.compile()
     (tmp_path / "driven.xml").write_text(spec.to_xml())
     proposal = import_hand(tmp_path / "driven.xml")
-    assert "drawn more than 2 m from the palm (in mm?), and left out: palm" in proposal.notes
+    assert "drawn more than 2 m from the palm (in mm?), and dropped: palm" in proposal.notes
     assert "palm" not in proposal.meshes and len(proposal.meshes) == len(proposal.hand.links) - 1
 
 
