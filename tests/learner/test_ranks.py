@@ -264,5 +264,5 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
 
     job.start(kept + 5, "resume", count=1)
     (alone,) = job.finish()
-    assert "The checkpoint is of 2 rank(s), this run has 1" in alone
+    assert "The checkpoint has 2 rank(s), this run has 1" in alone
     assert int(alone.split()[-1]) == steps * (kept + 3) + steps // 2 * 2

@@ -46,7 +46,7 @@ def test_a_policy_that_does_not_know_it_says_so(paper_policy, tmp_path: pathlib.
     options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures", *option]
     assert load("grasp")([str(tmp_path / "block.stl"), *options])() == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
-    assert line.startswith("congrasp: error: The policy does not know the constraint 'force'. It knows heading, ")
+    assert line.startswith("congrasp: error: The policy does not support the constraint 'force'. It supports heading, ")
 
 
 def test_a_grasp_is_made_with_a_limit(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:

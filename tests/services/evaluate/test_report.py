@@ -139,7 +139,7 @@ def test_limits_name_what_is_bad_by_the_figures():
     assert limits([good, bad]) == [
         "Pose: 75.0 % success, 60.0 % held for 2 s, success 21.4 points below the paper's 96.4 %.",
         "Objects with the most losses: can (50 % of 10).",
-        "Its fingers pass through one another: 11.0 mm at the deepest, in the mean of the worst row.",
+        "Its fingers pass through one another: 11.0 mm at the deepest, mean of the worst row.",
         "Its wrist peaks at 2.5 m/s, in the mean of the fastest row.",
     ]
 

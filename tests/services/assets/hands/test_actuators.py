@@ -63,7 +63,7 @@ def test_a_motor_of_a_tendon_through_space_has_the_tendons_mean_levers():
     around = between + 0.4 - np.arccos(radius / below) - np.arccos(radius / above)
     wrapped = np.sqrt(below**2 - radius**2) + np.sqrt(above**2 - radius**2) + radius * around
     assert around > 0 and servo.joints[0] == pytest.approx((straight - wrapped) / 0.8, rel=1e-6)
-    assert len(notes) == 1 and notes[0].startswith("1 motors pull tendons through space")
+    assert len(notes) == 1 and notes[0].startswith("1 motors pull spatial tendons")
 
 
 def test_a_joint_hangs_on_the_tendon_that_pulls_it_most():
@@ -73,4 +73,4 @@ def test_a_joint_hangs_on_the_tendon_that_pulls_it_most():
     both = _drive('<position name="again" tendon="flexor" kp="10000"/>')
     (tendon,) = both.tendons()
     assert set(tendon.joints) == {"root", "end"}
-    assert any("1 motors that pull joints of others alone are left out" in note for note in both.remarks())
+    assert any("1 motors that only pull joints of others are dropped" in note for note in both.remarks())
