@@ -49,7 +49,7 @@ class RosBus:
             self._rclpy, qos = importlib.import_module("rclpy"), importlib.import_module("rclpy.qos")
         except ImportError:
             raise congrasp.CongraspError(
-                "ROS 2's rclpy cannot be imported here.", "Source ROS 2's setup.bash, or use --zenoh (docs/robots.md)."
+                "ROS 2's rclpy cannot be imported here.", "Source ROS 2's setup.bash, or use --zenoh (docs/ros2.md)."
             ) from None
         self._rclpy.init()
         self._node = self._rclpy.create_node("congrasp")

@@ -160,7 +160,7 @@ def test_a_batch_is_joined_and_divided_along_the_axis_of_worlds():
 
 
 def test_an_unknown_algorithm_is_one_line_and_an_old_configuration_means_ppo():
-    with pytest.raises(CongraspError, match=r"There is no algorithm 'a2c'\. Choose among ppo, distill\.") as caught:
+    with pytest.raises(CongraspError, match=r"There is no algorithm 'a2c'\. Choose from: ppo, distill\.") as caught:
         make_algorithm(toy.SPEC, CONFIG)
     assert "\n" not in str(caught.value)
     old = to_json(RunConfig()).replace('  "algorithm": "ppo",\n', "")

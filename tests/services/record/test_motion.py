@@ -58,7 +58,7 @@ def test_a_file_of_the_first_format_is_read(tmp_path):
     np.testing.assert_equal(load_motion(again).goal, wanted)
     arrays["pose_joints"] = arrays["pose_joints"][:3]
     np.savez_compressed(path, **arrays, meta=np.array(json.dumps(meta)))
-    with pytest.raises(CongraspError, match=r"pose_q has shape \(3,\), where \(F,\) is \(20,\)"):
+    with pytest.raises(CongraspError, match=r"pose_q has shape \(3,\), but \(F,\) requires \(20,\)"):
         load_motion(path)
 
 
@@ -111,10 +111,10 @@ def test_what_is_no_motion_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("time", lambda x: x[:3], r"table has shape \(12,\), where \(T,\) is \(3,\)"),
+        ("time", lambda x: x[:3], r"table has shape \(12,\), but \(T,\) requires \(3,\)"),
         ("object_vertices", lambda x: x[:0], "object_vertices is empty"),
         ("object_faces", lambda x: x + 1000, "names vertices that do not exist"),
-        ("wrist_quaternion", lambda x: x[:, :3], r"wrist_quaternion has shape \(12, 3\), where \(T, 4\) is \(12, 4\)"),
+        ("wrist_quaternion", lambda x: x[:, :3], r"wrist_quaternion has shape \(12, 3\), but \(T, 4\) requires \(12, 4\)"),
     ],
 )
 def test_arrays_of_the_wrong_shape_are_named(tmp_path, name, change, message):
