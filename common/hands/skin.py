@@ -21,7 +21,7 @@ from congrasp.common.hands.spec import Hand, Link, link_origin
 HUMAN_HANDS = ("human", "mano")
 """Names of hands with flesh."""
 MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
-"""What a surface is made of."""
+"""Materials of a surface."""
 _LARGEST = 0.5  # m
 _SECTIONS = 20  # bevel of a housing
 _BEVEL = 0.45  # length of a housing's ends, in radii

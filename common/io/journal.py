@@ -155,7 +155,7 @@ def is_value(value: Any, kind: type) -> bool:
 
 
 def _end_of(path: pathlib.Path) -> tuple[bool, str]:
-    """Whether a journal ends within a line (its writer was killed in it, or the disk took a part of it), and the
+    """True if a journal ends within a line (its writer was killed in it, or the disk took a part of it), and the
     checksum of its last line; empty if there is none."""
     if not path.exists():
         return False, ""

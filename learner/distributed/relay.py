@@ -35,7 +35,7 @@ def _accept(server: socket.socket, address: tuple[str, int]) -> None:
 
 
 def _forward(near: socket.socket, address: tuple[str, int]) -> None:
-    """Forwards one connection until this end closes it; the other end's closing is passed on to nobody."""
+    """Forwards one connection until this end closes it; the other end's closing is not passed on."""
     while True:
         with contextlib.suppress(OSError):
             far = socket.create_connection(address)

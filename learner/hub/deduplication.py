@@ -58,7 +58,7 @@ class Sequences:
         return self.skipped + self._made(ahead)
 
     def _made(self, gap: int) -> int:
-        """So many of the sequence numbers in a gap can be of rollouts: an actor may make its numbers up."""
+        """Sequence numbers of a gap that can be of rollouts, limited by tickets: an actor may invent numbers."""
         return max(0, min(gap, self.granted + _WINDOW - self.skipped))
 
 

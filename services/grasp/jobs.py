@@ -44,7 +44,7 @@ class Settings(NamedTuple):
     film: Film | None
     """Style of a video; None for no video."""
     view: View | None
-    """Where pictures and video are seen from; what shows most of the grasp if None."""
+    """Viewpoint of pictures and video; None takes the one that shows most of the grasp."""
     pictures: bool
     again: bool
     """Repeats finished objects."""

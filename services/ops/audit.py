@@ -24,7 +24,7 @@ Identity = tuple[str, str, int]
 FAULTS = {"lost": "loss", "duplicated": "surplus", "corrupted": "damage", "unmatched": "surplus"}
 """Faults of rollouts, and their kinds."""
 EXIT_CODES = {"loss": 1, "surplus": 5, "damage": 6, "unjudged": 7}
-"""What `congrasp audit` exits with, by the gravest kind of what it found; 2 to 4 are those of errors."""
+"""Exit codes of `congrasp audit`, by the gravest kind of what it found; 2 to 4 are those of errors."""
 UNJUDGED = "not in the journals"
 """Outcome of accepted rollouts of which nothing can be said."""
 

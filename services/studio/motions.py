@@ -47,7 +47,7 @@ class Motions:
 
 
 def _asked(episode: Message) -> str:
-    """What was asked of a motion in words: its constraints, and the way the hand came in the world."""
+    """Request of a motion in words: its constraints, and the way the hand came in the world."""
     arrays, names = episode.arrays, active_constraints(episode.arrays)[1:]
     turn = Rotation.from_quat(arrays["object_quaternion"][0], scalar_first=True)
     down = -float(turn.apply(np.asarray(arrays["goal/heading_direction"], float))[2])

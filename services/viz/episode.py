@@ -1,4 +1,4 @@
-"""What a control step of a recorded episode looks like: hand, object, table, contacts and constraints."""
+"""Appearance of a control step of a recorded episode: hand, object, table, contacts and constraints."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

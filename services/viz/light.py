@@ -9,7 +9,7 @@ from congrasp.services.viz.triangles import Triangles
 
 
 class Lamps(NamedTuple):
-    """How finely a soft light is drawn."""
+    """Resolution of a soft light."""
 
     key: int
     """Lamps that stand for the key light."""

@@ -22,8 +22,8 @@ _AZIMUTHS, _ELEVATIONS = np.arange(0, 360, 30), (16, 28, 40)  # degrees, of the 
 _ASIDE = 75.0  # degrees between the two views of a picture
 _ROWS = 72  # of the pictures that cameras are compared by
 _CONTACT, _FINGER, _OBJECT, _BEHIND, _BEFORE = 2.0, 1.0, 1.0, 1.5, 0.8
-"""What the seen share of touching links, of all fingers and of the object counts, and a view along the forearm from
-behind it and from before the hand."""
+"""Weights of the seen shares of touching links, of all fingers and of the object, and of a view along the forearm from
+behind and from the front of the hand."""
 _FALL = 0.1  # how far the camera follows a falling object, m
 
 
@@ -97,7 +97,7 @@ class _Pictured:
         self._back = wrist.apply(back / np.linalg.norm(back))
 
     def score(self, view: View) -> float:
-        """How much of touching links, fingers and object a view shows, each from 0 to about 1."""
+        """Weighted shares of touching links, fingers and object that a view shows, each from 0 to about 1."""
         camera = fit(self._points, view.direction, 4 / 3)
         size = (_ROWS * 4 // 3, _ROWS)
         counts = _counts(self._shapes, camera, size)

@@ -76,7 +76,9 @@ def test_the_command_refuses_it_in_one_line(
     options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures"]
     assert load("grasp")([str(tmp_path / "block.stl"), *options, "--fingers", "thumb", "index"])() == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
-    assert line.startswith("congrasp: error: The policy does not support the constraint 'fingers'. It supports heading, ")
+    assert line.startswith(
+        "congrasp: error: The policy does not support the constraint 'fingers'. It supports heading, "
+    )
     assert not (tmp_path / "out" / "block" / RESULT).exists()
 
 

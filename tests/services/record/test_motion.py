@@ -114,7 +114,11 @@ def test_what_is_no_motion_is_named(tmp_path):
         ("time", lambda x: x[:3], r"table has shape \(12,\), but \(T,\) requires \(3,\)"),
         ("object_vertices", lambda x: x[:0], "object_vertices is empty"),
         ("object_faces", lambda x: x + 1000, "names vertices that do not exist"),
-        ("wrist_quaternion", lambda x: x[:, :3], r"wrist_quaternion has shape \(12, 3\), but \(T, 4\) requires \(12, 4\)"),
+        (
+            "wrist_quaternion",
+            lambda x: x[:, :3],
+            r"wrist_quaternion has shape \(12, 3\), but \(T, 4\) requires \(12, 4\)",
+        ),
     ],
 )
 def test_arrays_of_the_wrong_shape_are_named(tmp_path, name, change, message):
