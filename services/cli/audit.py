@@ -9,7 +9,7 @@ import tyro
 def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tuple[pathlib.Path, ...] = ()) -> int:
     """Compares the journals of a run's actors and of its learner: was every accepted rollout used once, and unchanged?
 
-    Exits with 1 if a rollout was lost, else with 5 if there is a surplus (one was used twice, or made by no actor), else
+    Exits with 1 if a rollout was lost, else with 5 for a surplus (a rollout used twice, or made by no actor), else
     with 6 if a rollout or a journal is damaged, else with 7 if something cannot be judged, for lines are missing.
 
     Args:
