@@ -241,9 +241,7 @@ class LearnerHub:
         charging = self._rate_limit.charging
         transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._reject)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
-        transport.serve(
-            below(self.keys.weights), self._on_weights, workers=4, depth=16, admission=self._reject_puller
-        )
+        transport.serve(below(self.keys.weights), self._on_weights, workers=4, depth=16, admission=self._reject_puller)
         transport.serve(
             self.keys.rollouts,
             charging(self._on_rollout),
