@@ -149,7 +149,7 @@ def test_an_error_is_the_last_line_of_a_log_in_json(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     line = json.loads(done.stdout)
     assert done.returncode == 2 and line["level"] == "error"
-    assert re.sub(r"Loading 'congrasp actor': \d+ s so far\.\n", "", done.stderr) == "",  "only a word while it loads"
+    assert re.sub(r"Loading 'congrasp actor': \d+ s so far\.\n", "", done.stderr) == "", "only a word while it loads"
     assert line["text"].startswith("'nonsense' is not an endpoint.")
 
 
