@@ -302,8 +302,8 @@ def _serve(queries: Any, server: _Server) -> None:
 
 def _answer(query: Any, key: str, server: _Server) -> Message | Future[Message]:
     """Returns the handler's reply to a query, unless it is rejected or damaged."""
-    if (turned_away := server.admission(key)) is not None:
-        return turned_away
+    if (rejected := server.admission(key)) is not None:
+        return rejected
     try:
         request = decode(query.payload.to_bytes() if query.payload else b"", max_bytes=server.max_message)
     except CongraspError as error:

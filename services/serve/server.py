@@ -95,7 +95,7 @@ class PolicyServer:
         )
         transport.serve(keys.health, self._describe)
         transport.serve(
-            below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._turn_away
+            below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._reject
         )  # one may infer while the other receives
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
@@ -132,7 +132,7 @@ class PolicyServer:
         self._batcher.close()
         self._follower.join(2 * _FOLLOW_SECONDS)
 
-    def _turn_away(self, key: str) -> None:
+    def _reject(self, key: str) -> None:
         """Refuses a query for which the queue has no room, before decoding it."""
         began = time.monotonic()
         try:

@@ -75,7 +75,7 @@ def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: 
         assert page.ask("GET", path)[0] == 404, path
 
 
-def test_other_sites_are_turned_away(page: Page) -> None:
+def test_other_sites_are_rejected(page: Page) -> None:
     assert page.ask("GET", "/api/state", Host="evil.example:80")[0] == 403
     assert page.ask("GET", "/api/state", Origin="http://evil.example")[0] == 403
     body = json.dumps({"action": "fill", "avoid": True}).encode()
