@@ -99,14 +99,13 @@ def read_hand(path: pathlib.Path) -> Hand:
     """Reads a hand file; see `hand_from_text`."""
     try:
         return hand_from_text(read_file(path, MAX_BYTES, _REMEDY).decode(), str(path))
-    except OSError as error:
-        raise CongraspError(f"The hand file {path} cannot be read: {error.strerror}.", _REMEDY) from None
     except UnicodeDecodeError:
         raise CongraspError(f"{path} is not JSON.", _REMEDY) from None
 
 
+@functools.cache
 def shipped_hand(name: str) -> Hand:
-    """Returns a hand of the package, which is referenced by its name."""
+    """Returns a hand of the package, which is referenced by its name; always the same object."""
     return dataclasses.replace(read_hand(_SHIPPED / f"{name}.json"), text="")
 
 
