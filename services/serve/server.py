@@ -30,8 +30,8 @@ DEPTH = 64
 """Limit of queued queries; further ones are refused at once."""
 SHARE = 16
 """Limit of queued queries of one peer."""
-TURN = BATCH_SIZES[1] - 1
-"""Limit of one peer's states in a batch while there are several peers: small enough for the others' control loops."""
+SHARED = BATCH_SIZES[1]
+"""Limit of a batch's states while several peers share it: small enough for their control loops."""
 _TIMEOUT, _MAX_TIMEOUT = 1.0, 60.0  # deadline of a query by default and at most, s
 _FOLLOW_SECONDS = 0.5
 
@@ -91,7 +91,7 @@ class PolicyServer:
             window=WINDOW,
             depth=DEPTH,
             share=SHARE,
-            parts=Parts(TURN, _cut, self._join),
+            parts=Parts(SHARED, _cut, self._join),
         )
         transport.serve(keys.health, self._describe)
         transport.serve(
