@@ -32,7 +32,7 @@ SHARE = 16
 """Limit of queued queries of one peer."""
 SHARED = BATCH_SIZES[1]
 """Limit of a batch's states while several peers share it: small enough for their control loops."""
-_MAX_TIMEOUT = 60.0
+_TIMEOUT, _MAX_TIMEOUT = 1.0, 60.0  # deadline of a query by default and at most, s
 _FOLLOW_SECONDS = 0.5
 
 
@@ -57,7 +57,6 @@ class PolicyServer:
         run: str,
         source: Source,
         *,
-        timeout: float = 1.0,
         on_answer: Callable[[str, float], None] = lambda outcome, seconds: None,
         on_batch: Callable[[int], None] = lambda size: None,
     ):
@@ -67,7 +66,6 @@ class PolicyServer:
           transport: endpoint of the server.
           run: name of the served run.
           source: source of policies.
-          timeout: default deadline of a query, s.
           on_answer: called with the outcome of every query (answered, refused, overloaded, late), and its duration.
           on_batch: called with the number of states of every batch.
 
@@ -78,7 +76,7 @@ class PolicyServer:
         first = source(-1)
         if first is None:
             raise CongraspError("There is no policy to serve yet.", "Start the server after the run has published one.")
-        self._source, self._timeout = source, timeout
+        self._source = source
         self._on_answer, self._on_batch = on_answer, on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
@@ -148,7 +146,7 @@ class PolicyServer:
         began = time.monotonic()
         try:
             query = self._function.layout.parse(request)
-            timeout = self._deadline(request.meta.get("timeout", self._timeout))
+            timeout = self._deadline(request.meta.get("timeout", _TIMEOUT))
             future = self._batcher.submit(query, timeout, peer=account(key))
         except CongraspError as error:
             self._count(error, began)
