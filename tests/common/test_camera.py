@@ -107,7 +107,7 @@ class Shown(NamedTuple):
 
 
 def test_images_come_at_their_rate_or_once():
-    """At 10 Hz in steps of 10 ms: two or three in 25 steps. Dropped points and the order leave points of the surface."""
+    """At 10 Hz in steps of 10 ms: two or three in 25 steps. Half of the points are dropped."""
     pose = jnp.tile(jnp.array([[0.0, 0.0, 0.05, 1.0, 0.0, 0.0, 0.0]]), (4, 1))
     points = jnp.repeat(cube(), 4, 0)
     still = jnp.zeros((4, 6)), jnp.full((4, 3), 3.0), pose[:, 3:]
