@@ -71,12 +71,11 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
 def open_run(run_dir: pathlib.Path) -> RunConfig:
     """Returns the configuration of a run directory; raises a CongraspError if it is not one, or the file is damaged."""
     path = run_dir / CONFIG_FILE
-    try:
-        text = read_file(path, _MAX_CONFIG)
-    except OSError:
+    if not path.exists():
         raise CongraspError(
             f"{run_dir} is not a run directory: it has no {CONFIG_FILE}.", "Pass one created by 'congrasp train'."
-        ) from None
+        )
+    text = read_file(path, _MAX_CONFIG)
     try:
         return run_config_from_json(text)
     except CongraspError as error:
@@ -130,7 +129,7 @@ def learner_url(run_dir: pathlib.Path) -> str:
     """Address of the learner of a run directory; empty if none is running."""
     try:
         return read_file(run_dir / _ENDPOINT_FILE, _MAX_ENDPOINT).decode(errors="replace")
-    except OSError:
+    except CongraspError:
         return ""
 
 

@@ -6,19 +6,17 @@ import pathlib
 from collections.abc import Callable
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.allegro import ALLEGRO
-from congrasp.common.hands.files import MAX_BYTES, hand_from_text, read_hand
+from congrasp.common.hands.files import MAX_BYTES, hand_from_text, read_hand, shipped_hand
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.left import left_hand, right_name
 from congrasp.common.hands.mano import own_mano_hand
-from congrasp.common.hands.sharpa import SHARPA
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import LONGEST_NAME
 
 HANDS: dict[str, Callable[[], Hand]] = {
     "human": lambda: HUMAN,
-    "allegro": lambda: ALLEGRO,
-    "sharpa": lambda: SHARPA,
+    "allegro": functools.partial(shipped_hand, "allegro"),
+    "sharpa": functools.partial(shipped_hand, "sharpa"),
     "mano": own_mano_hand,
 }
 """Makers of the hands; `mano` needs the user's own file."""

@@ -44,10 +44,9 @@ def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
 @functools.cache
 def table_of_gaps(hand: Hand) -> np.ndarray:
     """Gaps (S,) in metres at `CLOSURES`, made strictly decreasing where the hand's are not."""
-    # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
+    # In a separate thread nothing is being traced; inside a trace, there would be no numbers.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        q = thread.submit(lambda: closure_pose(hand, CLOSURES[:, None].astype(np.float32))).result()
-        gaps = np.asarray(thread.submit(lambda: jnp.min(_gaps(hand, _tips(hand, q)), -1)).result(), np.float64)
+        gaps = np.asarray(thread.submit(_least_gaps, hand, CLOSURES.astype(np.float32)).result(), np.float64)
     return np.minimum.accumulate(gaps) - 1e-6 * np.arange(len(gaps))
 
 
@@ -93,6 +92,12 @@ def _cost(hand: Hand, motors: Array) -> Array:
     missing = jnp.maximum(WIDEST * hand.object_scale - _gaps(hand, tips), 0.0)
     moved = (tips[1:] - tips[0]) - (open_tips[1:] - open_tips[0])
     return jnp.sum(missing**2) + _OFFSET * jnp.sum(moved[:, ::2] ** 2) + _TURN * jnp.sum((motors - started) ** 2)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _least_gaps(hand: Hand, closures: Array) -> Array:
+    """Gaps (S,) in m of a hand at closures (S,), compiled as one program."""
+    return jnp.min(_gaps(hand, _tips(hand, closure_pose(hand, closures[:, None]))), -1)
 
 
 def _tips(hand: Hand, q: Array) -> Array:

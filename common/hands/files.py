@@ -1,5 +1,17 @@
 """A hand as one JSON file with every field of `Hand`: written by `congrasp hands import`, editable by the user.
 
+The hands of the package are such files in `data/`. Their sources:
+
+* `human`: joint centres, axes and capsule radii are MyoHand's (Apache-2.0, MyoHub; OpenSim-derived); so are its limits,
+  widened where anatomy allows; phalanx masses of a mean adult hand.
+* `allegro`: the right Allegro hand V3 by the maker's published models (BSD-2, SimLab 2016), with the maker's boxes and
+  round fingertips as collision shapes and capsules of 23 mm for rewards and features. Gains of a PD controller that is
+  common for this hand. Wrist frame: origin at the palm's mounting end, fingers towards +z, closing side +x, index
+  finger on the side of +y; index and ring finger lean outwards by 5 degrees.
+* `sharpa`: the right Sharpa Wave hand by the maker's published models (Apache-2.0, Sharpa Group), without their joint
+  friction; capsules follow the published fits. Wrist frame: fingers towards +z, closing side +x, thumb and index finger
+  on the side of +y. Positive `fe` angles flex.
+
 Names of fields, units and frames are those of `common.hands.spec`. The file's text is part of the run's configuration,
 of policies and of recorded episodes.
 """
@@ -22,6 +34,7 @@ from congrasp.common.io.inputs import LONGEST_NAME, read_file
 FORMAT = 1
 MAX_BYTES = 1 << 20
 """Largest size of a hand file in bytes."""
+_SHIPPED = pathlib.Path(__file__).with_name("data")
 _LINKS, _JOINTS, _CAPSULES = 64, 64, 16  # limits for a hand, a hand and a link
 _LARGEST = 1e5  # bound of all numbers; the wrist of a real hand of 7 kg has a gain of 13,000
 _REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-hand.md."
@@ -86,10 +99,14 @@ def read_hand(path: pathlib.Path) -> Hand:
     """Reads a hand file; see `hand_from_text`."""
     try:
         return hand_from_text(read_file(path, MAX_BYTES, _REMEDY).decode(), str(path))
-    except OSError as error:
-        raise CongraspError(f"The hand file {path} cannot be read: {error.strerror}.", _REMEDY) from None
     except UnicodeDecodeError:
         raise CongraspError(f"{path} is not JSON.", _REMEDY) from None
+
+
+@functools.cache
+def shipped_hand(name: str) -> Hand:
+    """Returns a hand of the package, which is referenced by its name; always the same object."""
+    return dataclasses.replace(read_hand(_SHIPPED / f"{name}.json"), text="")
 
 
 def faults(hand: Hand) -> list[str]:

@@ -12,8 +12,8 @@ import pathlib
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.human import FINGER_GAINS, WRIST
-from congrasp.common.hands.spec import Capsule, Hand, Joint, Link, chain, vector
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.spec import Capsule, Hand, Link, chain, vector
 from congrasp.common.io.pickles import read_pickle
 
 VARIABLE = "CONGRASP_MANO"
@@ -129,7 +129,14 @@ def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
         points = [vector(point) for point in (*anchors[i], end)]
         limits = _THUMB_LIMITS if finger == "thumb" else _LIMITS
         moved = [
-            Joint(f"{finger}_{name}", vector(axis), points[bone], *np.radians(limits[name]).tolist(), **FINGER_GAINS)
+            dataclasses.replace(
+                HUMAN.joints[0],
+                name=f"{finger}_{name}",
+                axis=vector(axis),
+                anchor=points[bone],
+                lower=float(np.radians(limits[name][0])),
+                upper=float(np.radians(limits[name][1])),
+            )
             for name, bone, axis in zip(limits, (0, 0, 1, 2), (*axes[i, 0, 1:], *axes[i, 1:, 2]), strict=True)
         ]
         names = ("metacarpal", "proximal", "distal") if finger == "thumb" else ("proximal", "middle", "distal")
@@ -155,7 +162,7 @@ def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
             "thumb_ip_flexion": 0.90,
             **_each(mcp_flexion=1.35, pip=1.2, dip=1.2),
         },
-        wrist=WRIST,
+        wrist=HUMAN.wrist,
     )
 
 

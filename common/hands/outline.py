@@ -37,8 +37,8 @@ def outline(hand: Hand) -> Outline:
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
     # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
     with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        q = thread.submit(closure_pose, hand, CLOSURES[:, None].astype(np.float32)).result()
-        ends, center = (np.asarray(part, np.float64) for part in thread.submit(_posed, hand, q).result())
+        posed = thread.submit(_posed, hand, CLOSURES.astype(np.float32)).result()
+    ends, center = (np.asarray(part, np.float64) for part in posed)
     radii = np.repeat(hand.capsule_radii, 2).astype(np.float64)
     return Outline((ends - center[:, None]) @ axes.T, radii, table_of_gaps(hand))
 
@@ -54,8 +54,8 @@ def depth_below(outline: Outline, up: np.ndarray) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _posed(hand: Hand, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Ends (S, E, 3) of the hand's capsules at finger angles (S, F), and its centres (S, 3), in the wrist frame."""
-    transforms = kinematics.link_transforms(hand, q)
+def _posed(hand: Hand, closures: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Ends (S, E, 3) of the hand's capsules at closures (S,), and its centres (S, 3), in the wrist frame."""
+    transforms = kinematics.link_transforms(hand, closure_pose(hand, closures[:, None]))
     ends = kinematics.capsules(hand, transforms)
     return ends.reshape(*ends.shape[:-3], -1, 3), kinematics.hand_center(hand, kinematics.keypoints(hand, transforms))

@@ -14,10 +14,10 @@ from congrasp.common.wire.codec import Message, decode, encode
 
 @functools.cache
 def source_digest(*packages: ModuleType) -> str:
-    """Returns sixteen hex digits of all source in these packages, which invalidate cache entries when it changes."""
+    """Returns sixteen hex digits of all source and data in these packages; a change invalidates cache entries."""
     digest = hashlib.sha256()
     for folder in (folder for package in packages for folder in package.__path__):
-        for file in sorted(pathlib.Path(folder).rglob("*.py")):
+        for file in sorted(file for kind in ("*.py", "*.json") for file in pathlib.Path(folder).rglob(kind)):
             digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -41,18 +41,25 @@ def read_file(path: pathlib.Path, largest: int, remedy: str = "") -> bytes:
       remedy: remedy for the error message.
 
     Raises:
-      CongraspError: it is larger, or not a regular file (a pipe would block).
-      OSError: it cannot be read.
+      CongraspError: it cannot be read, is larger, or is not a regular file (a pipe would block).
     """
-    with open_file(path, remedy) as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > largest:
-            raise CongraspError(f"{path} has {size} bytes; the limit is {largest}.", remedy)
-        return file.read(size)
+    try:
+        with open_file(path, remedy) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > largest:
+                raise CongraspError(f"{path} has {size} bytes; the limit is {largest}.", remedy)
+            return file.read(size)
+    except OSError as error:
+        raise CongraspError(f"{path} cannot be read: {error.strerror}.", remedy) from None
 
 
 def open_file(path: pathlib.Path, remedy: str = "") -> BinaryIO:
-    """Opens a regular file for reading without blocking; raises like `read_file`."""
+    """Opens a regular file for reading without blocking.
+
+    Raises:
+      CongraspError: it is not a regular file.
+      OSError: it cannot be opened.
+    """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return os.fdopen(descriptor, "rb")

@@ -44,11 +44,7 @@ def read_pickle(path: pathlib.Path) -> dict[str, np.ndarray]:
     Raises:
       CongraspError: the file is missing, is not a pickle of arrays, or exceeds the limits above.
     """
-    try:
-        data = read_file(path, MAX_BYTES, _REMEDY)
-    except OSError as error:
-        raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
-    return read_pickles([(str(path), data)])[0]
+    return read_pickles([(str(path), read_file(path, MAX_BYTES, _REMEDY))])[0]
 
 
 def read_pickles(pickles: Iterable[tuple[str, bytes]]) -> list[dict[str, np.ndarray]]:

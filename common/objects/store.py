@@ -49,9 +49,10 @@ def load(path: str | os.PathLike[str]) -> GraspObject:
         raise CongraspError(
             f"There is no object file {path}.", "'congrasp objects list' shows the content of a folder."
         )
+    data = read_file(path, MAX_BYTES, remedy)
     try:
-        message = decode(read_file(path, MAX_BYTES))
-    except (CongraspError, OSError) as error:
+        message = decode(data)
+    except CongraspError as error:
         raise CongraspError(f"{path} cannot be read as an object: {error}", remedy) from None
     if message.meta.get("kind") != "object" or message.meta.get("format") != _FORMAT:
         raise CongraspError(f"{path} is not an object of this version of congrasp.", remedy)

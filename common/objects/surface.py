@@ -57,7 +57,6 @@ def sample_mesh(
     rng: np.random.Generator,
     *,
     oriented: bool,
-    count: int = SURFACE_POINTS,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples points on the part of a mesh that a finger can reach.
 
@@ -70,12 +69,11 @@ def sample_mesh(
       rng: generator for the start of the low-discrepancy sequence.
       oriented: True if all triangles have outward normals; otherwise, normals that point into the pieces while the
         other side is free are flipped.
-      count: number of points N.
 
     Returns:
       Points (N, 3), outward unit normals (N, 3), and indices (N,) of each point's triangle.
     """
-    points, normals, face = shapes.on_triangles(triangles, _sequence(rng.random(4), 0, 8 * count))
+    points, normals, face = shapes.on_triangles(triangles, _sequence(rng.random(4), 0, 8 * SURFACE_POINTS))
     outer, inner = (
         np.any([shapes.contains(piece, points + side * _REACHABLE * normals) for piece in pieces], axis=0)
         for side in (1, -1)
@@ -87,7 +85,7 @@ def sample_mesh(
         normals = np.where((outer & ~inner)[:, None], -normals, normals)
     if reachable.mean() < 0.25:
         reachable[:] = True
-    chosen = np.flatnonzero(reachable)[:count]
+    chosen = np.flatnonzero(reachable)[:SURFACE_POINTS]
     return points[chosen], normals[chosen], face[chosen]
 
 

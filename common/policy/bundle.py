@@ -219,11 +219,7 @@ def save(bundle: PolicyBundle, path: pathlib.Path) -> None:
 
 def load(path: pathlib.Path) -> PolicyBundle:
     """Reads a bundle from a file; errors name it."""
-    try:
-        data = read_file(path, MAX_MESSAGE, _REMEDY)
-    except OSError as error:
-        remedy = "Pass a policy file (policy.safetensors in a run's folder)."
-        raise CongraspError(f"The policy {path} cannot be read: {error.strerror}.", remedy) from None
+    data = read_file(path, MAX_MESSAGE, "Pass a policy file (policy.safetensors in a run's folder).")
     try:
         message = decode(data)
     except CongraspError as error:

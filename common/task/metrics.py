@@ -11,7 +11,7 @@ from congrasp.common.task.reward import terms
 from congrasp.common.task.types import Array
 
 FORCES = ("force_sum", "force_link_max")
-DIVERGED = "bad"  # name of the metric on the wire and in recordings
+DIVERGED = "diverged"
 
 
 def metric_names(task: TaskConfig) -> tuple[str, ...]:

@@ -139,6 +139,8 @@ class Transport(Protocol):
         """Closes all declarations; may be called repeatedly."""
         ...
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(self, *exception: object) -> None: ...
+    def __exit__(self, *exception: object) -> None:
+        self.close()

@@ -12,10 +12,10 @@ import time
 import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError, error_of
-from congrasp.common.transport.base import Admission, Answerer, Damage, Subscription, join
+from congrasp.common.transport.base import Admission, Answerer, Damage, Subscription, Transport, join
 from congrasp.common.transport.keys import matches
 from congrasp.common.wire.codec import Message
 
@@ -60,7 +60,7 @@ class MemoryHub:
                 watcher.changes.put((key, alive))
 
 
-class MemoryTransport:
+class MemoryTransport(Transport):
     """A `Transport` between the endpoints of a hub."""
 
     def __init__(self, hub: MemoryHub, on_close: Callable[[], None] = lambda: None):
@@ -175,12 +175,6 @@ class MemoryTransport:
         for subscription in self._subscriptions:
             subscription.close()
         join(self._threads, time.monotonic() + _GRACE)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _check_open(self) -> None:
         """Raises a `TransportError` if the endpoint is closed."""

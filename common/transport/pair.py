@@ -1,13 +1,13 @@
 """Two transports combined, for a learner with an actor in its process."""
 
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any
 
 from congrasp.common.transport.base import Answerer, Subscription, Transport
 from congrasp.common.wire.codec import Message
 
 
-class PairTransport:
+class PairTransport(Transport):
     """Serves, publishes and declares tokens on two transports of the caller; queries and subscribes on the first."""
 
     def __init__(self, first: Transport, second: Transport):
@@ -44,9 +44,3 @@ class PairTransport:
 
     def close(self) -> None:
         """Does nothing: both transports belong to the caller."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()

@@ -6,6 +6,7 @@ congestion control of the query, which every process here overwrites on arrival.
 """
 
 import contextlib
+import functools
 import json
 import logging
 import re
@@ -80,12 +81,20 @@ def configuration(
     return config
 
 
+@functools.cache
 def _open_files() -> int:
-    """Files that this process may have open; raises the limit to `_FILES` where the system allows it."""
+    """Files that this process may have open; raises the limit to `_FILES` where the system allows it, else warns."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = _FILES if hard == resource.RLIM_INFINITY else min(hard, _FILES)
     if soft != resource.RLIM_INFINITY and soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+    if most < _FILES:
+        _log.warning(
+            "This process may open %d files: as many silent connections keep new peers out. Raise the hard limit to %d "
+            "(ulimit -n, LimitNOFILE=).",
+            most,
+            _FILES,
+        )
     return most
 
 

@@ -18,14 +18,14 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import zenoh
 from zenoh.handlers import FifoChannel
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError, error_of
 from congrasp.common.transport import pieces, zenoh_session
-from congrasp.common.transport.base import Admission, Answerer, Damage, Subscription
+from congrasp.common.transport.base import Admission, Answerer, Damage, Subscription, Transport
 from congrasp.common.transport.keys import FLOWS, Flow, account, flow
 from congrasp.common.transport.pieces import Outbox, Pace
 from congrasp.common.transport.ports import shifted
@@ -48,7 +48,7 @@ class _Reply(NamedTuple):
     """Attachment of the first chunk of a longer reply; empty for a complete one."""
 
 
-class ZenohTransport:
+class ZenohTransport(Transport):
     """A `Transport` over Zenoh sessions."""
 
     def __init__(
@@ -246,12 +246,6 @@ class ZenohTransport:
         """See `Transport.close`; takes at most two seconds."""
         self._finalizer()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
     def _session(self, key: str) -> zenoh.Session:
         """Returns the session of a key's flow."""
         session = self._sessions.get(flow(key))
@@ -308,8 +302,8 @@ def _serve(queries: Any, server: _Server) -> None:
 
 def _answer(query: Any, key: str, server: _Server) -> Message | Future[Message]:
     """Returns the handler's reply to a query, unless it is rejected or damaged."""
-    if (turned_away := server.admission(key)) is not None:
-        return turned_away
+    if (rejected := server.admission(key)) is not None:
+        return rejected
     try:
         request = decode(query.payload.to_bytes() if query.payload else b"", max_bytes=server.max_message)
     except CongraspError as error:

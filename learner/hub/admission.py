@@ -51,7 +51,7 @@ class Admission:
         self._lock = threading.Lock()
         self._put_off = PutOff()
         self._refused: collections.Counter[str] = collections.Counter()
-        self.turned_away = 0
+        self.rejected = 0
         """Number of requests of deferred actors."""
 
     def check(self, message: Message) -> None:
@@ -95,11 +95,11 @@ class Admission:
             if actor in self._refused or len(self._refused) < _NAMES:
                 self._refused[actor] += 1
 
-    def turn_away(self, actor: str) -> float:
+    def retry_after(self, actor: str) -> float:
         """Seconds until the actor may send again, usually 0; counts earlier requests."""
         with self._lock:
             seconds = self._put_off.seconds(actor)
-            self.turned_away += seconds > 0
+            self.rejected += seconds > 0
             return seconds
 
     def counts(self, actor: str) -> dict[str, int]:

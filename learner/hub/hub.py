@@ -199,7 +199,7 @@ class LearnerHub:
                 "counters": self._staleness.counters()
                 | {
                     "missing": self._sequences.missing,
-                    "turned_away": self._rate_limit.turned_away + self._admission.turned_away,
+                    "rejected": self._rate_limit.rejected + self._admission.rejected,
                 },
             }
 
@@ -239,18 +239,16 @@ class LearnerHub:
         transport = self._transport
         transport.serve(self.keys.config, self._on_config)
         charging = self._rate_limit.charging
-        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._turn_away)
+        transport.serve(self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._reject)
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
-        transport.serve(
-            below(self.keys.weights), self._on_weights, workers=4, depth=16, admission=self._turn_away_puller
-        )
+        transport.serve(below(self.keys.weights), self._on_weights, workers=4, depth=16, admission=self._reject_puller)
         transport.serve(
             self.keys.rollouts,
             charging(self._on_rollout),
             workers=2,
             depth=8,
             on_damage=self._on_damage,
-            admission=self._turn_away,
+            admission=self._reject,
         )
         transport.watch_alive(self.keys.everyone, self._on_alive)
         transport.declare_alive(self.keys.alive("learner", self._name, self.session_id))
@@ -416,9 +414,9 @@ class LearnerHub:
         actors = ", ".join(sorted({header.actor for header in stale}))
         self._event("warning", f"Dropped as too old at version {self._staleness.version}: {len(stale)} of {actors}.")
 
-    def _turn_away(self, key: str) -> Message | None:
+    def _reject(self, key: str) -> Message | None:
         """Returns the reply to a deferred or rate-limited actor, before its request is decoded; None for others."""
-        if seconds := self._admission.turn_away(_sender(key)):
+        if seconds := self._admission.retry_after(_sender(key)):
             retry = self._answer("retry", why="A rollout of yours was refused: try again later.")
             return Message(meta={**retry.meta, "granted": False, "retry_after": seconds})
         if self._rate_limit.admits(key):
@@ -427,7 +425,7 @@ class LearnerHub:
         retry = self._answer("retry", why="Too many of your requests were useless.")
         return Message(meta={**retry.meta, "granted": False})
 
-    def _turn_away_puller(self, key: str) -> Message | None:
+    def _reject_puller(self, key: str) -> Message | None:
         """Returns the reply to a peer beyond the rate limit of weights; None for others, which are charged."""
         if not self._pull_limit.admits(key):
             return Message(meta=self._state())

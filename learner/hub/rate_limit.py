@@ -44,14 +44,14 @@ class RateLimit:
         self._clock = clock
         self._lock = threading.Lock()
         self._levels: collections.OrderedDict[str, tuple[float, float]] = collections.OrderedDict()
-        self.turned_away = 0
+        self.rejected = 0
         """Number of requests with an empty bucket."""
 
     def admits(self, key: str) -> bool:
         """True if a request under an actor's key may be processed; counts it otherwise."""
         with self._lock:
             fine = self._level(_account(key)) > 0
-            self.turned_away += not fine
+            self.rejected += not fine
             return fine
 
     def charge(self, key: str, size: int) -> None:

@@ -94,7 +94,7 @@ class WriteAheadLog:
                 header = validate_rollout(message, form, schema=schema)
                 if (*header.owner, header.sequence) != identity:
                     raise CongraspError("The file's name belongs to another rollout.")
-            except (CongraspError, OSError):
+            except CongraspError:
                 set_aside(path)
                 found.damaged.append(identity)
                 continue

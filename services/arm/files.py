@@ -15,7 +15,7 @@ from congrasp.services.assets.hands.geometry import geom_mesh
 from congrasp.services.viz.episode import episode_shapes
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.scene import Camera, Shape
-from congrasp.services.viz.shapes import fit, shape_points
+from congrasp.services.viz.shapes import fit, object_shape, shape_points
 from congrasp.services.viz.sheets import save_png
 
 if TYPE_CHECKING:
@@ -98,15 +98,7 @@ def _arm_shapes(motion: "ArmMotion", step: int) -> list[Shape]:
         turn = base.rotation * Rotation.from_matrix(data.geom_xmat[g].reshape(3, 3))
         material = robot.model.geom_matid[g]
         red, green, blue, _ = (robot.model.mat_rgba[material] if material >= 0 else robot.model.geom_rgba[g]).tolist()
-        shapes.append(
-            Shape(
-                "mesh",
-                (0, 0),
-                (red, green, blue),
-                base.rotation.apply(data.geom_xpos[g]) + base.position,
-                turn.as_quat(scalar_first=True),
-                vertices=np.asarray(mesh.vertices),
-                faces=np.asarray(mesh.faces),
-            )
-        )
+        place, quaternion = base.rotation.apply(data.geom_xpos[g]) + base.position, turn.as_quat(scalar_first=True)
+        both = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        shapes.append(object_shape(both, place, quaternion, colour=(red, green, blue)))
     return shapes

@@ -50,8 +50,8 @@ COMMANDS = {
 
 _READ = {".obj", ".stl", ".ply", ".glb", ".npz", ".csv", ".bvh", ".mcap", ".safetensors", ".urdf", ".xml"}
 """Endings of files that commands read."""
-_WRITTEN = ("--out", "--json", "--png", "--video", "--pictures")
-"""Options that name what a command writes."""
+_WRITTEN = ("--out", "--json", "--png", "--video", "--pictures", "--references")
+"""Options that name what a command writes, or creates if it is absent."""
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
 """Raised when the reader of the output is gone, as with `congrasp … | head`."""

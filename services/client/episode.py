@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -71,12 +71,6 @@ class EpisodePolicy(Policy):
 
     def close(self) -> None:
         """See `Policy.close`."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _resting(self, state: State) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Returns the resting pose with this reading, if the policy uses the mean, and the number of readings."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -47,12 +47,6 @@ class LeftPolicy(Policy):
     def close(self) -> None:
         """See `Policy.close`."""
         self._right.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
 
 def mirrored_request(request: GraspRequest) -> GraspRequest:

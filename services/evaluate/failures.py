@@ -18,7 +18,7 @@ _PUSHED = 0.05  # tolerated displacement of an object before the table is remove
 def cause(episode: Message, drop_height: float) -> str:
     """Cause of an episode's end with the object `drop_height` (m) or more below its initial height, or `held`."""
     metrics = episode.meta["metrics"]
-    if metrics["bad"]:
+    if metrics.get("diverged"):
         return "the physics diverged"
     if metrics["held"]:
         return "held"

@@ -30,10 +30,6 @@ _HEADINGS = {
     "center": "headings with the hand's centre above the table",
 }
 _TRACKER_UNITS = {"period": "s", "delay": "s", "position_noise": "m", "rotation_noise": "rad", "dropout": ""}
-_CITATION = """@article{congraspxl,
-  title  = {ConGraspXL: Controllable Constraint-Conditioned Dexterous Grasping Motion Synthesis},
-  author = {Zhang, Hui and Meboldt, Mirko and Song, Jie}
-}"""
 
 
 def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
@@ -44,30 +40,18 @@ def model_card(policy: PolicyBundle, rows: Sequence[Row]) -> Mapping[str, Any]:
       rows: rows of its evaluation.
 
     Returns:
-      `uses`: sentences; `commands`: examples of use; `data`: sentences; `limits`: sentences, those from the rows first;
-        `licence`; `citation`: BibTeX of the method.
+      `hand`; `constraints`: names; `data`: sentences; `limits`: sentences, those from the rows first. The rest
+        of a card is the same for all policies.
     """
-    hand = policy.spec.hand_name
     return {
-        "uses": (
-            f"Grasps of rigid objects with the {hand} hand in simulation, under any combination of its constraints: "
-            f"{', '.join(policy.task.constraints)}. Motions for animation, demonstrations and references for learning, "
-            "comparison with other methods.",
-        ),
-        "commands": (
-            "congrasp grasp examples/mug.obj --video --policy FILE",
-            "congrasp serve --policy FILE",
-            "congrasp export policy --policy FILE --to onnx",
-        ),
+        "hand": policy.spec.hand_name,
+        "constraints": policy.task.constraints,
         "data": (
             "It was trained by reinforcement learning in simulation. Objects are procedural, or those of the "
             "run's folder; constraints are sampled, or those of the run's constraint sets.",
             _trained(policy.task),
         ),
         "limits": (*limits(rows), _SIMULATED, _observed(policy.task), _MET),
-        "licence": "The software and its policies: Apache-2.0. A policy that you train is yours, within "
-        "the licences of the meshes, hands and captured grasps of its training.",
-        "citation": _CITATION,
     }
 
 

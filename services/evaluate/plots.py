@@ -41,8 +41,6 @@ def plot_evaluation(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str
         figures = {"table": _table(rows), "success": _success(rows)}
         if any(row.get("quantiles") for row in rows):
             figures["errors"] = _errors(rows)
-    except OSError as error:
-        raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
     except (CongraspError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise CongraspError(
             f"{path} is not the result of an evaluation ({type(error).__name__}: {error}).",

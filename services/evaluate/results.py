@@ -66,10 +66,8 @@ def read_results(file: pathlib.Path) -> Results:
     """
     remedy = "Run the command that wrote it again."
     try:
-        about = read_json(file, _LARGEST)
+        about = read_json(file, _LARGEST, remedy)
         rows = [Row.from_json(row) for row in about.pop("rows")]
-    except OSError as error:
-        raise CongraspError(f"{file} cannot be read: {error.strerror}.", remedy) from None
     except (LookupError, TypeError, AttributeError):
         raise CongraspError(f"{file} is not a file of results of this version.", remedy) from None
     if missing := {"policies", "command", "machine", "version", "objects", "physics", "heading_rules"} - about.keys():

@@ -207,7 +207,7 @@ def summarise(
         forces=_forces(sample.where(success)),
         episode_return=float(values["return"].mean()),
         links_at_removal=float(values["links_at_removal"].mean()),
-        diverged=float((values["bad"] > 0).mean()),
+        diverged=float((values["diverged"] > 0).mean()),
         paper=paper_row(paper, hand, method, constraint, group),
         plausibility=_plausibility(values, held_2s),
         margins={name: NORMAL_95 * standard_error(error) for name, error in reached.items() if len(error) > 1},

@@ -189,5 +189,5 @@ def _read(path: pathlib.Path, about: dict[str, Any]) -> _Result | None:
         values = {name.removeprefix("values/"): x for name, x in arrays.items() if name.startswith("values/")}
         sample = Sample(values, arrays["link_force"], arrays["torque"])
         return _Result(sample, meta["names"], arrays["traits"], meta["families"], meta["left_out"])
-    except (OSError, LookupError, CongraspError):
+    except (LookupError, CongraspError):
         return None

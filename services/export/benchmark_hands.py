@@ -7,9 +7,11 @@ recognised by these, not by names: it is the benchmark's if its joints are at th
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+import json
+import pathlib
 from typing import Literal, NamedTuple
 
+import dacite
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -24,7 +26,8 @@ PLACES_MM = 0.1
 _FACING = 1e-3  # tolerance of an axis's direction, rad
 
 
-class Shape(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Shape:
     """A collision shape of a benchmark's hand, in the palm's frame at zero."""
 
     joint: str
@@ -38,7 +41,8 @@ class Shape(NamedTuple):
     """(4,) w x y z, its frame to the palm's."""
 
 
-class BenchmarkHand(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class BenchmarkHand:
     """A hand of F joints in the benchmark's order."""
 
     fingers: dict[str, tuple[Row, ...]]
@@ -73,119 +77,11 @@ class BenchmarkHand(NamedTuple):
         return np.array([*itertools.chain(*self.fingers.values())]).reshape(-1, 2, 3)
 
 
-def _straight(x: float, z: float, side: int) -> tuple[Row, ...]:
-    """A finger of the Shadow hand along z, that spreads about y and bends about x."""
-    return (
-        (x, 0, z, 0, side, 0),
-        (x, 0, z, 1, 0, 0),
-        (x, 0, z + 0.045, 1, 0, 0),
-        (x, 0, z + 0.070, 1, 0, 0),
-    )
-
-
-def _phalanges(
-    finger: str,
-    rows: tuple[Row, ...],
-    quaternion: tuple[float, ...],
-    boxes: Sequence[tuple[Vector, Vector]],
-    tip: float,
-) -> tuple[Shape, ...]:
-    """An Allegro finger: a box on each joint, half extents and place in the finger's frame, and a capsule at the tip.
-
-    Args:
-      finger: its joints' name.
-      rows: of its joints.
-      quaternion: (w, x, y, z) of the finger's frame, whose z axis is along it, in the palm's.
-      boxes: for each joint.
-      tip: m from the last joint to the capsule's middle.
-    """
-    turn, found = Rotation.from_quat(quaternion, scalar_first=True), []
-    for i, (row, (size, place)) in enumerate(zip(rows, boxes, strict=True)):
-        found.append(Shape(f"{finger}{i}", "box", size, tuple(row[:3] + turn.apply(place)), quaternion))
-    end = tuple(rows[-1][:3] + turn.apply((0, 0, tip)))
-    return (*found, Shape(f"{finger}3", "capsule", (_TIP, _TIP_HALF[tip], 0.0), end, quaternion))
-
-
-def _upright(length: float) -> tuple[Vector, Vector]:
-    """Half extents and place of the box of an Allegro phalanx of a length in metres."""
-    return (0.0098, 0.01375, length / 2), (0.0, 0.0, length / 2)
-
-
-_TIP, _TIP_HALF = 0.012, {0.019: 0.01, 0.035: 0.008}  # m, radius of Allegro's fingertips, half length by their place
-_S, _C = 0.0871558, 0.9961947  # of the 5 degrees by which Allegro's outer fingers lean
-_H = np.sqrt(0.5)
-_ALLEGRO: dict[str, tuple[Row, ...]] = {
-    "ffj": (
-        (0, 0.0435, -0.001542, 0, _S, _C),
-        (0, 0.0449294, 0.0147956, 0, _C, -_S),
-        (0, 0.0496358, 0.0685901, 0, _C, -_S),
-        (0, 0.0529825, 0.1068440, 0, _C, -_S),
-    ),
-    "mfj": (
-        (0, 0, 0.0007, 0, 0, 1),
-        (0, 0, 0.0171, 0, 1, 0),
-        (0, 0, 0.0711, 0, 1, 0),
-        (0, 0, 0.1095, 0, 1, 0),
-    ),
-    "rfj": (
-        (0, -0.0435, -0.001542, 0, -_S, _C),
-        (0, -0.0449294, 0.0147956, 0, _C, _S),
-        (0, -0.0496358, 0.0685901, 0, _C, _S),
-        (0, -0.0529825, 0.1068440, 0, _C, _S),
-    ),
-    "thj": (
-        (-0.0182, 0.019333, -0.045987, 0, -_S, -_C),
-        (-0.0132, 0.0567279, -0.0763618, 0, _C, -_S),
-        (-0.0132, 0.0743606, -0.0779045, 1, 0, 0),
-        (-0.0132, 0.1255650, -0.0823844, 1, 0, 0),
-    ),
-}
-_FINGER = [_upright(length) for length in (0.0164, 0.054, 0.0384, 0.016)]
-_THUMB = [
-    ((0.0179, 0.017, 0.02275), (-0.0179, 0.009, 0.0145)),
-    *(_upright(length) for length in (0.0177, 0.0514, 0.0314)),
-]
-_LEAN = (0.9990482, 0.0436194)
 BENCHMARK_HANDS = {
-    "allegro": BenchmarkHand(
-        fingers=_ALLEGRO,
-        from_tip=False,
-        position=(0.0, 0.0, 0.0),
-        quaternion=(0.0, _H, 0.0, _H),
-        kp=5.0,
-        damping=0.1,
-        torque_limit=100.0,
-        shapes=(
-            Shape("", "box", (0.0204, 0.0565, 0.0475), (-0.0093, 0.0, -0.0475), (1.0, 0.0, 0.0, 0.0)),
-            *_phalanges("ffj", _ALLEGRO["ffj"], (_LEAN[0], -_LEAN[1], 0.0, 0.0), _FINGER, 0.019),
-            *_phalanges("mfj", _ALLEGRO["mfj"], (1.0, 0.0, 0.0, 0.0), _FINGER, 0.019),
-            *_phalanges("rfj", _ALLEGRO["rfj"], (_LEAN[0], _LEAN[1], 0.0, 0.0), _FINGER, 0.019),
-            *_phalanges("thj", _ALLEGRO["thj"], (0.477714, -0.521334, -0.521334, -0.477714), _THUMB, 0.035),
-        ),
-    ),
-    "shadow": BenchmarkHand(
-        fingers={
-            "rh_FFJ": _straight(0.033, 0.095, -1),
-            "rh_MFJ": _straight(0.011, 0.099, -1),
-            "rh_RFJ": _straight(-0.011, 0.095, 1),
-            "rh_LFJ": ((-0.033, 0, 0.02071, 0.5735764, 0, 0.8191520), *_straight(-0.033, 0.0865, 1)),
-            "rh_THJ": (
-                (0.034, -0.00858, 0.029, -_H, 0, -_H),
-                (0.034, -0.00858, 0.029, _H, 0, -_H),
-                (0.0608701, -0.00858, 0.0558701, _H, 0, -_H),
-                (0.0608701, -0.00858, 0.0558701, 0, -1, 0),
-                (0.0834975, -0.00858, 0.0784975, 0, -1, 0),
-            ),
-        },
-        from_tip=True,
-        position=(0.0, 0.0, 0.034),
-        quaternion=(1.0, 0.0, 0.0, 0.0),
-        kp=5.0,
-        damping=0.05,
-        torque_limit=3.0,
-    ),
+    name: dacite.from_dict(BenchmarkHand, fields, dacite.Config(cast=[tuple]))
+    for name, fields in json.loads(pathlib.Path(__file__).with_suffix(".json").read_text()).items()
 }
-"""By the benchmark's names. Allegro's motors have no limit there; 100 N.m is beyond what anything asks of them."""
+"""The benchmark's hands by its names for them."""
 
 
 class Match(NamedTuple):

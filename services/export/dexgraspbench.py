@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from congrasp.actors.physics.scene import compile_scene
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand, own_hands
-from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
@@ -27,6 +26,7 @@ from congrasp.common.io.inputs import file_name
 from congrasp.common.io.npz import read_npz
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.config import TaskConfig
+from congrasp.services.assets.hands.kinematics import posed
 from congrasp.services.export.benchmark_hands import Match, benchmarked, match_hand
 from congrasp.services.export.benchmark_objects import convex_object, write_object
 from congrasp.services.export.frames import TOLERANCE_MM
@@ -249,7 +249,7 @@ def error_mm(grasp: Grasp, arrays: dict[str, np.ndarray]) -> float:
     worst = 0.0
     for name in ("pregrasp", "grasp"):
         state, order = grasp.states[name], grasp.match.order
-        data = _posed(grasp.hand, state.q)
+        data = posed(grasp.hand, state.q)
         joints = [data.joint(joint.name) for joint in grasp.hand.joints]
         bodies = [data.body(grasp.hand.links[link].name) for link in grasp.hand.joint_links]
         anchors, turns = grasp.match.joint_frames(arrays[f"{name}_qpos"])
@@ -315,16 +315,3 @@ def _last_clear(hand: Hand, obj: GraspObject, motion: GraspMotion, last: int) ->
         if gap >= CLEARANCE:
             break
     return best, float(farthest)
-
-
-def _posed(hand: Hand, q: np.ndarray) -> mujoco.MjData:
-    """The hand's bodies in MuJoCo with the wrist at the world's origin."""
-    spec = mujoco.MjSpec()
-    spec.compiler.degree = False
-    add_hand(spec, hand)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    for joint, angle in zip(hand.joints, q, strict=True):
-        data.qpos[model.joint(joint.name).qposadr[0]] = angle
-    mujoco.mj_kinematics(model, data)
-    return data

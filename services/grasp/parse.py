@@ -310,8 +310,6 @@ def _json(path: pathlib.Path, name: str, keys: tuple[str, ...]) -> dict[str, Any
     remedy = f"Write a JSON file with {', '.join(keys)}, or name a motion (.npz) or a constraint set."
     try:
         given = read_json(path, _LARGEST, remedy)
-    except OSError as error:
-        raise CongraspError(f"{name}: {path} cannot be read: {error.strerror}.", remedy) from None
     except CongraspError as error:
         raise CongraspError(f"{name}: {error}") from None
     for key in keys:

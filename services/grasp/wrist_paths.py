@@ -19,7 +19,7 @@ _LARGEST, _DEEPEST = 32 << 20, 200
 """Bytes of a BVH or CSV file, and joints of a BVH chain."""
 HUGE = 1e9
 """No angle, place or part of a quaternion is as large."""
-_UP = {"y": Rotation.from_euler("X", 90, degrees=True), "z": Rotation.identity()}
+_FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
     f"{sign}{axis}": s * row for axis, row in zip("xyz", np.eye(3), strict=True) for sign, s in (("+", 1), ("-", -1))
 }
@@ -40,8 +40,6 @@ def read_wrist_path(
     path: pathlib.Path,
     *,
     joint: str = "RightHand",
-    unit: float = 0.01,
-    up: str = "y",
     fingers: str = "-y",
     back: str = "+z",
 ) -> WristPath:
@@ -51,8 +49,6 @@ def read_wrist_path(
       path: `.csv`, a line a frame: x, y, z (m) and a quaternion w, x, y, z; `.npz` with `position` (T, 3) and
         `quaternion` (T, 4), or a grasp motion; or `.bvh`.
       joint: of a BVH file: the joint that is the wrist.
-      unit: of a BVH file: metres per unit.
-      up: of a BVH file: its vertical axis, y or z.
       fingers: the axis of the wrist's own frame along which its fingers point, such as +x.
       back: the axis towards the back of the hand.
 
@@ -64,10 +60,8 @@ def read_wrist_path(
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Name a CSV, NPZ or BVH file.")
     if kind == ".bvh":
-        if up not in _UP:
-            raise CongraspError(f"The vertical axis is '{up}'.", "It is y or z.")
         position, rotation, seconds = read_bvh(path, joint)
-        position, rotation = _UP[up].apply(position * unit), _UP[up] * rotation
+        position, rotation = _FROM_Y_UP.apply(position * _CM), _FROM_Y_UP * rotation
     elif kind in readers:
         position, quaternion, seconds = readers[kind](path)
         rotation = Rotation.from_quat(quaternion, scalar_first=True)
@@ -91,7 +85,7 @@ def read_bvh(path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, floa
     """
     try:
         return _bvh(read_file(path, _LARGEST, "Cut it into shorter ones.").decode(), path, joint)
-    except (OSError, ValueError, LookupError, StopIteration) as error:
+    except (ValueError, LookupError, StopIteration) as error:
         raise CongraspError(f"{path} cannot be read as BVH: {str(error)[:200]}.", "Export it again.") from None
 
 
@@ -164,8 +158,6 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
-    except OSError as error:
-        raise CongraspError(f"{path} cannot be read: {error.strerror}.", remedy) from None
     except UnicodeDecodeError:
         raise CongraspError(f"{path} is not text.", remedy) from None
     rows: list[list[float]] = []

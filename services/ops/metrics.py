@@ -19,7 +19,7 @@ _GAUGES = {
         "Tickets that could be granted now; with those that run, the actors that it can use.",
     ),
     "missing": ("rollouts_missing", "Gaps in the counts of actors' rollouts."),
-    "turned_away": ("requests_turned_away", "Requests of actors that had made too many useless ones."),
+    "rejected": ("requests_rejected", "Requests of actors that had made too many useless ones."),
 }
 _MILLISECONDS = (0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -76,7 +76,7 @@ class LearnerMetrics:
         yield GaugeMetricFamily("congrasp_learner_ready", "Whether it takes rollouts.", float(status["version"] >= 0))
         yield _gauge("version", "Newest policy version.", status["version"])
         yield _gauge("finished", "Whether the run is over.", status["finished"])
-        yield _gauge("ledger_balanced", "Whether the counters add up.", not status["warnings"])
+        yield _gauge("counters_balanced", "Whether the counters add up.", not status["warnings"])
         yield _gauge("queue_length", "Rollouts that wait.", status["queue"]["length"])
         yield _gauge("queue_limit", "Rollouts that may wait.", status["queue"]["limit"])
         for name, value in status["rates"].items():

@@ -61,24 +61,20 @@ def read_records(
     Raises:
       CongraspError: the file cannot be opened, or is not an MCAP file.
     """
+    dropped = Dropped()
     try:
-        file = open_file(path)
-    except OSError as error:
-        raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
-    with file:
-        start = file.read(len(MCAP0_MAGIC))
-        if not MCAP0_MAGIC.startswith(start):
-            raise CongraspError(f"{path} is not an MCAP file.", "Pass a file written by 'congrasp record'.")
-        dropped = Dropped()
-        try:
+        with open_file(path) as file:
+            start = file.read(len(MCAP0_MAGIC))
+            if not MCAP0_MAGIC.startswith(start):
+                raise CongraspError(f"{path} is not an MCAP file.", "Pass a file written by 'congrasp record'.")
             for schema, channel, message in read_messages(file, dropped):
                 if wanted(channel.topic):
                     name = schema.name if schema else ""
                     yield Record(channel.topic, name, channel.message_encoding, message.log_time, message.data)
-        except OSError as error:
-            raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
-        if text := str(dropped):
-            warn(f"{path} is {text}.")
+    except OSError as error:
+        raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
+    if text := str(dropped):
+        warn(f"{path} is {text}.")
 
 
 def is_episode(topic: str) -> bool:

@@ -109,7 +109,7 @@ def _read(file: pathlib.Path, part: Part, settings: Mapping[str, Any]) -> Result
         kept = {"pictures", "seconds", "references", "left_out", "heading_rules"}
         same = about["settings"] == settings and about.keys() >= kept
         return Result(part, about["source"], rows, about, False) if same else None
-    except (OSError, LookupError, TypeError, AttributeError, CongraspError):
+    except (LookupError, TypeError, AttributeError, CongraspError):
         return None
 
 

@@ -1,8 +1,8 @@
 """Batches queries that arrive together: a bounded queue and a worker thread, which a single query bypasses.
 
 Peers take turns in the queue, and each has a limited share of it: one that floods is refused when others would not be.
-While several peers send queries, a long query is answered in parts, one per batch, so that it delays the others by one
-part.
+While several peers send queries, batches are small and the peers share each equally, so that a long query, answered in
+parts, delays the others by no more than a small batch.
 """
 
 import collections
@@ -27,7 +27,7 @@ class Parts(NamedTuple, Generic[T, R]):
     """Splitting of an item into parts."""
 
     most: int
-    """Limit of one peer's weight in a batch while there are several peers."""
+    """Limit of a batch's weight while there are several peers, but no more of them than this."""
     cut: Callable[[T, int, int], T]
     """(item, first, end) -> the part of weight `end` - `first`."""
     join: Callable[[T, list[R]], R | Exception]
@@ -126,7 +126,7 @@ class Batcher(Generic[T, R]):
             if peer != self._latest:
                 self._several_until, self._latest = (now + _ALONE) if self._latest else -math.inf, peer
             alone = not self._running and not self._queues and self._expected == 1
-            alone = alone and waiting.weight <= self._turn()
+            alone = alone and waiting.weight <= self._limits()[0]
             if alone:
                 self._running = True
             else:
@@ -196,14 +196,17 @@ class Batcher(Generic[T, R]):
             self._running, self._expected = True, len(batch)
             return batch
 
-    def _turn(self) -> int:
-        """Limit of one peer's weight in a batch."""
-        return self._parts.most if self._parts and time.monotonic() < self._several_until else self._size
+    def _limits(self) -> tuple[int, int]:
+        """Limits of a batch's weight and of one peer's weight in it; the caller holds the lock."""
+        if self._parts is None or time.monotonic() >= self._several_until:
+            return self._size, self._size
+        room = self._parts.most if len(self._queues) <= self._parts.most else self._size
+        return room, max(1, room // max(1, len(self._queues)))
 
     def _take(self) -> list[_Part[T, R]]:
         """Takes a batch from the queue, one item or part of each peer in turn; the caller holds the lock."""
         batch: list[_Part[T, R]] = []
-        room, most = self._size, self._turn()
+        room, most = self._limits()
         turns = collections.Counter[str]()
         while waiting := [peer for peer in self._queues if turns[peer] < most]:
             peer = waiting[0]  # the peer whose turn it is

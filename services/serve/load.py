@@ -2,10 +2,7 @@
 
 import concurrent.futures
 import contextlib
-import os
 import pathlib
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -18,7 +15,7 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.transport.ports import local_url
 from congrasp.services.client.policy import Policy
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
+from congrasp.services.ops.children import Child, end_all
 
 
 @contextlib.contextmanager
@@ -32,26 +29,11 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]
       log: file for the server's output.
     """
     endpoint = local_url()
-    command = [sys.executable, "-m", "congrasp", "serve", "--policy", str(policy), "--listen", endpoint]
-    with log.open("wb") as output:
-        server = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
-            start_new_session=True,
-        )
-    register_child(server)
+    server = Child("server", ["serve", "--policy", str(policy), "--listen", endpoint], log)
     try:
-        yield endpoint, server.pid
+        yield endpoint, server.start()
     finally:
-        server.terminate()
-        try:
-            server.wait(5.0)
-        except subprocess.TimeoutExpired:
-            server.kill()
-            server.wait()
+        end_all([server])
 
 
 def processor_seconds(process: int) -> float:

@@ -30,9 +30,9 @@ DEPTH = 64
 """Limit of queued queries; further ones are refused at once."""
 SHARE = 16
 """Limit of queued queries of one peer."""
-TURN = BATCH_SIZES[1] - 1
-"""Limit of one peer's states in a batch while there are several peers: small enough for the others' control loops."""
-_MAX_TIMEOUT = 60.0
+SHARED = BATCH_SIZES[1]
+"""Limit of a batch's states while several peers share it: small enough for their control loops."""
+_TIMEOUT, _MAX_TIMEOUT = 1.0, 60.0  # deadline of a query by default and at most, s
 _FOLLOW_SECONDS = 0.5
 
 
@@ -57,7 +57,6 @@ class PolicyServer:
         run: str,
         source: Source,
         *,
-        timeout: float = 1.0,
         on_answer: Callable[[str, float], None] = lambda outcome, seconds: None,
         on_batch: Callable[[int], None] = lambda size: None,
     ):
@@ -67,7 +66,6 @@ class PolicyServer:
           transport: endpoint of the server.
           run: name of the served run.
           source: source of policies.
-          timeout: default deadline of a query, s.
           on_answer: called with the outcome of every query (answered, refused, overloaded, late), and its duration.
           on_batch: called with the number of states of every batch.
 
@@ -78,7 +76,7 @@ class PolicyServer:
         first = source(-1)
         if first is None:
             raise CongraspError("There is no policy to serve yet.", "Start the server after the run has published one.")
-        self._source, self._timeout = source, timeout
+        self._source = source
         self._on_answer, self._on_batch = on_answer, on_batch
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
@@ -93,11 +91,11 @@ class PolicyServer:
             window=WINDOW,
             depth=DEPTH,
             share=SHARE,
-            parts=Parts(TURN, _cut, self._join),
+            parts=Parts(SHARED, _cut, self._join),
         )
         transport.serve(keys.health, self._describe)
         transport.serve(
-            below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._turn_away
+            below(keys.act), self._act, workers=2, depth=DEPTH, admission=self._reject
         )  # one may infer while the other receives
         self._follower = threading.Thread(target=self._follow, daemon=True, name="follow")
         self._follower.start()
@@ -134,7 +132,7 @@ class PolicyServer:
         self._batcher.close()
         self._follower.join(2 * _FOLLOW_SECONDS)
 
-    def _turn_away(self, key: str) -> None:
+    def _reject(self, key: str) -> None:
         """Refuses a query for which the queue has no room, before decoding it."""
         began = time.monotonic()
         try:
@@ -148,7 +146,7 @@ class PolicyServer:
         began = time.monotonic()
         try:
             query = self._function.layout.parse(request)
-            timeout = self._deadline(request.meta.get("timeout", self._timeout))
+            timeout = self._deadline(request.meta.get("timeout", _TIMEOUT))
             future = self._batcher.submit(query, timeout, peer=account(key))
         except CongraspError as error:
             self._count(error, began)

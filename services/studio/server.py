@@ -114,6 +114,7 @@ class PageServer:
 
 class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
+    request_queue_size = 128  # a connection that finds no room is repeated after a second
 
     def __init__(self, address: tuple[str, int], handler: Any):
         """Listens at (interface, port)."""
@@ -168,8 +169,11 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Requests are not logged."""
 
     def _route(self) -> tuple[str, dict[str, str]]:
-        """Path and query parameters of the request."""
-        parts = urllib.parse.urlsplit(self.path)
+        """Path and query parameters of the request; an empty path for a malformed URL."""
+        try:
+            parts = urllib.parse.urlsplit(self.path)
+        except ValueError:
+            return "", {}
         return parts.path, dict(urllib.parse.parse_qsl(parts.query))
 
     def _refused(self, more: bool = False) -> bool:
@@ -188,8 +192,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def _file(self, name: str) -> None:
         """Sends a file of the page."""
-        file = STATIC / name
-        if "/" in name or file.suffix not in _TYPES or not file.is_file():
+        file = next((file for file in STATIC.iterdir() if file.name == name and file.suffix in _TYPES), None)
+        if file is None:
             self._send(404, "text/plain", b"There is nothing of this name.")
             return
         self._send(200, _TYPES[file.suffix], file.read_bytes())
@@ -197,7 +201,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def _answer(self, work: Callable[[], Answer]) -> None:
         """Sends what `work` returns, or its error."""
         try:
-            found = work()
+            content = _content(work())
         except BadRequest as error:
             self._send(400, "application/json", json.dumps({"error": str(error)}).encode())
             return
@@ -209,16 +213,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             message = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
             self._send(500, "application/json", json.dumps({"error": message}).encode())
             return
-        if isinstance(found, Message):
-            self._send(200, "application/octet-stream", encode(found))
-        elif isinstance(found, Download):
-            name = urllib.parse.quote(found.name)
-            more = {"Content-Disposition": f"attachment; filename*=UTF-8''{name}"}
-            self._send(200, "application/octet-stream", found.data, more)
-        elif isinstance(found, Picture):
-            self._send(200, "image/png", found.png)
-        else:
-            self._send(200, "application/json", json.dumps(found, allow_nan=False).encode())
+        self._send(200, *content)
 
     def _send(self, code: int, kind: str, data: bytes, more: Mapping[str, str] | None = None) -> None:
         """Sends a whole answer."""
@@ -235,3 +230,15 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(data)
+
+
+def _content(found: Answer) -> tuple[str, bytes, Mapping[str, str]]:
+    """Media type, bytes and further headers of an answer."""
+    if isinstance(found, Message):
+        return "application/octet-stream", encode(found), {}
+    if isinstance(found, Download):
+        name = urllib.parse.quote(found.name)
+        return "application/octet-stream", found.data, {"Content-Disposition": f"attachment; filename*=UTF-8''{name}"}
+    if isinstance(found, Picture):
+        return "image/png", found.png, {}
+    return "application/json", json.dumps(found, allow_nan=False).encode(), {}

@@ -1,7 +1,5 @@
 """A learner and its actors as processes of this machine: starts, restarts and ends them."""
 
-import contextlib
-import dataclasses
 import os
 import pathlib
 import subprocess
@@ -24,47 +22,13 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import local_url, rank_url, reachable_url
-from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
+from congrasp.services.ops.children import CHILD_GRACE, Child, end_all, wait_for
 
 MAX_RESTARTS = 5
-CHILD_GRACE = 2.0
-"""Seconds for a child to drain; the rest of `GRACE` remains to kill it before this process must end."""
 _BAD_INPUT = 2
 _START_SECONDS, _POLL = 120.0, 0.25
 Report = Callable[[dict[str, Any]], None]
 """Called several times a second with the learner's newest metrics, if any, and the number of live actors."""
-
-
-@dataclasses.dataclass
-class Child:
-    """A process of the run."""
-
-    name: str
-    arguments: list[str]
-    log: pathlib.Path
-    environment: dict[str, str] = dataclasses.field(default_factory=dict)
-    process: subprocess.Popen[bytes] | None = None
-    restarts: int = 0
-    again_at: float = 0.0
-
-    def start(self) -> None:
-        """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies with its parent."""
-        environment = {**os.environ, **self.environment, PARENT_VARIABLE: str(os.getpid())}
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "congrasp", *self.arguments],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL,
-                env=environment,
-                start_new_session=True,
-            )
-        register_child(self.process)
-
-    def last_line(self) -> str:
-        """The last line of its log."""
-        lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
-        return lines[-1].removeprefix("congrasp: error: ") if lines else "its log is empty"
 
 
 def train(
@@ -263,7 +227,7 @@ def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: 
     dead = next(child for child in learners if child.process and child.process.poll())
     assert dead.process is not None
     died = f"The {dead.name} died (exit code {dead.process.poll()})"
-    _wait_for([child.process for child in learners if child.process], CHILD_GRACE)
+    wait_for([child.process for child in learners if child.process], CHILD_GRACE)
     end_all(learners)
     for child in learners:
         assert child.process is not None
@@ -280,23 +244,3 @@ def _check_can_restart(child: Child, code: int) -> None:
     """Raises a `CongraspError` if a restart would end in the same way."""
     if code == _BAD_INPUT or child.restarts >= MAX_RESTARTS:
         raise CongraspError(f"The {child.name} failed: {child.last_line()}", f"Its log is {child.log}.")
-
-
-def _wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
-    """Waits until all have ended, or the time is over."""
-    deadline = time.monotonic() + seconds
-    for process in processes:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(max(0.0, deadline - time.monotonic()))
-
-
-def end_all(children: Sequence[Child]) -> None:
-    """Sends SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE` seconds."""
-    running = [child.process for child in children if child.process is not None and child.process.poll() is None]
-    for process in running:
-        process.terminate()
-    _wait_for(running, CHILD_GRACE)
-    for process in running:
-        if process.poll() is None:
-            process.kill()
-            process.wait()

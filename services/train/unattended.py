@@ -10,7 +10,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
 from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE, has_checkpoints
-from congrasp.services.train.processes import Child, end_all
+from congrasp.services.ops.children import Child, end_all
 
 _TRAINED = "trained.json"
 _POLL = 0.5
@@ -27,7 +27,7 @@ def seconds(run_dir: pathlib.Path) -> float | None:
     """Duration of its training in seconds; for a resumed one, that of the last session."""
     try:
         return float(read_json(run_dir / _TRAINED, _LARGEST)["seconds"])
-    except (OSError, LookupError, TypeError, ValueError, CongraspError):
+    except (LookupError, TypeError, ValueError, CongraspError):
         return None
 
 

@@ -10,10 +10,10 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.sampling.headings import INWARD
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, WAYPOINT
-from congrasp.services.viz.raster import render_scene
+from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, WAYPOINT
+from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.scene import Shape
-from congrasp.services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, table_shape
+from congrasp.services.viz.shapes import arrow, beads, object_shape, posed_hand, table_shape
 from congrasp.services.viz.sheets import contact_sheet
 
 _ARROWS, _PATHS = 14, 4
@@ -69,17 +69,9 @@ class _Placed:
     @property
     def body(self) -> Shape:
         """The object with its painted regions."""
-        return Shape(
-            "mesh",
-            (0, 0),
-            OBJECT,
-            self.position,
-            np.asarray(self.arrays["rest"][self.rest][3:], float),
-            vertices=self.arrays["visual/vertices"],
-            faces=self.arrays["visual/faces"],
-            paint_points=self.arrays["surface/points"],
-            paint_colours=np.where(self.arrays["surface/avoid"][:, None], AVOID, GRASPABLE),
-        )
+        mesh = self.arrays["visual/vertices"], self.arrays["visual/faces"]
+        paint = self.arrays["surface/points"], np.where(self.arrays["surface/avoid"][:, None], AVOID, GRASPABLE)
+        return object_shape(mesh, self.position, self.arrays["rest"][self.rest][3:], paint)
 
 
 def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.ndarray:
@@ -114,8 +106,6 @@ def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.n
     }
     body, images = placed.body, []
     for shapes in panels.values():
-        extent = np.concatenate([shape_points(shape) for shape in [*shapes, body]])
-        camera = fit(extent, np.array(_VIEW), _SIZE[0] / _SIZE[1])
-        images.append(render_scene([*shapes, body, table_shape(placed.position)], camera, _SIZE))
+        images.append(render_fitted([*shapes, body], _VIEW, _SIZE, [table_shape(placed.position)]))
     title = f"{meta['object']}, {meta['hand']} hand, resting pose {rest + 1} of {len(arrays['rest'])}"
     return contact_sheet(images, list(panels), columns=3, title=f"{title}; avoid region in dark red")

@@ -13,9 +13,9 @@ from congrasp.services.assets.objects.repair import with_few_faces
 from congrasp.services.assets.objects.sizes import length, size_in_words
 from congrasp.services.assets.objects.sources import Source, read_mesh
 from congrasp.services.record.palette import AVOID, GRASPABLE, OBJECT, PIECES
-from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.scene import Shape
-from congrasp.services.viz.shapes import fit, posed_hand, shape_points, upright
+from congrasp.services.viz.shapes import object_shape, posed_hand, shape_points, upright
 from congrasp.services.viz.sheets import contact_sheet
 
 _SIZE = (460, 360)
@@ -78,10 +78,7 @@ def import_sheet(
     parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [
         Body(rest.apply(vertices), faces, PIECES[i % len(PIECES)]) for i, (vertices, faces) in pieces
     ]
-    images = []
-    for shapes in (_beside(hand, bodies) for bodies in parts.values()):
-        points = np.concatenate([shape_points(shape) for shape in shapes])
-        images.append(render_scene(shapes, fit(points, np.array(_VIEW), _SIZE[0] / _SIZE[1]), _SIZE))
+    images = [render_fitted(_beside(hand, bodies), _VIEW, _SIZE) for bodies in parts.values()]
     title = f"{obj.name} beside the {hand.name} hand at true scale"
     return contact_sheet(images, list(parts), columns=len(parts), title="  |  ".join([title, *obj.notes]))
 
@@ -101,14 +98,12 @@ def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
     low, high = points.min(0), points.max(0)
     middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     shapes = [
-        Shape(
-            "mesh",
-            (0, 0),
+        object_shape(
+            (body.vertices - middle, body.faces),
+            np.zeros(3),
+            np.array([1.0, 0.0, 0.0, 0.0]),
+            body.own and (body.own.points - middle, body.own.values / 255),
             body.colour,
-            vertices=body.vertices - middle,
-            faces=body.faces,
-            paint_points=body.own and body.own.points - middle,
-            paint_colours=body.own and body.own.values / 255,
         )
         for body in bodies
     ]

@@ -14,9 +14,9 @@ from congrasp.common.objects.shapes import tessellate
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.sampling.headings import Headings, within_reach
 from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, PIECES
-from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.scene import Shape
-from congrasp.services.viz.shapes import arrow, fit, object_shape, shape_points, table_shape
+from congrasp.services.viz.shapes import arrow, object_shape, table_shape
 from congrasp.services.viz.sheets import contact_sheet
 
 _ARROWS, _LENGTH = 24, 0.08  # how many headings, and from how far before them they are drawn, m
@@ -56,8 +56,7 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
     }
     images = []
     for shapes in panels.values():
-        camera = fit(np.concatenate([shape_points(shape) for shape in shapes]), np.array(_VIEW), _SIZE[0] / _SIZE[1])
-        images.append(render_scene([*shapes, table_shape(place)], camera, _SIZE))
+        images.append(render_fitted(shapes, _VIEW, _SIZE, [table_shape(place)]))
     title = f"{obj.name}: {1000 * obj.mass:.0f} g, resting pose 1 of {len(obj.rest_poses)}"
     return contact_sheet(images, list(panels), columns=len(panels), title=title)
 
@@ -67,8 +66,7 @@ def rest_picture(obj: GraspObject, rest: int, size: tuple[int, int] = _SMALL) ->
     pose = np.asarray(obj.rest_poses[rest], float)
     shape = dataclasses.replace(_painted(obj), position=pose[:3], quaternion=pose[3:])
     shape = dataclasses.replace(shape, paint_points=None, paint_colours=None)
-    camera = fit(shape_points(shape), np.array(_VIEW), size[0] / size[1])
-    return render_scene([shape, table_shape(pose[:3])], camera, size)
+    return render_fitted([shape], _VIEW, size, [table_shape(pose[:3])])
 
 
 def rests_sheet(obj: GraspObject) -> np.ndarray:
@@ -88,8 +86,7 @@ def overview(objects: Sequence[GraspObject]) -> np.ndarray:
     images, titles = [], []
     for obj in objects:
         shape = _painted(obj)
-        camera = fit(shape_points(shape), np.array(_VIEW), _SMALL[0] / _SMALL[1])
-        images.append(render_scene([shape, table_shape(shape.position)], camera, _SMALL))
+        images.append(render_fitted([shape], _VIEW, _SMALL, [table_shape(shape.position)]))
         titles.append(f"{obj.name}: {1000 * obj.mass:.0f} g")
     return contact_sheet(images, titles, columns=_COLUMNS)
 

@@ -7,6 +7,7 @@ import numpy as np
 from congrasp.services.viz.kernels import NOTHING, averaged, cover, shade
 from congrasp.services.viz.light import FEW, MANY, ON_TABLE, light_on
 from congrasp.services.viz.scene import Camera, Shape
+from congrasp.services.viz.shapes import fit, shape_points
 from congrasp.services.viz.triangles import Triangles, joined, triangles_of
 
 SAMPLES = 2
@@ -40,6 +41,14 @@ def render_scene(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int] 
         glass = _turned(triangles_of(shape for shape in shapes if shape.alpha == alpha), camera)
         picture.add(glass, np.ones((len(glass.points), 2), np.float32), alpha)
     return averaged(picture.image, SAMPLES)
+
+
+def render_fitted(
+    shapes: Sequence[Shape], view: Sequence[float] | np.ndarray, size: tuple[int, int], around: Sequence[Shape] = ()
+) -> np.ndarray:
+    """Renders shapes and others around them by the nearest camera in direction `view` (3,) that sees `shapes`."""
+    points = np.concatenate([shape_points(shape) for shape in shapes])
+    return render_scene([*shapes, *around], fit(points, np.array(view), size[0] / size[1]), size)
 
 
 def visible(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:

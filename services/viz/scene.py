@@ -68,7 +68,6 @@ def between(
     radius: float,
     colour: tuple[float, float, float],
     *,
-    alpha: float = 1.0,
     shadow: bool = True,
 ) -> Shape:
     """A capsule from `start` to `end` (3,), or a ball where they coincide; the rest is as in `Shape`."""
@@ -76,6 +75,6 @@ def between(
     length = float(np.linalg.norm(along))
     middle = np.add(start, end) / 2
     if length < 1e-9:
-        return Shape("sphere", (radius, 0.0), colour, middle, alpha=alpha, shadow=shadow)
+        return Shape("sphere", (radius, 0.0), colour, middle, shadow=shadow)
     turn = Rotation.align_vectors([along / length], [[0.0, 0.0, 1.0]])[0].as_quat(scalar_first=True)
-    return Shape("capsule", (radius, length / 2), colour, middle, turn, alpha, shadow=shadow)
+    return Shape("capsule", (radius, length / 2), colour, middle, turn, shadow=shadow)

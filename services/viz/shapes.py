@@ -96,6 +96,7 @@ def object_shape(
     position: np.ndarray,
     quaternion: np.ndarray,
     paint: tuple[np.ndarray, np.ndarray] | None = None,
+    colour: Colour = OBJECT,
 ) -> Shape:
     """An object.
 
@@ -104,12 +105,13 @@ def object_shape(
       position: (3,) m, world.
       quaternion: (4,) from its frame to the world.
       paint: points (P, 3) in its frame, and what colour (P, 3) in [0, 1] the surface has at them; without, one for all.
+      colour: colour without paint.
     """
     points, colours = paint or (None, None)
     return Shape(
         "mesh",
         (0, 0),
-        OBJECT,
+        colour,
         np.asarray(position, float),
         np.asarray(quaternion, float),
         vertices=mesh[0],

@@ -22,7 +22,7 @@ from congrasp.services.viz.views import camera_of, views
 
 _SIZE, _COLUMNS = (320, 240), 6
 _FILM_SIZE, _FILM_FPS, _HELD = (320, 240), 12.5, 0.5  # pixels, frames a second, s of the hold
-_COLOURS = 96  # of a film
+_COLOURS = 224  # of a film
 _APPROACH, _LIFT = 1.0, 0.12  # s, m
 
 
@@ -126,7 +126,8 @@ def save_film(path: pathlib.Path, episode: Message) -> None:
     frames = [
         Image.fromarray(frame) for frame in render_episode_frames(episode, steps, _FILM_SIZE, camera, overlays=False)
     ]
-    palette = frames[-1].quantize(_COLOURS, dither=Image.Dither.NONE)
+    several = np.hstack([np.asarray(frame) for frame in frames[:: max(1, len(frames) // 4)]])
+    palette = Image.fromarray(several).quantize(_COLOURS, dither=Image.Dither.NONE)
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     path.parent.mkdir(parents=True, exist_ok=True)
     drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=round(1000 / _FILM_FPS), loop=0)

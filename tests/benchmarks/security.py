@@ -34,7 +34,7 @@ def bench_security(repeats: int) -> None:
         f"a request of 100 bytes: {found['secure_query_ms']:.2f} ms secured, {found['plain_query_ms']:.2f} ms plain\n"
         f"a rollout of 8 MB:      {secure:.0f} MB/s secured, {plain:.0f} MB/s plain (ratio {secure / plain:.2f})\n"
         f"the same in a flood:    {flooded:.0f} MB/s (ratio {flooded / secure:.2f}), while "
-        f"{found['flood_turned_away']:.0f} requests were rejected\n"
+        f"{found['flood_rejected']:.0f} requests were rejected\n"
         f"opening the learner:    {found['secure_open_ms']:.0f} ms secured, {found['plain_open_ms']:.0f} ms plain"
     )
 
@@ -60,9 +60,9 @@ def _measure(repeats: int) -> dict[str, float]:
                         note(f"{name}_mb_per_s", _MEGABYTES / _seconds(actor, _KEYS.rollout(_ACTOR), _LARGE, 10))
                         if certs is not None:
                             with _flood(endpoint, certs, limit):
-                                before = limit.turned_away
+                                before = limit.rejected
                                 note("flood_mb_per_s", _MEGABYTES / _seconds(actor, _KEYS.rollout(_ACTOR), _LARGE, 10))
-                                note("flood_turned_away", limit.turned_away - before)
+                                note("flood_rejected", limit.rejected - before)
         return {name: statistics.median(values) for name, values in found.items()}
 
 
@@ -105,7 +105,7 @@ def _flood(endpoint: str, certs: pathlib.Path, limit: RateLimit) -> Iterator[Non
     hostile.start()
     try:
         deadline = time.monotonic() + 60.0
-        while not limit.turned_away and time.monotonic() < deadline:
+        while not limit.rejected and time.monotonic() < deadline:
             time.sleep(0.1)
         yield
     finally:

@@ -1,6 +1,7 @@
 """All transports behave alike, one from outside among them; Zenoh's ends refuse what they should, and end."""
 
 import contextlib
+import functools
 import signal
 import socket
 import subprocess
@@ -420,9 +421,18 @@ def test_admission_sends_requests_away_unread(pair):
     assert client.query(KEYS.ticket("b"), Message(), timeout=60).meta == {"later": KEYS.ticket("b")}
 
 
-def test_a_listener_leaves_files_free_for_its_threads_whatever_the_limit_is(monkeypatch):
+@pytest.mark.parametrize(("hard", "files", "warnings"), [(1024, 1024, 1), (20_000, 16_384, 0)])
+def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free(
+    monkeypatch, caplog, hard, files, warnings
+):
     """Zenoh panics in a process that has no file left."""
-    monkeypatch.setattr(zenoh_session.resource, "getrlimit", lambda kind: (1024, 1024))
-    settings = zenoh_session.configuration("policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None)
+    limits = [(1024, hard)]
+    monkeypatch.setattr(zenoh_session.resource, "getrlimit", lambda kind: limits[-1])
+    monkeypatch.setattr(zenoh_session.resource, "setrlimit", lambda kind, limit: limits.append(limit))
+    monkeypatch.setattr(zenoh_session, "_open_files", functools.cache(zenoh_session._open_files.__wrapped__))
+    for _ in range(2):
+        settings = zenoh_session.configuration("policy", ["tcp/127.0.0.1:7457"], True, 1 << 20, None)
     taken = [int(settings.get_json(f"transport/unicast/{name}")) for name in ("accept_pending", "max_sessions")]
-    assert taken == [256, 256]
+    assert taken == [files // 4, min(1000, files // 4)]
+    assert limits[-1] == (files, hard)
+    assert [record.args for record in caplog.records] == [(files, 16_384)] * warnings

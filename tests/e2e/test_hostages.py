@@ -96,7 +96,7 @@ def test_peers_that_ask_for_weights_without_end_are_put_off():
     ):
         link.config(10)
         _updates(link, hub, 20)
-        assert hub._pull_limit.turned_away > 0
+        assert hub._pull_limit.rejected > 0
 
 
 def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():

@@ -27,7 +27,7 @@ def test_the_run_goes_on_beside_an_attacker(cluster, what):
     works = {
         "hold_tickets": lambda status: status["counters"]["running"] >= 2,
         "show_tokens": lambda status: status["unlisted"] > 3000,
-        "send_nonsense": lambda status: status["counters"]["turned_away"] > 20,
+        "send_nonsense": lambda status: status["counters"]["rejected"] > 20,
         "publish_logs": bool,
     }
     cluster.wait(works[what], timeout=60.0)  # it has what it wants before the honest one comes

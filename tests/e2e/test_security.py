@@ -131,7 +131,7 @@ def test_with_the_right_certificates_a_run_works_from_end_to_end(run):
         eventually(lambda: (received := logs.receive(5)) and received[0] == key)
         status = eventually(lambda: (now := observer.query(KEYS.status, Message(), timeout=5).meta) and now)
         assert ("actor", ME) in {(role["role"], role["id"]) for role in status["roles"]}
-        assert status["counters"]["accepted"] == 2 and status["counters"]["turned_away"] == 0
+        assert status["counters"]["accepted"] == 2 and status["counters"]["rejected"] == 0
     assert (
         server.query(KEYS.weights_for("server", "0.s"), Message(meta={"newer_than": -1}), timeout=5).meta["version"]
         == 1
@@ -539,7 +539,7 @@ def test_nothing_unpickles():
 # --- floods ---
 
 
-def test_a_flood_is_turned_away_and_the_others_go_on(run):
+def test_a_flood_is_rejected_and_the_others_go_on(run):
     """Useless requests, more than the learner could look at, from one certificate under many names."""
     stop = threading.Event()
 
@@ -554,7 +554,7 @@ def test_a_flood_is_turned_away_and_the_others_go_on(run):
     for thread in threads:
         thread.start()
     try:
-        eventually(lambda: run.hub.status()["counters"]["turned_away"] > 50)
+        eventually(lambda: run.hub.status()["counters"]["rejected"] > 50)
         with ActorLink(run.connect("actor.0"), "safe", ME, request_timeout=5.0) as link:
             link.config(10)
             for version in range(20):
@@ -568,7 +568,7 @@ def test_a_flood_is_turned_away_and_the_others_go_on(run):
             thread.join(10)
     ledger = run.hub.status()["counters"]
     assert ledger["accepted"] == ledger["consumed"] == 40
-    assert ledger["damaged"] < ledger["turned_away"] + 1000
+    assert ledger["damaged"] < ledger["rejected"] + 1000
 
 
 def test_what_is_too_long_or_too_often_is_dropped(run):

@@ -153,7 +153,7 @@ def test_batches_come_in_order_and_wait(bench):
     assert b.ledger() | {"capacity": 0} == {
         "granted": 0, "redeemed": 0, "returned": 0, "expired": 0, "accepted": 4, "consumed": 4, "dropped": 0,
         "stale": 0, "duplicate": 0, "damaged": 0, "undone": 0, "running": 0, "queued": 0, "capacity": 0, "missing": 0,
-        "turned_away": 0,
+        "rejected": 0,
     }  # fmt: skip
 
 
@@ -248,7 +248,7 @@ def test_nobody_makes_the_learner_forget_what_another_sent(bench):
     assert b.send(0, version=9, actor="0.a")["outcome"] == "duplicate"
 
 
-def test_floods_are_turned_away_and_cost_the_others_nothing(bench, monkeypatch):
+def test_floods_are_rejected_and_cost_the_others_nothing(bench, monkeypatch):
     monkeypatch.setattr(hub, "RateLimit", functools.partial(RateLimit, clock=lambda: 0.0))  # no token returns
     b = bench()
     b.hub.publish_weights(bundle(0), 0)
@@ -260,7 +260,7 @@ def test_floods_are_turned_away_and_cost_the_others_nothing(bench, monkeypatch):
     assert not reply["granted"] and reply["retry_after"] > 0
     assert b.ticket()["granted"] and b.send(0)["outcome"] == "accepted"
     ledger = b.ledger()
-    assert ledger["turned_away"] == 2500 - stale + 1 and ledger["stale"] == stale
+    assert ledger["rejected"] == 2500 - stale + 1 and ledger["stale"] == stale
     texts = []
     while received := events.receive(0.1):
         texts.append(received[1].meta["text"])

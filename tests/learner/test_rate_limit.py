@@ -24,7 +24,7 @@ def test_useless_requests_empty_a_certificates_bucket_and_time_fills_it():
         assert limit.admits(f"congrasp/r/rollout/{name}")
         limit.charge(f"congrasp/r/rollout/{name}", 100)  # two each: one for itself, one for its size
     assert not limit.admits(A) and not limit.admits("congrasp/r/ticket/0.z") and limit.admits(B)
-    assert limit.turned_away == 2
+    assert limit.rejected == 2
     clock.now = 0.5  # -1 + 1: still nothing
     assert not limit.admits(A)
     clock.now = 0.6

@@ -22,6 +22,7 @@ _BREADTH = 0.03  # half the breadth of the slab in which the local width is meas
 _BEYOND = 0.01  # the slab ends this far beyond the heading position, at the fingertips
 _FINGER = 0.012  # thickness of a thin finger that closes from below
 _SIDE = 0.015  # depth of an object's side along the cross-finger axis, in which fingertips need a surface
+_CONE = np.radians(30)  # half angle of the cone of directions around the inward normal, rad
 _OPPOSED = np.cos(np.arctan(1.0))  # least cosine of a normal with that axis: the edge of the cone of friction 1
 _TUBE = 0.01  # radius around the approach that must be free in front of the surface point
 _MARGIN = 0.01  # distance of an approach from the avoid region; closing fingers of this thickness must not meet it
@@ -52,10 +53,8 @@ def sample_headings(
     use_affordance: bool,
     lenient: bool = False,
     count: int = COUNT,
-    cone: float = np.radians(30),
     inward: float = INWARD,
     max_width: float = MAX_WIDTH,
-    back_off: float = BACK_OFF,
     attempts: int = 6,
     along: np.ndarray | None = None,
     at: np.ndarray | None = None,
@@ -87,10 +86,8 @@ def sample_headings(
       lenient: if fingers that close on the graspable region always meet the other one, as on a small handle, accepts
         candidates whose approach clears the avoid region.
       count: number of headings H.
-      cone: half angle of the cone around the inward normal, rad.
       inward: metres from the surface point to the heading position.
       max_width: largest local width, m.
-      back_off: length of the approach that is checked, m.
       attempts: batches of candidates.
       along: (3,) unit, prescribed direction of all headings; surface points that face it are used. None draws
         directions.
@@ -111,13 +108,13 @@ def sample_headings(
     total = 0
     for _ in range(attempts):
         source = rng.choice(sources, _BATCH)
-        direction = _in_cone(-obj.normals[source], cone, rng)
+        direction = _in_cone(-obj.normals[source], _CONE, rng)
         if along is not None:
             direction = np.broadcast_to(np.float32(along), direction.shape)
         position = points[source] + np.float32(inward) * direction
         if at is not None:
             position = np.broadcast_to(np.float32(at), position.shape)
-        faults = _faults(points, avoid, position, direction, inward, back_off)
+        faults = _faults(points, avoid, position, direction, inward, BACK_OFF)
         position, direction, faults = (part[faults.argsort(kind="stable")] for part in (position, direction, faults))
         clean = int((faults == 0).sum())
         cross, width = _roll(surface, position[:clean], direction[:clean], rng, opposed=opposed)

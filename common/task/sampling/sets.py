@@ -129,10 +129,9 @@ def load(path: pathlib.Path) -> Message:
       CongraspError: the file is missing, of another kind, or damaged.
     """
     remedy = "Run 'congrasp constraints generate' again."
+    data = read_file(path, MAX_MESSAGE, remedy)
     try:
-        message = decode(read_file(path, MAX_MESSAGE))
-    except OSError as error:
-        raise CongraspError(f"The constraint set {path} cannot be read: {error.strerror}.", remedy) from None
+        message = decode(data)
     except CongraspError as error:
         raise CongraspError(f"{path} cannot be read as a constraint set: {error}", remedy) from None
     if message.meta.get("kind") != "constraints" or message.meta.get("format") != FORMAT:

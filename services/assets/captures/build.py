@@ -314,14 +314,14 @@ def _set(
     clear = _resting_poses(hand, q, position, quaternion, fields["rest"])
     nearer = _ends_nearer_to_graspable(position[:, -1], fields["points"], fields["avoid"])
     row = ConstraintBank(
-        **{name: value for name, value in fields.items() if not name.startswith("chosen")},
+        **{name: value for name, value in fields.items() if name != "weight" and not name.startswith("chosen")},
         pose_q=_twice(q),
         pose_position=_twice(position[:, -1]),
         pose_quaternion=_twice(quaternion[:, -1]),
         trajectory_position=_twice(position),
         trajectory_quaternion=_twice(quaternion),
         pose_valid=np.stack([clear.T, (clear & nearer[:, None]).T]),
-        weight=np.float32(1.0),
+        weight=np.float32(1.0),  # people held it, however flat it lies
         mass=np.float32(fitting.mass),
         renewable=np.bool_(False),
         grasps=np.zeros(2, int),

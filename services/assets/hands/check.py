@@ -99,12 +99,11 @@ def write_findings(path: pathlib.Path, findings: Sequence[Finding]) -> None:
 
 def read_findings(path: pathlib.Path) -> list[Finding]:
     """Reads a file of `write_findings`; raises a CongraspError if it cannot be read."""
+    remedy = "Create it with 'congrasp hands check --json'."
     try:
-        return [Finding(**fields) for fields in read_json(path, _LARGEST)["findings"]]
-    except (OSError, LookupError, TypeError) as error:
-        raise CongraspError(
-            f"{path} holds no self-check: {error}.", "Create it with 'congrasp hands check --json'."
-        ) from None
+        return [Finding(**fields) for fields in read_json(path, _LARGEST, remedy)["findings"]]
+    except (LookupError, TypeError) as error:
+        raise CongraspError(f"{path} holds no self-check: {error}.", remedy) from None
 
 
 def _verdict(value: float, doubt: float, fail: float) -> Verdict:

@@ -20,6 +20,15 @@ def _model(hand: Hand) -> mujoco.MjModel:
     return spec.compile()
 
 
+def posed(hand: Hand, q: np.ndarray) -> mujoco.MjData:
+    """Bodies and joints of the hand at finger angles (F,) rad, with its wrist at the origin."""
+    data = mujoco.MjData(_model(hand))
+    for joint, angle in zip(hand.joints, q, strict=True):
+        data.joint(joint.name).qpos[0] = angle
+    mujoco.mj_kinematics(data.model, data)
+    return data
+
+
 def mujoco_link_poses(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Origins (L, 3) and orientations (L, 4) of the links' frames in the wrist frame.
 
@@ -27,10 +36,6 @@ def mujoco_link_poses(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray
       hand: the hand.
       q: (F,) finger angles, rad.
     """
-    model = _model(hand)
-    data = mujoco.MjData(model)
-    for joint, angle in zip(hand.joints, q, strict=True):
-        data.joint(joint.name).qpos[0] = angle
-    mujoco.mj_kinematics(model, data)
-    bodies = [model.body(link.name).id for link in hand.links]
+    data = posed(hand, q)
+    bodies = [data.body(link.name).id for link in hand.links]
     return data.xpos[bodies], data.xquat[bodies]

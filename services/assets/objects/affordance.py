@@ -63,11 +63,9 @@ def relabelled(
     )
 
 
-def two_parts(
-    obj: GraspObject, graspable: np.ndarray, name: str = "", words: Sequence[str] = ("grasp", "avoid")
-) -> GraspObject:
+def two_parts(obj: GraspObject, graspable: np.ndarray, name: str = "") -> GraspObject:
     """The object with the surface points `graspable` (512,) bool, and the others to avoid."""
-    return relabelled(obj, np.where(graspable, 0, 1), words, (True, False), name)
+    return relabelled(obj, np.where(graspable, 0, 1), ("grasp", "avoid"), (True, False), name)
 
 
 def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> np.ndarray:

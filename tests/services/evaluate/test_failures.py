@@ -18,7 +18,7 @@ def episode(heights, **metrics) -> Message:
     position = np.zeros((len(heights), 3))
     position[:, 2] = heights
     table = np.arange(len(heights)) < 2
-    known = {"bad": 0.0, "held": 0.0, "moved_at_removal": 0.01, "links_at_removal": 3.0}
+    known = {"diverged": 0.0, "held": 0.0, "moved_at_removal": 0.01, "links_at_removal": 3.0}
     return Message({"object_position": position, "table": table}, {"metrics": known | metrics, "control_dt": 0.01})
 
 
@@ -26,7 +26,7 @@ def episode(heights, **metrics) -> Message:
     ("metrics", "said"),
     [
         ({"held": 1.0}, "held"),
-        ({"bad": 1.0, "links_at_removal": 0.0}, "the physics diverged"),
+        ({"diverged": 1.0, "links_at_removal": 0.0}, "the physics diverged"),
         ({"moved_at_removal": 0.06}, "pushed away before the table was removed"),
         ({"links_at_removal": 0.0}, "not touched when the table was removed"),
         ({}, "slipped 0.03 s after the table was removed"),

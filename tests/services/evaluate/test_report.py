@@ -65,7 +65,7 @@ def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
     for ours, paper in (("4.0", "7.8"), ("13.0", "20.0")):
         assert f'<td class="number">{ours} <span class="paper">{paper}</span></td>' in text
     assert "<th>heading, °</th><th>heading, mm</th>" in text
-    assert "300 episodes in simulation. Success is at or above the paper's in 2 of the 3 rows" in html.unescape(text)
+    assert "300 episodes in simulation. Success is at or above the paper's in 2 of its 3 rows" in html.unescape(text)
     assert "slipped &lt;b&gt;" in text and "--policy &lt;mine&gt;" in text
     assert len(found.sources) == 2 and not found.links
     for source in found.sources:

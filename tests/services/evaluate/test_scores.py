@@ -33,7 +33,7 @@ REQUIRED = (
 
 def _sample(success, held, **columns) -> Sample:
     count = len(success)
-    names = ("return", "links_at_removal", "bad", "object_index", "heading_rad", "heading_m", "pose_rad", "pose_m")
+    names = ("return", "links_at_removal", "diverged", "object_index", "heading_rad", "heading_m", "pose_rad", "pose_m")
     names += (
         "trajectory_rad",
         "trajectory_m",
@@ -58,7 +58,7 @@ def test_a_row_averages_over_successful_episodes():
         trajectory_rad=[0.4, 0.5, 9.0, 0.6],
         heading_rad=[7.0, 7.0, 7.0, 7.0],
         object_index=[3, 3, 5, 4],
-        bad=[0, 0, 1, 0],
+        diverged=[0, 0, 1, 0],
     )
     sample.link_force[:, 0] = [[2, 0], [4, 6], [100, 100], [0, 0]]
     sample.torque[:, 0] = [[0.5, 0.5, 0.5], [0.0, 0.0, 1.0], [1, 1, 1], [0.0, 0.0, 0.5]]

@@ -8,10 +8,14 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.objects.families.draft import Draft, box
+from congrasp.common.objects.shapes import matrix
 from congrasp.common.request import GraspRequest
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.grasp.approaches import headings
+from congrasp.services.grasp.grasper import with_avoid
 
 
 def test_a_thing_that_lies_too_flat_is_not_stood_on_its_edge_silently(tmp_path: pathlib.Path) -> None:
@@ -23,3 +27,19 @@ def test_a_thing_that_lies_too_flat_is_not_stood_on_its_edge_silently(tmp_path: 
     rest = int(str(error.value).split("--rest ")[1][0]) - 1
     rests = headings(get_hand("human"), phone, GraspRequest({"heading": {}}, rest=rest), 8, rng)[3]
     assert rest > 0 and (rests == rest).all()
+
+
+def test_fingers_close_across_a_handle_that_few_surface_points_lie_on() -> None:
+    """A bar of 9 mm, 25 mm before a block: fingertips have no room behind it at the usual depth of 2 cm."""
+    rods = [box((0.017, 0.0045, 0.0045), (0.052, 0.0, z)) for z in (0.03, -0.03)]
+    draft = Draft((box((0.04, 0.04, 0.045)), *rods, box((0.0045, 0.0045, 0.0345), (0.0695, 0.0, 0.0))))
+    cup = procedural._build("cup", "mug", draft, np.random.default_rng(0))
+    assert cup is not None
+    face = cup.pieces[0].pos[0] + 0.04
+    avoid = cup.points[:, 0] < face + 0.001
+    assert 0.02 < (~avoid).mean() < 0.1
+    upright = int(np.argmax([abs(matrix(rest[3:])[2, 2]) for rest in cup.rest_poses]))
+    request, rng = GraspRequest({"heading": {}}, avoid, rest=upright), np.random.default_rng(0)
+    position, _, cross, _ = headings(get_hand("human"), with_avoid(cup, avoid), request, 64, rng)
+    assert len(np.unique(position, axis=0)) > 4 and (position[:, 0] > face + 0.01).all()
+    assert (np.abs(cross[:, 1]) > 0.7).all()  # across the bars of the handle, not along them

@@ -54,7 +54,7 @@ def test_a_set_is_what_training_draws_from(sets):
         rest = arrays["rest"]
         assert len(np.unique(rest, axis=0)) == len(rest) <= bank.rest.shape[1]
         headings = Headings(*(arrays[f"heading/{name}"][0] for name in Headings._fields))
-        all_cleared, reachable = within_reach(headings, OBJECTS[n].points, rest, outline(HAND))
+        all_cleared, reachable = within_reach(headings, OBJECTS[n], rest, outline(HAND))
         np.testing.assert_array_equal(arrays["heading/allowed"][0], reachable)
         for r, cleared in enumerate(all_cleared):
             moved = np.linalg.norm(cleared.position - headings.position, axis=-1)

@@ -68,7 +68,7 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, 
 
     monkeypatch.setattr(evaluation, "evaluate_tables", never)
     again, printed = reproduced(), capsys.readouterr().out
-    assert printed.count("done before") == 2 and again["cells"] == first["cells"]
+    assert printed.count("evaluated before") == 2 and again["cells"] == first["cells"]
     assert Reader((tmp_path / "reproduction.html").read_text()).sources == page.sources
     (tmp_path / "tables" / "human-ours-single.json").write_text("{")
     assert [part["name"] for part in reproduced()["parts"]] == ["human-ours-objects"]

@@ -48,7 +48,7 @@ def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tm
     )
     assert set(failures) == {OURS, GRAPSXL} and time.monotonic() - began < 40
     assert "human-ours failed: The disk is full." in failures[OURS] and "human-ours.log" in failures[OURS]
-    assert "human-graspxl was ended" in failures[GRAPSXL] and (GRAPSXL, "update 3") in lines
+    assert "human-graspxl was stopped" in failures[GRAPSXL] and (GRAPSXL, "update 3") in lines
     assert training.trained(tmp_path, OURS) is None and training.seconds(tmp_path, OURS) is None
     assert training.trained(tmp_path, PHASES) == tmp_path / PHASES.name / "policy.safetensors"
     assert training.seconds(tmp_path, PHASES) > 0.0

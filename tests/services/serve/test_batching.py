@@ -103,7 +103,7 @@ class Letters(Gate):
         return [CongraspError("bad") if "!" in item else item.upper() for item in items]
 
     def batcher(self):
-        parts = Parts(2, lambda item, first, end: item[first:end], lambda item, results: "".join(results))
+        parts = Parts(4, lambda item, first, end: item[first:end], lambda item, results: "".join(results))
         return Batcher(self, size=8, window=0.0, depth=10, weigh=len, parts=parts)
 
     def run(self, *items):
@@ -121,7 +121,15 @@ def test_a_long_item_is_run_in_parts_beside_another_peers(several):
     gate = Letters()
     futures, batcher = gate.run(("a", "k"), ("b", "abcdefg"), ("a", "l"), ("b", "hi"), ("a", "mno"))
     assert [future.result(10) for future in futures] == ["K", "ABCDEFG", "L", "HI", "MNO"]
-    assert gate.batches == [["k"], ["ab", "l", "m"], ["cd", "no"], ["ef"], ["g", "h"], ["i"]]
+    assert gate.batches == [["k"], ["ab", "l", "m"], ["cd", "no"], ["efg", "h"], ["i"]]
+    batcher.close()
+
+
+def test_peers_share_a_small_batch_however_long_their_items_are(several):
+    gate = Letters()
+    futures, batcher = gate.run(("a", "k"), ("b", "abcdefg"), ("c", "tuvwxyz"), ("a", "l"))
+    assert [future.result(10) for future in futures] == ["K", "ABCDEFG", "TUVWXYZ", "L"]
+    assert gate.batches == [["k"], ["a", "t", "l"], ["bc", "uv"], ["de", "wx"], ["fg", "yz"]]
     batcher.close()
 
 
@@ -138,7 +146,7 @@ def test_an_item_of_which_a_part_fails_is_run_no_further(several):
     futures, batcher = gate.run(("a", "k"), ("b", "ab!defgh"), ("a", "l"), ("b", "ij"))
     assert str(futures[1].exception(10)) == "bad"
     assert [futures[i].result(10) for i in (0, 2, 3)] == ["K", "L", "IJ"]
-    assert gate.batches == [["k"], ["ab", "l"], ["!d"], ["ij"]]
+    assert gate.batches == [["k"], ["ab", "l"], ["!def"], ["ij"]]
     batcher.close()
 
 

@@ -37,7 +37,7 @@ def config():
     return dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def robot(example, config):
     hand = get_hand(config.task.hand)
     return example.MujocoRobot(hand, config.task, SEED, congrasp.JointLimits.of_hand(hand))

@@ -83,7 +83,7 @@ FLAGS = np.ones(4, bool)
 )
 def test_where_nothing_held_the_constraint_whose_absence_helps_most_decided(asked, without, says) -> None:
     made = episode(12, removal=8, success=False)
-    metrics = {**made.meta["metrics"], "held": 0.0, "bad": 0.0, "moved_at_removal": 0.2}
+    metrics = {**made.meta["metrics"], "held": 0.0, "diverged": 0.0, "moved_at_removal": 0.2}
     failed = type(made)(made.arrays, {**made.meta, "metrics": metrics})
     request = GraspRequest({"heading": {}, **{name: {} for name in asked}}, FLAGS if "affordance" in asked else None)
     tried: dict[str, GraspRequest] = {}

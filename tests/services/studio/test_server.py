@@ -1,6 +1,8 @@
 """The page's server answers its own page alone, and any request with a result or a message."""
 
+import contextlib
 import http.client
+import http.server
 import io
 import json
 import pathlib
@@ -23,7 +25,7 @@ from congrasp.services.record.reader import read_episodes
 from congrasp.services.studio import files
 from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.server import PageServer
+from congrasp.services.studio.server import PageServer, _Server
 from congrasp.services.studio.session import Session
 from tests import studio as made_up
 
@@ -71,11 +73,25 @@ def page(grasping: made_up.MadeUpGrasping) -> Iterator[Page]:
 def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: Page) -> None:
     assert b"<title>congrasp" in page.ask("GET", "/")[1]
     assert page.ask("GET", "/static/gl.js")[0] == 200
-    for path in ("/static/../server.py", "/static/%2e%2e/server.py", "/etc/passwd", "/static/", "/api/none"):
+    hostile = ("HTTP://[", f"/static/{'a' * 300}.css", "/static/%00.css")
+    for path in ("/static/../server.py", "/static/%2e%2e/server.py", "/etc/passwd", "/static/", "/api/none", *hostile):
         assert page.ask("GET", path)[0] == 404, path
 
 
-def test_other_sites_are_turned_away(page: Page) -> None:
+def test_a_result_that_is_not_json_is_answered() -> None:
+    server = PageServer({"/api/nan": lambda query: {"x": float("nan")}}, {}, "127.0.0.1", 0)
+    code, found = Page(server.port).ask("GET", "/api/nan")
+    server.close()
+    assert code == 500 and "ValueError" in json.loads(found)["error"]
+
+
+def test_a_hundred_connections_at_once_find_room() -> None:
+    with _Server(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server, contextlib.ExitStack() as stack:
+        for _ in range(100):  # none is accepted yet
+            stack.enter_context(socket.create_connection(server.server_address[:2], 10.0))
+
+
+def test_other_sites_are_rejected(page: Page) -> None:
     assert page.ask("GET", "/api/state", Host="evil.example:80")[0] == 403
     assert page.ask("GET", "/api/state", Origin="http://evil.example")[0] == 403
     body = json.dumps({"action": "fill", "avoid": True}).encode()

@@ -81,4 +81,4 @@ def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(
     monkeypatch.setattr(metric_writers._TensorBoard, "write", refuse)
     publish(tmp_path, ["tensorboard"], range(4))
     assert len(read_metrics(tmp_path / "logs")["learner/0/kl"][0]) == 4
-    assert capsys.readouterr().err.count("tensorboard gets no more metrics") == 1
+    assert capsys.readouterr().err.count("tensorboard receives no more metrics") == 1

@@ -30,7 +30,7 @@ def test_an_importer_from_outside_needs_a_file_and_a_row(run_import, tmp_path, m
     known.check(sets["box"].arrays, 0, case)
     assert [(row["sequence"], row["rule"]) for row in report.dropped] == [("cup_lift", "no mesh")]
     (tmp_path / "empty").mkdir()
-    with pytest.raises(CongraspError, match=r"holds no sequence of own.*holds \*\.capture\.npz"):
+    with pytest.raises(CongraspError, match=r"holds no sequence of own.*folder with \*\.capture\.npz"):
         load("constraints")(["import", "own", str(tmp_path / "empty")])()
 
 

@@ -145,7 +145,7 @@ def test_wrong_hand_files_are_one_line(claw, tmp_path):
     refused("more than once", links=[*links, links[-1]])
     refused("is not a joint", open_pose={"elbow": 1.0})
     refused("outside its limits in the closed pose", closed_pose={"left_root": 3.0})
-    refused("no hand", links=3)
+    refused("not a hand", links=3)
     refused("'wings'|wings", wings=2)
     refused("mass above zero", links=[{**links[0], "mass": 0.0}, *links[1:]])
     joint = {**links[1]["joints"][0], "axis": [0.0, 2.0, 0.0]}

@@ -138,7 +138,7 @@ def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhe
     colours = {"colour_points": np.zeros((2, 3), np.float32), "colour_values": np.zeros((2, 3), np.uint8)}
     check_episode(Message(whole.arrays | colours, whole.meta))
     for name in colours:
-        with pytest.raises(CongraspError, match="without the other"):
+        with pytest.raises(CongraspError, match="colour_points without colour_values, or the reverse"):
             check_episode(Message(whole.arrays | {name: colours[name]}, whole.meta))
     far = {**colours, "colour_points": np.full((2, 3), 1e3, np.float32)}
     with pytest.raises(CongraspError, match="colour_points are more than 10 m"):

@@ -1,0 +1,68 @@
+"""Processes of congrasp that another one starts and ends."""
+
+import contextlib
+import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+
+from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
+
+CHILD_GRACE = 2.0
+"""Seconds for a child to drain; the rest of `GRACE` remains to kill it before this process must end."""
+
+
+@dataclasses.dataclass
+class Child:
+    """A process of the run."""
+
+    name: str
+    arguments: list[str]
+    log: pathlib.Path
+    environment: dict[str, str] = dataclasses.field(default_factory=dict)
+    process: subprocess.Popen[bytes] | None = None
+    restarts: int = 0
+    again_at: float = 0.0
+
+    def start(self) -> int:
+        """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies with its parent."""
+        environment = {**os.environ, **self.environment, PARENT_VARIABLE: str(os.getpid())}
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "congrasp", *self.arguments],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env=environment,
+                start_new_session=True,
+            )
+        register_child(self.process)
+        return self.process.pid
+
+    def last_line(self) -> str:
+        """The last line of its log."""
+        lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
+        return lines[-1].removeprefix("congrasp: error: ") if lines else "its log is empty"
+
+
+def wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    """Waits until all have ended, or the time is over."""
+    deadline = time.monotonic() + seconds
+    for process in processes:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(max(0.0, deadline - time.monotonic()))
+
+
+def end_all(children: Sequence[Child]) -> None:
+    """Sends SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE` seconds."""
+    running = [child.process for child in children if child.process is not None and child.process.poll() is None]
+    for process in running:
+        process.terminate()
+    wait_for(running, CHILD_GRACE)
+    for process in running:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
