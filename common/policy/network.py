@@ -16,6 +16,7 @@ NVIDIA GPUs) at half the cost.
 
 import itertools
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -105,14 +106,16 @@ class GatedNetwork(nn.Module):
         return nn.Dense(units, precision=self.precision, name=name)
 
 
-def _exact(layout: Layout, *sizes: Any) -> GatedNetwork:
+def _exact(
+    layout: Layout, hidden: tuple[int, ...], points: tuple[int, ...], encoder: int, outputs: int
+) -> GatedNetwork:
     """Returns the actor network of `_sizes`, with the same results on every device."""
-    return GatedNetwork(layout, *sizes, jax.lax.Precision.HIGHEST)
+    return GatedNetwork(layout, hidden, points, encoder, outputs, jax.lax.Precision.HIGHEST)
 
 
-def _fast(layout: Layout, *sizes: Any) -> GatedNetwork:
+def _fast(layout: Layout, hidden: tuple[int, ...], points: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
     """Returns the critic network of `_sizes`, in the device's default precision."""
-    return GatedNetwork(layout, *sizes, None)
+    return GatedNetwork(layout, hidden, points, encoder, outputs, None)
 
 
 def _sizes(tree: Params) -> tuple[tuple[int, ...], tuple[int, ...], int, int]:
@@ -124,7 +127,7 @@ def _sizes(tree: Params) -> tuple[tuple[int, ...], tuple[int, ...], int, int]:
     return hidden, points, next(iter(units.values()), 0), outputs
 
 
-def layer_count(tree: Params, kind: str) -> int:
+def layer_count(tree: Mapping[str, Any], kind: str) -> int:
     """Number of layers of the trunk, or of a cloud's points, in a network's parameters."""
     return sum(name.startswith(f"{kind}_") for name in tree)
 

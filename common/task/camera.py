@@ -6,6 +6,7 @@ object frame is the world frame: surface and goal of its scene are the cloud and
 with the camera's constant error. The true pose is not part of that scene.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -155,12 +156,11 @@ def behind(eye: Array, points: Array, capsules: Capsules) -> Array:
     """
     ray, axis = points - eye[:, None], capsules.ends[:, :, 1] - capsules.ends[:, :, 0]
     away = eye[:, None] - capsules.ends[:, :, 0]
-    exact = {"precision": jax.lax.Precision.HIGHEST}
+    product = functools.partial(jnp.einsum, "bni,bci->bnc", ray, precision=jax.lax.Precision.HIGHEST)
     a = jnp.sum(ray * ray, -1)[:, :, None]
     e = jnp.maximum(jnp.sum(axis * axis, -1), 1e-12)[:, None]
     f = jnp.sum(axis * away, -1)[:, None]
-    b = jnp.einsum("bni,bci->bnc", ray, axis, **exact)
-    c = jnp.einsum("bni,bci->bnc", ray, away, **exact)
+    b, c = product(axis), product(away)
     s = jnp.clip((b * f - c * e) / jnp.maximum(a * e - b * b, 1e-12), 0.0, 1.0)
     t = jnp.clip((b * s + f) / e, 0.0, 1.0)
     s = jnp.clip((b * t - c) / a, 0.0, 1.0)
