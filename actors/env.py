@@ -18,7 +18,9 @@ from congrasp.actors.stress import Frame, Protocol
 from congrasp.actors.success import Success
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
+from congrasp.common.task import camera as cameras
 from congrasp.common.task import metrics, privileged, sensing
+from congrasp.common.task.camera import Camera
 from congrasp.common.task.config import ControlConfig, RewardWeights, TaskConfig
 from congrasp.common.task.constraints import blocks
 from congrasp.common.task.constraints.base import Scene
@@ -89,6 +91,8 @@ class EnvState(NamedTuple):
     """(B, 6) momentum of the observer of the wrist's load (`common.task.control.track_load`)."""
     tracker: Tracker | None
     """Trackers of the objects' poses; None if the policy observes the true ones."""
+    camera: Camera | None
+    """Cameras, which replace the trackers; None if the policy has none."""
     readings: Readings | None
     """Latest readings of the sensors; None if the policy observes the true state."""
     success: Success
@@ -299,15 +303,16 @@ class GraspEnv:
             table=self.table_present(state),
         )
         sensed = None
-        if state.tracker is not None and state.readings is not None:
-            first = state.tracker.first
+        if state.readings is not None:
+            first = state.tracker.first if state.tracker else cameras.world(len(scene.q))
             begun = scene._replace(object_position_initial=first[:, :3], object_quaternion_initial=first[:, 3:])
-            sensed = self._view(state, sensing.seen_by(self.task, begun, state.readings))
-        return state._replace(views=Views(self._view(state, scene), sensed))
+            shown = (state.camera.cloud, state.camera.goal) if state.camera else (state.surface, state.goal)
+            sensed = self._view(sensing.seen_by(self.task, begun, state.readings), *shown)
+        return state._replace(views=Views(self._view(scene, state.surface, state.goal), sensed))
 
-    def _view(self, state: EnvState, scene: SceneState) -> View:
+    def _view(self, scene: SceneState, surface: Surface, goal: Goal) -> View:
         """Returns a control step with its features."""
-        return View(scene, features(self.hand, self.task, scene, state.surface, state.goal))
+        return View(scene, features(self.hand, self.task, scene, surface, goal))
 
     def scene_of(self, state: EnvState) -> Scene:
         """Scene of the current control step, as input of the task's terms."""
@@ -318,7 +323,8 @@ class GraspEnv:
         """Scene of the current control step as observed by the policy."""
         assert state.views is not None, "call `with_scene` first"
         view = state.views.sensed or state.views.true
-        return Scene(self.hand, self.task, *view, state.goal, state.readings)
+        cloud, goal = (state.camera.cloud, state.camera.goal) if state.camera else (None, state.goal)
+        return Scene(self.hand, self.task, *view, goal, state.readings, cloud)
 
     def privileged(self, state: EnvState) -> Scene:
         """Scene of the current control step as observed by a policy of the full state."""
@@ -327,40 +333,52 @@ class GraspEnv:
     def critic_inputs(self, state: EnvState, masses: Array) -> Array:
         """Privileged inputs (B, P) of the critic; `masses` are those of `Settings`."""
         start = state.reset_state
+        sensor = state.camera or state.tracker
         parameters = privileged.Parameters(
             mass=masses[start.object_index] * start.mass_scale,
             friction=start.friction,
             gain_scale=start.gain_scale,
             stationary=start.stationary,
             hold=state.hold,
-            sensors=None if state.tracker is None else state.tracker.sensors,
+            sensors=None if sensor is None else sensor.sensors,
         )
         return privileged.observe(self.scene_of(state), parameters)
 
     def _first_readings(self, initial: InitialConditions) -> dict[str, Any]:
-        """Initial tracker and readings of episodes; None if the policy needs none."""
+        """Initial tracker or camera, and readings, of episodes; None if the policy needs none."""
+        found: dict[str, Any] = {"tracker": None, "camera": None, "readings": None}
         if not self.task.sensed:
-            return {"tracker": None, "readings": None}
+            return found
         start, task = initial.reset_state, self.task
         steps = sensing.longest(task.sensing, task.control_dt)
-        tracker = sensing.begin(initial.sensors, steps, start.object_position, start.object_quaternion)
+        if task.observation == "camera":
+            pose = jnp.concatenate([start.object_position, start.object_quaternion], -1)
+            found["camera"] = cameras.begin(task, initial.sensors, steps, pose, initial.surface, initial.goal)
+            shown = cameras.world(len(pose))
+        else:
+            found["tracker"] = sensing.begin(initial.sensors, steps, start.object_position, start.object_quaternion)
+            shown = found["tracker"].shown
         wrist = jnp.zeros((len(start.q), 6))
-        first = Readings(start.q, wrist, start.q, wrist, tracker.shown[:, :3], tracker.shown[:, 3:])
-        return {"tracker": tracker, "readings": sensing.still(first, task.history)}
+        first = Readings(start.q, wrist, start.q, wrist, shown[:, :3], shown[:, 3:])
+        return {**found, "readings": sensing.still(first, task.history)}
 
     def _sense(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
         """Returns the environments with the sensors' readings after a control step, in the carried frame."""
-        if state.tracker is None or state.readings is None:
+        if state.readings is None:
             return state
-        position, quaternion = physics_state.object_position, physics_state.object_quaternion
-        table, settle = self.table_present(state), self.task.sensing.settle
-        tracker = sensing.track(state.tracker, state.time, position, quaternion, table, settle)
-        shown = physics_state._replace(object_position=tracker.shown[:, :3], object_quaternion=tracker.shown[:, 3:])
-        shown = protocols.carried(shown, state.reset_state.base_quaternion, state.frame)
-        newest = Readings(
-            shown.q, shown.u, state.q_target, state.u_target, shown.object_position, shown.object_quaternion
-        )
-        return state._replace(tracker=tracker, readings=sensing.push(state.readings, newest))
+        start, tracker, camera, shown = state.reset_state, state.tracker, state.camera, physics_state
+        if tracker is not None:
+            true = shown.object_position, shown.object_quaternion
+            tracker = sensing.track(tracker, state.time, *true, self.table_present(state), self.task.sensing.settle)
+            shown = shown._replace(object_position=tracker.shown[:, :3], object_quaternion=tracker.shown[:, 3:])
+        shown = protocols.carried(shown, start.base_quaternion, state.frame)
+        if camera is not None:
+            camera = cameras.look(self.hand, camera, state.time, shown, start, state.surface)
+            world = cameras.world(len(shown.q))
+            shown = shown._replace(object_position=world[:, :3], object_quaternion=world[:, 3:])
+        pose = shown.object_position, shown.object_quaternion
+        newest = Readings(shown.q, shown.u, state.q_target, state.u_target, *pose)
+        return state._replace(tracker=tracker, camera=camera, readings=sensing.push(state.readings, newest))
 
     def table_present(self, state: EnvState) -> Array:
         """(B,) bool: the table is present in the coming control step."""

@@ -68,6 +68,8 @@ class NetworkConfig:
     """Units of the trunk's layers."""
     encoder: int = 64
     """Units of each optional constraint's encoder."""
+    points: tuple[int, ...] = (64, 128)
+    """Units of the layers through which each point of a camera's cloud passes before the maximum over the points."""
     initial_std: float = 0.6
     """Initial standard deviation of the action, in units of action."""
     privileged_critic: bool = True

@@ -28,8 +28,16 @@ _TASK: dict[str, tuple[float, float]] = {
     "trajectory_points": (2, 1000),
     "history": (2, 64),
 }
-_SENSING = {"period": 10.0, "delay": 1.0, "position_noise": 1.0, "rotation_noise": 3.2, "dropout": 1.0}
-"""Upper bounds of the ranges of a task's tracker."""
+_SENSING = {
+    "period": 10.0,
+    "delay": 1.0,
+    "position_noise": 1.0,
+    "rotation_noise": 3.2,
+    "dropout": 1.0,
+    "camera_distance": 10.0,
+    "camera_elevation": 1.5,
+}
+"""Upper bounds of the ranges of a task's tracker or camera."""
 _LAYERS, _UNITS = 16, 8192
 
 
@@ -55,6 +63,8 @@ def network_faults(network: NetworkConfig, layout: Sequence[tuple[str, int]], ac
     yield from _numbers(network)
     if not 1 <= len(network.hidden) <= _LAYERS or not all(1 <= units <= _UNITS for units in network.hidden):
         yield f"hidden is {str(network.hidden)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} units"
+    if not 1 <= len(network.points) <= _LAYERS or not all(1 <= units <= _UNITS for units in network.points):
+        yield f"points is {str(network.points)[:60]}, not 1 to {_LAYERS} layers of 1 to {_UNITS} units"
     if not 1 <= network.encoder <= _UNITS:
         yield f"encoder is {network.encoder}, not 1 to {_UNITS}"
     sizes = [size for _, size in layout]  # a policy of headings only has no mask

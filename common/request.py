@@ -14,14 +14,14 @@ class GraspRequest:
     """Constraints on one object, and the initial state of the episode.
 
     Omitted fields are free: `congrasp grasp` then attempts several values. A control loop must set `surface`, `q`,
-    `wrist` and `object_pose`.
+    `wrist` and `object_pose`; for a policy with a camera `cloud`, `q` and `wrist`, and constraints in the world frame.
     """
 
     constraints: Mapping[str, Mapping[str, np.ndarray]] = dataclasses.field(default_factory=lambda: {"heading": {}})
     """Goal arrays of the requested constraints by constraint and field, object frame, metres and radians
     (`common.task.constraints`): `{"heading": {"direction": (0, 0, -1)}, "fingers": {"allowed": (1, 1, 0, 0, 0)}}`."""
     avoid: np.ndarray | None = None
-    """(N,) bool: surface points that must not be touched, for an affordance."""
+    """(N,) bool: points of surface or cloud that must not be touched, for an affordance."""
     above: bool = False
     """Restricts the approach to 30 degrees around straight down, in any pose of the object."""
     rest: int | None = None
@@ -34,6 +34,8 @@ class GraspRequest:
     """Initial pose of the wrist in the world frame: the base of the virtual wrist joints."""
     object_pose: Pose | None = None
     """Initial pose of the object in the world frame."""
+    cloud: np.ndarray | None = None
+    """(N, 3) points of the visible part of the object's surface, world frame, m."""
 
     def given(self, constraint: str, field: str) -> np.ndarray | None:
         """Returns a goal array, or None if it is not requested."""

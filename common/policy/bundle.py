@@ -69,6 +69,8 @@ class PolicySpec:
     def schema(self) -> str:
         """Sixteen hex digits shared by policies that can replace each other."""
         sizes = [self.network.hidden, self.network.encoder]
+        if network.CLOUD in dict(self.layout):
+            sizes.append(self.network.points)
         text = json.dumps([_SCHEMA, self.hand, self.layout, self.action_size, sizes])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

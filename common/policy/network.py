@@ -1,7 +1,9 @@
 """Policy and critic networks, which have the same structure but share no weights, and the policy's diagonal Gaussian.
 
 State and heading are always active and feed the trunk directly. Each optional constraint has an encoder whose output is
-multiplied by the constraint's mask bit, so that the trunk receives zeros for an inactive constraint.
+multiplied by the constraint's mask bit, so that the trunk receives zeros for an inactive constraint. All points of a
+camera's cloud pass through the same layers, and the trunk receives the maxima over the points, which do not depend on
+their order (Qi et al. 2017, arXiv 1612.00593).
 
 All functions are pure. `params` is a nested dict with the entries `actor` and `critic`; observations are already
 normalised (`common.policy.normalizer`) and have any leading axes.
@@ -14,6 +16,7 @@ NVIDIA GPUs) at half the cost.
 
 import itertools
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -34,6 +37,8 @@ TRUNK = ("state", "heading", "mask")
 """Blocks that feed the trunk directly, in this order; the codes of the gated blocks follow."""
 PRIVILEGED = "privileged"
 """Block of the critic's privileged inputs, which follow the codes in its trunk."""
+CLOUD, POINT = "cloud", 4
+"""Block of a camera's cloud, always active, and its numbers a point."""
 _HIDDEN_GAIN = math.sqrt(2.0)
 _ACTION_GAIN = 0.01  # initial actions are noise around zero, independent of the observation
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -41,7 +46,7 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 def gated(layout: Layout) -> tuple[str, ...]:
     """Names of the optional blocks gated by the mask, in the order of its bits."""
-    return tuple(name for name, _ in layout if name not in (*TRUNK, PRIVILEGED))
+    return tuple(name for name, _ in layout if name not in (*TRUNK, CLOUD, PRIVILEGED))
 
 
 def check_layout(layout: Layout) -> None:
@@ -63,6 +68,7 @@ class GatedNetwork(nn.Module):
     Attributes:
       layout: names and sizes of the observation's blocks.
       hidden: units of the trunk's layers.
+      points: units of the layers of a cloud's points.
       encoder: units of each optional block's encoder.
       outputs: units of the linear output layer.
       precision: precision of the matrix products.
@@ -70,6 +76,7 @@ class GatedNetwork(nn.Module):
 
     layout: Layout
     hidden: tuple[int, ...]
+    points: tuple[int, ...]
     encoder: int
     outputs: int
     precision: jax.lax.Precision | None
@@ -79,6 +86,11 @@ class GatedNetwork(nn.Module):
         """Maps normalised observations (..., D) to (..., outputs)."""
         blocks = split(self.layout, observation)
         inputs = [blocks[name] for name in TRUNK]
+        if CLOUD in blocks:
+            x = blocks[CLOUD].reshape(*observation.shape[:-1], -1, POINT)
+            for depth, units in enumerate(self.points):
+                x = nn.elu(self._dense(units, f"{CLOUD}_{depth}")(x))
+            inputs.append(jnp.max(x, -2))
         for bit, name in enumerate(gated(self.layout)):
             code = nn.elu(self._dense(self.encoder, name)(blocks[name]))
             inputs.append(code * blocks["mask"][..., bit : bit + 1])
@@ -94,22 +106,30 @@ class GatedNetwork(nn.Module):
         return nn.Dense(units, precision=self.precision, name=name)
 
 
-def _exact(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
-    """Returns the actor network, with the same results on every device."""
-    return GatedNetwork(layout, hidden, encoder, outputs, jax.lax.Precision.HIGHEST)
+def _exact(
+    layout: Layout, hidden: tuple[int, ...], points: tuple[int, ...], encoder: int, outputs: int
+) -> GatedNetwork:
+    """Returns the actor network of `_sizes`, with the same results on every device."""
+    return GatedNetwork(layout, hidden, points, encoder, outputs, jax.lax.Precision.HIGHEST)
 
 
-def _fast(layout: Layout, hidden: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
-    """Returns the critic network, in the device's default precision."""
-    return GatedNetwork(layout, hidden, encoder, outputs, None)
+def _fast(layout: Layout, hidden: tuple[int, ...], points: tuple[int, ...], encoder: int, outputs: int) -> GatedNetwork:
+    """Returns the critic network of `_sizes`, in the device's default precision."""
+    return GatedNetwork(layout, hidden, points, encoder, outputs, None)
 
 
-def _sizes(tree: Params) -> tuple[tuple[int, ...], int, int]:
-    """Hidden, encoder and output units of a network, from its kernels' shapes."""
-    depth = sum(name.startswith("trunk_") for name in tree)
-    hidden = tuple(tree[f"trunk_{i}"]["kernel"].shape[-1] for i in range(depth))
-    encoders = [layer["kernel"].shape[-1] for name, layer in tree.items() if not name.startswith(("trunk_", "output"))]
-    return hidden, encoders[0] if encoders else 0, tree["output"]["kernel"].shape[-1]
+def _sizes(tree: Params) -> tuple[tuple[int, ...], tuple[int, ...], int, int]:
+    """Units of a network's trunk, points, encoders and output, from its kernels' shapes."""
+    units = {name: layer["kernel"].shape[-1] for name, layer in tree.items()}
+    depths = {kind: layer_count(tree, kind) for kind in ("trunk", CLOUD)}
+    hidden, points = (tuple(units.pop(f"{kind}_{i}") for i in range(depth)) for kind, depth in depths.items())
+    outputs = units.pop("output")
+    return hidden, points, next(iter(units.values()), 0), outputs
+
+
+def layer_count(tree: Mapping[str, Any], kind: str) -> int:
+    """Number of layers of the trunk, or of a cloud's points, in a network's parameters."""
+    return sum(name.startswith(f"{kind}_") for name in tree)
 
 
 def _critic_layout(layout: Layout, privileged: int) -> Layout:
@@ -123,8 +143,9 @@ def shapes(layout: Layout, action_size: int, config: NetworkConfig, privileged: 
     size = sum(size for _, size in layout)
     observation = jax.ShapeDtypeStruct((1, size), jnp.float32)
     critic_input = jax.ShapeDtypeStruct((1, size + privileged), jnp.float32)
-    actor = _exact(layout, config.hidden, config.encoder, action_size)
-    critic = _fast(_critic_layout(layout, privileged), config.hidden, config.encoder, 1)
+    sizes = (config.hidden, config.points, config.encoder)
+    actor = _exact(layout, *sizes, action_size)
+    critic = _fast(_critic_layout(layout, privileged), *sizes, 1)
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     return {
         "actor": {

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common.policy.network import TRUNK, Layout
+from congrasp.common.policy.network import CLOUD, POINT, TRUNK, Layout
 from congrasp.common.task.types import Array
 
 LIMIT = 10.0
@@ -87,7 +87,8 @@ def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
 
     `state` and `heading` are centred and divided by their standard deviation. Optional blocks are divided by their root
     mean square without centring: zero, which means "inactive", stays exactly zero, and a nearly constant feature is not
-    amplified to the clip. Mask bits are unchanged.
+    amplified to the clip. Mask bits are unchanged. All points of a cloud have the same scales, so that their order does
+    not matter.
     """
     size = sum(width for _, width in layout)
     shift, scale = np.zeros(size), np.ones(size)
@@ -100,6 +101,8 @@ def observation_affine(statistics: Statistics, layout: Layout) -> Affine:
         part = Statistics(statistics.count, statistics.mean[block], statistics.m2[block])
         if name not in TRUNK:
             mean_square = part.mean**2 + part.m2 / part.count
+            if name == CLOUD:
+                mean_square = np.tile(mean_square.reshape(-1, POINT).mean(0), width // POINT)
             scale[block] = 1.0 / np.maximum(np.sqrt(mean_square), _SMALLEST_STD)
         else:
             shift[block], scale[block] = part.mean, 1.0 / _std(part)

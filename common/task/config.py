@@ -83,9 +83,10 @@ class ControlConfig:
 
 @dataclasses.dataclass(frozen=True)
 class SensingConfig:
-    """Tracker that measures the object's pose (`common.task.sensing`): ranges, drawn uniformly at every reset.
+    """Tracker that measures the object's pose (`common.task.sensing`), or camera that shows its surface
+    (`common.task.camera`): ranges, drawn uniformly at every reset.
 
-    With zeros, the default, it gives the true pose at every control step.
+    With zeros, the default, either is perfect and measures at every control step.
     """
 
     period: tuple[float, float] = (0.0, 0.0)
@@ -93,11 +94,11 @@ class SensingConfig:
     delay: tuple[float, float] = (0.0, 0.0)
     """Latency of a sample in seconds, rounded to control steps; at most 1."""
     position_noise: tuple[float, float] = (0.0, 0.0)
-    """Standard deviation of each coordinate of a sample, m."""
+    """Standard deviation of each coordinate of a sample, or of the depth of an image's point, m."""
     rotation_noise: tuple[float, float] = (0.0, 0.0)
     """Standard deviation of a sample's rotation about each axis, rad."""
     dropout: tuple[float, float] = (0.0, 0.0)
-    """Probability that a sample is lost."""
+    """Probability that a sample, or a point of an image, is lost."""
     position_bias: tuple[float, float] = (0.0, 0.0)
     """Standard deviation of each coordinate of a constant error of all samples of an episode, m."""
     rotation_bias: tuple[float, float] = (0.0, 0.0)
@@ -105,6 +106,14 @@ class SensingConfig:
     settle: float = 0.0
     """The wrist is guided by the mean of the object's poses until one is this far from it, m, or the table is removed;
     0: by the first pose."""
+    single_image: float = 0.0
+    """Share of the episodes in which the camera takes one image, before the reach, and none after it."""
+    camera_distance: tuple[float, float] = (0.4, 0.8)
+    """Distance of the camera from the object at the start, m."""
+    camera_elevation: tuple[float, float] = (0.3, 1.2)
+    """Elevation of the camera above the object, rad; at most 1.5."""
+    camera_azimuth: tuple[float, float] = (-3.15, 3.15)
+    """Direction from the object to the camera about the vertical, from the world's x axis, rad."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,14 +195,15 @@ class TaskConfig(_Shares):
     """Sliding friction between hand and object, drawn uniformly at every reset."""
     gain_range: tuple[float, float] = (1.0, 1.0)
     """Factors on the finger servos' gains, drawn uniformly at every reset."""
-    observation: Literal["full", "tracked"] = "full"
-    """Observation of the policy: the full state of the simulator, or the sensors of a robot (`common.task.sensing`):
-    joint angles and targets, the wrist, and the object's pose from a tracker; no forces and no velocities, but the last
-    `history` steps."""
+    observation: Literal["full", "tracked", "camera"] = "full"
+    """Observation of the policy: the full state of the simulator, or the sensors of a robot: joint angles and targets,
+    the wrist, and the object's pose from a tracker (`common.task.sensing`) or a partial cloud of its surface from a
+    depth camera (`common.task.camera`); no forces and no velocities, but the last `history` steps."""
     history: int = 8
-    """Control steps in a tracked observation, including the current one: 2 to 64."""
+    """Control steps in a tracked or camera observation, including the current one: 2 to 64."""
     sensing: SensingConfig = SensingConfig()
-    """The tracker. A policy that observes the full state also gets the object's pose from it, unless it is perfect."""
+    """The tracker or camera. A policy that observes the full state also gets the object's pose from the tracker, unless
+    it is perfect."""
     drop_height: float = 0.05
     """Distance below the object's height at the table's removal at which it counts as fallen, m."""
     control: ControlConfig = ControlConfig()
@@ -204,4 +214,4 @@ class TaskConfig(_Shares):
     @property
     def sensed(self) -> bool:
         """True if the policy observes anything but the true state of the simulation."""
-        return self.observation == "tracked" or self.sensing != SensingConfig()
+        return self.observation != "full" or self.sensing != SensingConfig()

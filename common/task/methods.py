@@ -16,6 +16,9 @@ from congrasp.common.task.config import TaskConfig
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 STUDENT = "student"
 """Method of policies with a robot's sensors; `congrasp train --teacher` distils them."""
+CAMERA = "camera"
+"""Method of students with a depth camera instead of a tracker; `congrasp train --teacher NAME --method camera`."""
+STUDENTS = (STUDENT, CAMERA)
 STATIONARY_SHARE = 0.6
 """Share of the updates with stationary objects, in training with two phases: the paper's 15 of 25 hours."""
 
@@ -89,6 +92,10 @@ METHODS = {
         "no privileged observations: joints, wrist and a tracker's object poses over some steps, no forces and "
         "no velocities",
         task={"observation": "tracked"},
+    ),
+    CAMERA: Method(
+        "no privileged observations: joints, wrist and a partial cloud of the object's surface, no pose of it",
+        task={"observation": "camera"},
     ),
 }
 

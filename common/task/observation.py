@@ -14,6 +14,9 @@ from congrasp.common.task.geometry import flat, squash
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.types import Array
 
+_OF_POSE = ("object_displacement", "object_rotation", "past object_position", "past object_rotation")
+"""Fields that a camera does not provide, because they need the object's pose."""
+
 
 def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
     """Names and sizes of the observation's blocks, in order: the state, those of the constraints, and the mask."""
@@ -23,9 +26,12 @@ def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
 def fields(hand: Hand, task: TaskConfig) -> dict[str, tuple[ObservationField, ...]]:
     """Fields of every block, in order, restricted to those that the task's policy observes."""
     mask = "1 for each active constraint in the order of 'masks'; the block of an inactive one is zero"
-    past = _past_fields(hand, task) if task.observation == "tracked" else ()
+    past = _past_fields(hand, task) if task.observation != "full" else ()
+    meaning = "m, points of the camera's cloud, wrist frame, each with 1 if an active affordance avoids it, else 0"
+    cloud = (ObservationField("cloud", 4 * task.surface_points, meaning),)
     return {
-        "state": (*(field for field in _state_fields(hand) if _is_seen(task, field)), *past),
+        "state": tuple(field for field in (*_state_fields(hand), *past) if _is_seen(task, field)),
+        **({"cloud": cloud} if task.observation == "camera" else {}),
         **{
             block: tuple(field for field in content if _is_seen(task, field))
             for constraint in known(task)
@@ -39,6 +45,8 @@ def fields(hand: Hand, task: TaskConfig) -> dict[str, tuple[ObservationField, ..
 
 def _is_seen(task: TaskConfig, field: ObservationField) -> bool:
     """True if a field is part of the task's observation."""
+    if task.observation == "camera" and field.name in _OF_POSE:
+        return False
     return task.observation == "full" or not field.privileged
 
 
@@ -68,7 +76,7 @@ def _state_fields(hand: Hand) -> tuple[ObservationField, ...]:
 
 
 def _past_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
-    """Fields of a tracked observation for earlier control steps."""
+    """Fields of a robot's observation for earlier control steps."""
     f, past = len(hand.joints), task.history - 1
     order = f"for each of the last {past} control steps, newest first"
     return (
@@ -85,7 +93,7 @@ def _past_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
 
 def _past(scene: Scene) -> list[Array]:
     """Arrays (B, ...) of `_past_fields`."""
-    assert scene.readings is not None, "a tracked observation needs readings"
+    assert scene.readings is not None, "a robot's observation needs readings"
     now = Readings(*(field[:, :1] for field in scene.readings))
     past = Readings(*(field[:, 1:] for field in scene.readings))
     to_wrist = rotations.conjugate(scene.features.wrist_quaternion)[:, None]
@@ -97,6 +105,17 @@ def _past(scene: Scene) -> list[Array]:
         flat(rotations.rotate(to_wrist, past.object_position - now.object_position)),
         flat(rotations.rotate(to_wrist, _turn(past.object_quaternion, now.object_quaternion))),
     ]
+
+
+def _cloud(scene: Scene) -> Array:
+    """Points of the cloud in the wrist frame, each followed by its label: (B, 4 N)."""
+    assert scene.cloud is not None, "a camera observation needs a cloud"
+    features, cloud = scene.features, scene.cloud
+    points = rotations.inverse_transform(features.wrist_position, features.wrist_quaternion, cloud.points)
+    labels = jnp.zeros(cloud.avoid.shape)
+    if "affordance" in scene.goal.active:
+        labels = cloud.avoid * scene.gate("affordance")[:, None]
+    return flat(jnp.concatenate([points, labels[..., None]], -1))
 
 
 def _turn(start: Array, end: Array) -> Array:
@@ -128,8 +147,10 @@ def observe(scene: Scene) -> Array:
         state.table.astype(jnp.float32)[:, None],
     ]
     parts = _seen(task, values, _state_fields(hand))
-    if task.observation == "tracked":
-        parts += _past(scene)
+    if task.observation != "full":
+        parts += _seen(task, _past(scene), _past_fields(hand, task))
+    if task.observation == "camera":
+        parts.append(_cloud(scene))
     for constraint in known(task):
         described = constraint.fields(hand, task)
         observed = [_seen(task, *block) for block in zip(constraint.observe(scene), described, strict=True)]

@@ -17,9 +17,12 @@ from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.resting import resting_mean
 from congrasp.common.task.types import Array, SceneState
 
+NEVER = 20_000.0
+"""Period in control steps that no episode reaches."""
+
 
 class Sensors(NamedTuple):
-    """Trackers of B episodes, drawn at their start."""
+    """Trackers or cameras of B episodes, drawn at their start."""
 
     key: Array
     """(B, 2) uint32 random key of errors and losses."""
@@ -39,6 +42,8 @@ class Sensors(NamedTuple):
     """(B, 3) m, constant error of the samples, world frame."""
     rotation_bias: Array
     """(B, 3) rad, rotation vector of a constant error of the samples, world frame."""
+    eye: Array
+    """(B, 3) m, from the object's resting position to the camera, world frame."""
 
 
 class Tracker(NamedTuple):
@@ -91,16 +96,25 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
         deviation = jax.random.uniform(size, (batch, 1), minval=limits[0], maxval=limits[1])
         return deviation * jax.random.normal(direction, (batch, 3))
 
+    def placed(number: int) -> Array:
+        ranges = jnp.array((config.camera_distance, config.camera_elevation, config.camera_azimuth))
+        share = jax.random.uniform(jax.random.fold_in(key, number), (batch, 3))
+        distance, up, around = jnp.moveaxis(ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0]), -1, 0)
+        level = jnp.cos(up)
+        return distance[:, None] * jnp.stack([level * jnp.cos(around), level * jnp.sin(around), jnp.sin(up)], -1)
+
+    once = jax.random.uniform(jax.random.fold_in(key, 10), (batch,)) < config.single_image
     return Sensors(
         key=jax.random.key_data(jax.random.split(keys[0], batch)),
-        period=jnp.maximum(drawn(1, config.period) / control_dt, 1.0),
-        phase=drawn(2, (0.0, 1.0)),
+        period=jnp.where(once, NEVER, jnp.maximum(drawn(1, config.period) / control_dt, 1.0)),
+        phase=jnp.where(once, 0.0, drawn(2, (0.0, 1.0))),
         delay=jnp.round(drawn(3, config.delay) / control_dt).astype(jnp.int32),
         position_noise=drawn(4, config.position_noise),
         rotation_noise=drawn(5, config.rotation_noise),
         dropout=drawn(6, config.dropout),
         position_bias=bias(7, config.position_bias),
         rotation_bias=bias(8, config.rotation_bias),
+        eye=placed(9),
     )
 
 
@@ -132,19 +146,28 @@ def track(
       table: (B,) bool: the table is present.
       settle: see `SensingConfig`.
     """
-    sensors = tracker.sensors
-    pose = jnp.concatenate([position, quaternion], -1)
-    poses = jnp.concatenate([pose[:, None], tracker.poses[:, :-1]], 1)
-    taken = time - sensors.delay
-    periods = [jnp.floor(n / sensors.period + sensors.phase) for n in (taken - 1, taken)]
-    arrived = jnp.take_along_axis(poses, sensors.delay[:, None, None], 1)[:, 0]
-    sample, lost = _sampled(sensors, time, arrived)
-    fresh = (periods[1] > periods[0]) & ~lost
-    shown = jnp.where(fresh[:, None], sample, tracker.shown)
+    poses, arrived, due = arrival(tracker.sensors, tracker.poses, time, jnp.concatenate([position, quaternion], -1))
+    sample, lost = _sampled(tracker.sensors, time, arrived)
+    shown = jnp.where((due & ~lost)[:, None], sample, tracker.shown)
     if settle:
         first, rested = resting_mean(jnp, tracker.first, tracker.rested, shown, jnp.asarray(table), settle)
         tracker = tracker._replace(first=first, rested=rested)
     return tracker._replace(poses=poses, shown=shown)
+
+
+def arrival(sensors: Sensors, poses: Array, time: Array, pose: Array) -> tuple[Array, Array, Array]:
+    """Returns the poses in transit (B, K, 7) after a control step, the oldest (B, 7), and a mask (B,) of due samples.
+
+    Args:
+      sensors: periods and delays.
+      poses: (B, K, 7) poses in transit before the step, newest first.
+      time: (B,) int, see `track`.
+      pose: (B, 7) true poses after the step.
+    """
+    poses = jnp.concatenate([pose[:, None], poses[:, :-1]], 1)
+    taken = time - sensors.delay
+    periods = [jnp.floor(n / sensors.period + sensors.phase) for n in (taken - 1, taken)]
+    return poses, jnp.take_along_axis(poses, sensors.delay[:, None, None], 1)[:, 0], periods[1] > periods[0]
 
 
 def _sampled(sensors: Sensors, time: Array, pose: Array) -> tuple[Array, Array]:

@@ -84,7 +84,7 @@ def _evaluate(
     scene = scene_of(hand, full, state, surface, goal)
     ones = {field.name: 1.0 for field in dataclasses.fields(RewardWeights)}
     terms = reward_terms(scene, RewardWeights(**{**ones, "force_max": task.reward.force_max}))
-    own = scene._replace(task=task, readings=readings)
+    own = scene._replace(task=task, readings=readings, cloud=surface)
     return observe(own), observe_for_teacher(scene, own, task.control), privileged.observe(own, parameters), terms
 
 
@@ -152,8 +152,10 @@ def _goal(hand: Hand, task: TaskConfig, rng: np.random.Generator) -> Goal:
             shape = tuple(symbols[size] if isinstance(size, str) else size for size in array.shape)
             if array.kind == "flag":
                 made[name] = rng.random((_STATES, *shape)) < 0.5
+            elif array.kind in ("real", "position"):
+                made[name] = _within(rng, *shape, most=0.3)
             else:
-                made[name] = _within(rng, *shape, most=0.3) if array.kind == "real" else _unit(rng, *shape)
+                made[name] = _unit(rng, *shape)
         values[constraint.name] = constraint.goal(**made)
     return Goal(values, {block: np.ones(_STATES, bool) for constraint in known(task) for block in constraint.blocks})
 

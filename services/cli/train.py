@@ -12,7 +12,7 @@ from congrasp.common.config import MetricWriter, RunConfig, Split
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.io.inputs import file_name
-from congrasp.common.task.methods import with_method
+from congrasp.common.task.methods import STUDENT, STUDENTS, with_method
 from congrasp.learner.run_directory import CONFIG_FILE, open_run
 from congrasp.services.train.presets import get_preset, with_hand
 from congrasp.services.train.student import student_of
@@ -47,8 +47,8 @@ def train(
       config: The run.
       preset: Named configuration to start from: quickstart, full, human, allegro or sharpa.
       method: What of it is trained: ours, a baseline or ablation of the paper (graspxl, dgrasp, no-dynamic-center,
-        no-feedforward, two-phase, single-stage), or what a robot can use (student), whose settings then hold. By
-        default the preset's, ours.
+        no-feedforward, two-phase, single-stage), or what a robot can use (student, with a tracker; camera, with a
+        depth camera), whose settings then hold. By default the preset's, ours.
       hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by default the
         preset's.
       run_dir: Where the run is kept; runs/NAME-DATE by default.
@@ -58,8 +58,8 @@ def train(
         actors. The batch grows with them.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
       teacher: A policy file, or the hand of a pretrained policy, to distil into a policy for robots, which sees the
-        joints, the wrist and a tracker's object poses, no forces and no velocities (docs/students.md). The task is the
-        teacher's, the algorithm `distill`.
+        joints, the wrist and a tracker's object poses, no forces and no velocities (docs/students.md), or with
+        `--method camera` a partial point cloud (docs/camera.md). The task is the teacher's, the algorithm `distill`.
       constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp constraints import'); their
         objects are those of --objects.folder, and --objects.procedural puts others beside them.
       split: Of these sets the part for training (the default), what is held out, or all.
@@ -121,7 +121,8 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
         return {"preset": preset, "config": config}
     config = get_preset(preset, hand)
     if teacher := _value("--teacher", arguments):
-        config = student_of(config, teacher)
+        method = _value("--method", arguments)
+        config = student_of(config, teacher, method if method in STUDENTS else STUDENT)
     return {"preset": preset, "config": config}
 
 

@@ -14,9 +14,11 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy import Answer, Policy, State
 
 _REQUIRED = ("surface", "q", "wrist", "object_pose")
+_WITH_CAMERA = ("cloud", "q", "wrist")
 _MEASURED = ("q", "u", "object_position", "object_quaternion")
 _FIRST = ("object_position_initial", "object_quaternion_initial")
 _READ = (*_MEASURED, "q_target", "u_target")
+_POINTS = ("surface_points", "cloud", "surface_avoid")
 _LONGEST = 64  # control steps that a policy may look back
 
 
@@ -50,7 +52,7 @@ class EpisodePolicy(Policy):
         rest, rested = self._resting(state)
         (answer,) = self._ask({**self._begun(), **rest}, [state])
         known = {**self._begun(), **state}
-        reading = {name: _numbers(name, known[name]) for name in _READ}
+        reading = {name: _numbers(name, known[name]) for name in _READ if name in known}
         self._past = [reading, *self._past[: _LONGEST - 1]]
         self._begun().update(rest, q_target=answer.q_target, u_target=answer.u_target)
         self._time, self._rested = self._time + 1, rested
@@ -122,7 +124,7 @@ class EpisodePolicy(Policy):
             self._packer = _Packer(reply.meta, episode, len(reply.arrays["q_target"]))
             if len(states) == 1 and not (self._past and self._packer.looks_back):
                 return reply, [[reply.arrays[name]] for name in ("action", "q_target", "u_target")]
-        now |= {name: episode[name] for name in ("q_target", "u_target", *_FIRST)}
+        now |= {name: episode[name] for name in ("q_target", "u_target", *_FIRST) if name in episode}
         reply = self._query(self._packer.pack([{**now, **state} for state in states], self._past, meta))
         return reply, self._packer.unpack(reply)
 
@@ -140,12 +142,10 @@ class _Packer:
         self._digest, self._fields, self._fingers = layout["layout"], layout["fields"], fingers
         self.most, self.settle = int(layout.get("states", 1)), float(layout.get("settle", 0.0))
         self._past = {name: self._fields[f"past_{name}"][1] for name in _READ if f"past_{name}" in self._fields}
+        self._measured = [name for name in _MEASURED if name in self._fields]
         self.looks_back = bool(self._past)
         self._episode = np.zeros(layout["size"], np.float32)
-        points = self._fields["surface_points"][1]
         for name, value in episode.items():
-            if name in ("surface_points", "surface_avoid") and len(value) != points:
-                value = value[np.arange(points) * len(value) // points]
             self._write(self._episode, name, value)
 
     def pack(self, states: Sequence[State], past: Sequence[State], meta: Mapping[str, Any]) -> Message:
@@ -155,7 +155,7 @@ class _Packer:
         """
         vectors = np.tile(self._episode, (len(states), 1))
         for vector, state in zip(vectors, states, strict=True):
-            if lacking := [name for name in _MEASURED if name not in state]:
+            if lacking := [name for name in self._measured if name not in state]:
                 raise RefusedError(f"The query lacks the field '{lacking[0]}'.")
             for name, value in state.items():
                 self._write(vector, name, _numbers(name, value))
@@ -173,6 +173,8 @@ class _Packer:
         if name not in self._fields:
             raise RefusedError(f"The query has an unknown field '{name}'.", f"Known: {', '.join(self._fields)}.")
         offset, *shape = self._fields[name]
+        if name in _POINTS and value.ndim and len(value) and len(value) != shape[0]:
+            value = value[np.arange(shape[0]) * len(value) // shape[0]]
         if list(value.shape) != shape:
             raise RefusedError(f"The field '{name}' has shape {value.shape}; it must be {tuple(shape)}.")
         vector[offset : offset + math.prod(shape)] = value.ravel()
@@ -180,8 +182,9 @@ class _Packer:
 
 def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
     """The fields of a query that stay the same for an episode, and the first targets."""
-    lacking = [f"'{name}'" for name in _REQUIRED if getattr(request, name) is None]
-    if lacking or request.wrist is None or request.object_pose is None:
+    required = _REQUIRED if request.cloud is None else _WITH_CAMERA
+    lacking = [f"'{name}'" for name in required if getattr(request, name) is None]
+    if lacking or request.wrist is None:
         raise RefusedError(f"The request lacks {' and '.join(lacking)}.", "A control loop begins from where all is.")
     if request.above:
         raise RefusedError("The request is for a hand from above.", "Give the heading's direction to a control loop.")
@@ -191,9 +194,8 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
         "u_target": np.zeros(6),
         "base_position": request.wrist[0],
         "base_quaternion": request.wrist[1],
-        "object_position_initial": request.object_pose[0],
-        "object_quaternion_initial": request.object_pose[1],
-        "surface_points": request.surface,
+        **({} if request.object_pose is None else dict(zip(_FIRST, request.object_pose, strict=True))),
+        **{name: x for name, x in (("cloud", request.cloud), ("surface_points", request.surface)) if x is not None},
         **({} if request.avoid is None else {"surface_avoid": request.avoid}),
         **{f"{name}_{field}": value for name, own in request.constraints.items() for field, value in own.items()},
     }

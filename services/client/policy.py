@@ -45,7 +45,8 @@ class Policy(Protocol):
 
         Args:
           request: with `surface`, `q`, `wrist` (the base from now on) and `object_pose`, the goal arrays of its
-            constraints, and `avoid` if the affordance is among them.
+            constraints, and `avoid` if the affordance is among them. A policy with a camera takes `cloud` instead of
+            `surface` and `object_pose`, and constraints in the world frame.
 
         Raises:
           RefusedError: the request lacks one of them, or holds what is no array of numbers.
@@ -58,7 +59,8 @@ class Policy(Protocol):
         Args:
           state: `q`, `u`, `object_position`, `object_quaternion`, `table`; where there are sensors also `q_velocity`,
             `u_velocity`, `object_velocity`, `object_angular_velocity`, `contact_force`, `contact_position` and
-            `contact_found`, by the names and shapes of `common.task.types.SceneState` without the batch axis.
+            `contact_found`, by the names and shapes of `common.task.types.SceneState` without the batch axis. A policy
+            with a camera takes no pose of the object but, from a newer image, `cloud` (N, 3) in the world frame.
 
         Raises:
           RefusedError: the request or the state is bad. Its subclasses in `common.errors` tell what a program can act
@@ -87,8 +89,8 @@ class Policy(Protocol):
         Returns:
           `hand`, its `joints` (F names in the order of `q`), `open_pose` (F,) rad; `limits`, the fields of
           `JointLimits`, or None for a hand whose joints share motors; `period`, seconds of a control step;
-          `approach_steps`, control steps before the table is taken away in training; `observation` (`full` or
-          `tracked`), `constraints`, `surface_points`, `trajectory_points`.
+          `approach_steps`, control steps before the table is taken away in training; `observation` (`full`,
+          `tracked` or `camera`), `constraints`, `surface_points`, `trajectory_points`.
 
         Raises:
           TransportError: there is no response from the server.

@@ -10,7 +10,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands
-from congrasp.common.task.methods import STUDENT, evaluated_as
+from congrasp.common.task.methods import STUDENTS, evaluated_as
 
 Table = Literal[
     "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
@@ -121,7 +121,7 @@ def line_up(tables: Sequence[Table], given: Sequence[Entrant], hand: str, method
         if table == "hands" and not given:
             for name in pretrained_hands():
                 known.setdefault((name, "ours"), read_entrant(policy_file(None, name)))
-        taught = table == "sensing" and any(one.method == STUDENT for one in first)
+        taught = table == "sensing" and any(one.method in STUDENTS for one in first)
         if (taught or table == "ablation") and (own, "ours") not in known and own in pretrained_hands():
             known[own, "ours"] = read_entrant(policy_file(None, own))
         chosen = {

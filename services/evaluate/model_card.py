@@ -121,10 +121,10 @@ def _range(limits: tuple[float, float]) -> str:
 
 def _observed(task: TaskConfig) -> str:
     """Describes the observation of the policy."""
+    robot = f"It observes the last {task.history} control steps of joint angles, the wrist, their targets"
+    if task.observation == "camera":
+        return f"{robot}, and a partial cloud of the object from a depth camera; no pose, velocities or contact forces."
     if task.observation == "tracked":
-        return (
-            f"It observes the last {task.history} control steps of joint angles, the wrist, their targets and the "
-            "object's pose from a tracker; no velocities and no contact forces."
-        )
+        return f"{robot} and the object's pose from a tracker; no velocities and no contact forces."
     pose = "exact poses" if task.sensing == SensingConfig() else "the object's pose from a tracker"
     return f"It observes {pose}, velocities and contact forces."

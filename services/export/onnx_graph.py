@@ -10,7 +10,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.common.policy.network import TRUNK, gated
+from congrasp.common.policy.network import CLOUD, POINT, TRUNK, gated, layer_count
 from congrasp.common.policy.normalizer import LIMIT
 
 OPSET = 17
@@ -38,7 +38,15 @@ class _Graph:
     def dense(self, layers: Mapping[str, Any], layer: str, x: str, output: str) -> str:
         """Adds a layer of the network."""
         kernel = self.constant(f"{layer}.kernel", layers[layer]["kernel"])
-        return self.node("Gemm", [x, kernel, self.constant(f"{layer}.bias", layers[layer]["bias"])], output)
+        product = self.node("MatMul", [x, kernel], f"{output}.product")
+        return self.node("Add", [product, self.constant(f"{layer}.bias", layers[layer]["bias"])], output)
+
+    def stack(self, layers: Mapping[str, Any], kind: str, x: str) -> str:
+        """Adds the layers of the trunk, or of a cloud's points."""
+        for depth in range(layer_count(layers, kind)):
+            name = f"{kind}_{depth}"
+            x = self.node("Elu", [self.dense(layers, name, x, f"{name}.dense")], f"{name}.elu")
+        return x
 
 
 def policy_model(bundle: PolicyBundle, meta: Mapping[str, Any]) -> onnx.ModelProto:
@@ -59,15 +67,16 @@ def policy_model(bundle: PolicyBundle, meta: Mapping[str, Any]) -> onnx.ModelPro
     for (name, size), end in zip(layout, ends, strict=True):
         _slice(graph, "normalised", end - size, end, name)
     parts = list(TRUNK)
+    if CLOUD in dict(layout):
+        points = graph.node("Reshape", [CLOUD, graph.constant("points.shape", [0, -1, POINT], np.int64)], "points")
+        seen = graph.stack(layers, CLOUD, points)
+        parts.append(graph.node("ReduceMax", [seen], "points.most", axes=[1], keepdims=0))
     for bit, name in enumerate(gated(layout)):
         code = graph.node("Elu", [graph.dense(layers, name, name, f"{name}.dense")], f"{name}.code")
         gate = _slice(graph, "mask", bit, bit + 1, f"{name}.bit")
         parts.append(graph.node("Mul", [code, gate], f"{name}.gated"))
     x = graph.node("Concat", parts, "trunk", axis=-1)
-    for depth in range(sum(name.startswith("trunk_") for name in layers)):
-        name = f"trunk_{depth}"
-        x = graph.node("Elu", [graph.dense(layers, name, x, f"{name}.dense")], f"{name}.elu")
-    graph.dense(layers, "output", x, "action")
+    graph.dense(layers, "output", graph.stack(layers, "trunk", x), "action")
 
     def port(name: str, size: int) -> Any:
         """An input or output (batch, size)."""

@@ -4,9 +4,9 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from congrasp.common.task.methods import METHODS, STUDENT
+from congrasp.common.task.methods import METHODS, STUDENTS
 
-BASELINES = tuple(name for name in METHODS if name not in ("ours", STUDENT))
+BASELINES = tuple(name for name in METHODS if name not in ("ours", *STUDENTS))
 """Methods compared with the full system, all for one hand."""
 _ON_MANY_OBJECTS = ("ours", "graspxl", "no-dynamic-center")
 """Methods tested by the paper on large-scale objects."""

@@ -17,7 +17,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.priority import explain, resolve
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import seen_by
-from congrasp.common.task.types import SceneState, Surface
+from congrasp.common.task.types import SceneState
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.limits import JointLimits
 from congrasp.services.serve.requests import PACKED, STATES_LIMIT, Layout, Query
@@ -115,12 +115,12 @@ class PolicyFunction:
         hand, task = self.layout.hand, self.layout.task
         fields, checks = self.layout.complete(vectors)
         asked = {c.name: fields["asked"][:, i] > 0.5 for i, c in enumerate(self.layout.known) if c.optional}
-        surface = Surface(fields["surface_points"], fields["surface_avoid"])
+        surface = self.layout.surface(fields)
         resolution = resolve(hand, surface, self.layout.goal(fields), asked)
         state = SceneState(**{name: fields[name] for name in SceneState._fields})
         if (readings := self.layout.readings(fields)) is not None:
             state = seen_by(task, state, readings)
-        scene = scene_of(hand, task, state, surface, resolution.goal, readings)
+        scene = scene_of(hand, task, state, surface, resolution.goal, readings)._replace(cloud=surface)
         mean = mean_action(observation.layout(hand, task), weights, observation.observe(scene))
         action = control.decode(scene, task.control, mean)
         notes = jnp.stack([resolution.redirected, resolution.aligned], -1)

@@ -8,6 +8,9 @@ For a policy with history (`TaskConfig.observation` "tracked") it also carries `
 `past_u_target`, `past_object_position` and `past_object_quaternion` of earlier control steps, newest first; without
 them, those of the current one are repeated.
 
+For a policy with a camera ("camera") `cloud` (N, 3) replaces `surface_points` and all fields of the object's pose and
+velocity. Cloud and constraints are in the world frame.
+
 A query may also be packed: the vector itself as its single array, with the digest of its layout in the metadata. A
 named query can request the `layout` with its reply. Packed queries cost both ends a quarter. They may hold several
 states, one per row, with the same constraints; the reply then has as many rows.
@@ -26,6 +29,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError, LayoutError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import LONGEST_NAME
+from congrasp.common.task.camera import world
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import known, require_known
 from congrasp.common.task.sensing import Readings
@@ -34,6 +38,8 @@ from congrasp.common.wire.codec import Message
 
 STATES_LIMIT = 64
 """Most states in one query."""
+CLOUD = "cloud"
+"""Name of the points of a query to a policy with a camera."""
 SURFACE_LIMIT = 4096
 """Most surface points in one query; the policy uses `TaskConfig.surface_points` of them."""
 PACKED = "packed"
@@ -87,12 +93,14 @@ class Layout:
         self._neutral = {
             f"{c.name}_{name}": value for c in self.known for name, value in c.neutral(hand, task)._asdict().items()
         }
-        self.shapes = {name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in SceneState._fields}
-        self._past = [f"past_{name}" for name in Readings._fields] if task.observation == "tracked" else []
+        self.points = CLOUD if task.observation == "camera" else "surface_points"
+        self._state = [n for n in SceneState._fields if not (self.points == CLOUD and n.startswith("object_"))]
+        self.shapes = {name: special.get(name, (4,) if "quaternion" in name else (3,)) for name in self._state}
+        self._past = [f"past_{n}" for n in Readings._fields if n in self._state] if task.observation != "full" else []
         steps = (task.history - 1,)
         self.shapes |= {name: (*steps, *self.shapes[name.removeprefix("past_")]) for name in self._past}
         self.shapes |= {name: np.shape(value) for name, value in self._neutral.items()}
-        self.shapes |= {"surface_points": (points, 3), "surface_avoid": (points,), "asked": (len(self.known),)}
+        self.shapes |= {self.points: (points, 3), "surface_avoid": (points,), "asked": (len(self.known),)}
         self.offsets = {}
         self.size = 0
         for name, shape in self.shapes.items():
@@ -101,7 +109,7 @@ class Layout:
         own = [name for name, (_, _, array) in self._arrays.items() if array.kind in ("direction", "quaternion")]
         self._flags = [name for name, (_, _, array) in self._arrays.items() if array.kind == "flag"]
         past = [name for name in self._past if "quaternion" in name]
-        self._directions = [*(name for name in SceneState._fields if "quaternion" in name), *past, *own]
+        self._directions = [*(name for name in self._state if "quaternion" in name), *past, *own]
         self.digest = hashlib.sha256(json.dumps(self.description()).encode()).hexdigest()[:16]
 
     def description(self) -> dict[str, Any]:
@@ -149,8 +157,8 @@ class Layout:
         if unknown:
             shown = ascii(unknown[0])[:60]
             raise CongraspError(f"The query has an unknown field {shown}.", f"Known: {', '.join(self.shapes)}.")
-        required = [name for name in SceneState._fields if name not in _OPTIONAL_STATE]
-        required += ["surface_points"]
+        required = [name for name in self._state if name not in _OPTIONAL_STATE]
+        required.append(self.points)
         required += [n for n, (c, _, array) in self._arrays.items() if c.name in asked and array.required]
         required += [name for constraint in self.known if constraint.name in asked for name in constraint.needs]
         for name in required:
@@ -158,7 +166,7 @@ class Layout:
                 raise CongraspError(f"The query lacks the field '{name}'.")
         vector = np.zeros(self.size, np.float32)
         given = dict(arrays)
-        given["surface_points"], given["surface_avoid"] = self._surface(given)
+        given[self.points], given["surface_avoid"] = self._resampled(given)
         for name in self._past:  # without history, the current state is repeated
             given.setdefault(name, np.broadcast_to(given[name.removeprefix("past_")], self.shapes[name]))
         for name, value in given.items():
@@ -191,9 +199,18 @@ class Layout:
             fields[name], length = _unit(fields[name], wanted, default)
             lengths.append(length)
         fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"])
-        surface, goal = Surface(fields["surface_points"], fields["surface_avoid"]), self.goal(fields)
+        frame, still = world(len(vectors)), jnp.zeros((len(vectors), 3))
+        for name in (name for name in SceneState._fields if name not in self._state):  # the object frame is the world's
+            fields[name] = frame[:, 3:] if "quaternion" in name else still
+            if name in Readings._fields:
+                fields[f"past_{name}"] = jnp.repeat(fields[name][:, None], self.task.history - 1, 1)
+        surface, goal = self.surface(fields), self.goal(fields)
         fitting = [~asked[:, i] | c.valid(surface, goal[c.name]) for i, c in enumerate(self.known)]
         return fields, jnp.stack([finite, *fitting, *lengths], 1)
+
+    def surface(self, fields: Mapping[str, Any]) -> Surface:
+        """Returns the labelled surface points, or the cloud, of completed fields."""
+        return Surface(fields[self.points], fields["surface_avoid"])
 
     def goal(self, fields: Mapping[str, Any]) -> Goal:
         """Returns the goal arrays of completed fields, before the priority rules."""
@@ -238,12 +255,12 @@ class Layout:
             )
         return tuple(constraint.name for constraint in self.known if constraint.name in names)
 
-    def _surface(self, arrays: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    def _resampled(self, arrays: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Points and labels, resampled to the number that the policy uses."""
-        points = np.asarray(arrays["surface_points"])
+        points = np.asarray(arrays[self.points])
         if points.ndim != 2 or points.shape[1] != 3 or not 1 <= len(points) <= SURFACE_LIMIT:
             raise CongraspError(
-                f"The field 'surface_points' has shape {points.shape}; it must be (N, 3), N at most {SURFACE_LIMIT}."
+                f"The field '{self.points}' has shape {points.shape}; it must be (N, 3), N at most {SURFACE_LIMIT}."
             )
         avoid = np.asarray(arrays.get("surface_avoid", np.zeros(len(points), bool)))
         if avoid.shape != (len(points),):

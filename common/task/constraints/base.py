@@ -37,8 +37,9 @@ class GoalArray:
     """Shape without the batch axis; each entry is a symbol of `symbol_sizes` or a number."""
     meaning: str
     """Unit, frame and meaning."""
-    kind: Literal["real", "direction", "quaternion", "flag"] = "real"
-    """Kind of value: directions and quaternions must be unit vectors; flags are booleans."""
+    kind: Literal["real", "position", "direction", "quaternion", "flag"] = "real"
+    """Kind of value: positions, directions and quaternions are in the object frame, and the latter two must be unit
+    vectors; flags are booleans."""
     neutral: tuple[float, ...] = ()
     """Last axis of the value used where no request gives one; zeros by default."""
     required: bool = True
@@ -111,6 +112,8 @@ class Scene(NamedTuple):
     goal: Goal
     readings: "Readings | None" = None
     """Last control steps, if the policy observes them."""
+    cloud: Surface | None = None
+    """Cloud of the camera, world frame, if the policy has one."""
 
     def gate(self, block: str) -> Array:
         """(B,) 1 if a block is active, else 0."""

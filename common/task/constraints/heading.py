@@ -40,7 +40,7 @@ _FAR = 0.15
 class HeadingGoal(NamedTuple):
     """Approach direction and target of the hand, object frame."""
 
-    position: Annotated[Array, GoalArray((3,), "m, target of the hand's centre (p-bar)")]
+    position: Annotated[Array, GoalArray((3,), "m, target of the hand's centre (p-bar)", "position")]
     direction: Annotated[
         Array, GoalArray((3,), "unit, direction in which the hand moves (v-bar)", "direction", neutral=(0.0, 0.0, -1.0))
     ]

@@ -43,7 +43,7 @@ class PoseGoal(NamedTuple):
     """A wrist pose in the object frame, and finger angles."""
 
     q: Annotated[Array, GoalArray(("F",), "rad, finger angles (q-bar)")]
-    position: Annotated[Array, GoalArray((3,), "m, object frame: wrist position")]
+    position: Annotated[Array, GoalArray((3,), "m, object frame: wrist position", "position")]
     quaternion: Annotated[
         Array, GoalArray((4,), "wrist frame to object frame", "quaternion", neutral=(1.0, 0.0, 0.0, 0.0))
     ]

@@ -47,7 +47,7 @@ _FAR, _TURNED = 0.15, 0.5
 class TrajectoryGoal(NamedTuple):
     """Wrist poses from the first, distant one to the grasp, object frame."""
 
-    position: Annotated[Array, GoalArray(("K", 3), "m, object frame: wrist waypoints")]
+    position: Annotated[Array, GoalArray(("K", 3), "m, object frame: wrist waypoints", "position")]
     quaternion: Annotated[
         Array, GoalArray(("K", 4), "wrist frame to object frame", "quaternion", neutral=(1.0, 0.0, 0.0, 0.0))
     ]

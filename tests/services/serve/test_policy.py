@@ -214,6 +214,30 @@ def test_a_policy_that_looks_back_is_told_what_was_before(episode):
     assert not np.array_equal(policy.act_each([moved])[0].u_target, policy.act_each([states[0]])[0].u_target)
 
 
+def test_a_policy_with_a_camera_takes_clouds_and_no_pose(episode):
+    """Its request and states hold clouds; a newer one changes the answer, and a pose is refused."""
+    task = dataclasses.replace(STUDENT.task, observation="camera")
+    policy = LocalPolicy(untrained(dataclasses.replace(STUDENT, task=task)))
+    own, cloud = episode.request, np.asarray(episode.request.surface) + episode.request.object_pose[0]
+    heading = own.constraints["heading"]
+    heading = {**heading, "position": np.asarray(heading["position"]) + own.object_pose[0]}
+    request = dataclasses.replace(
+        own, constraints={"heading": heading}, surface=None, object_pose=None, avoid=None, cloud=cloud[:100]
+    )
+    state = {name: episode.state[name] for name in ("q", "u", "table") if name in episode.state}
+    policy.reset(request)
+    for _ in range(3):
+        answer = policy.act(state)
+    assert answer.q_target.shape == state["q"].shape and policy.metadata()["observation"] == "camera"
+    again = policy.act_each([state, {**state, "cloud": cloud[:100]}, {**state, "cloud": cloud[:60] + 0.01}])
+    np.testing.assert_array_equal(again[0].action, again[1].action)
+    assert not np.array_equal(again[2].action, again[0].action)
+    with pytest.raises(RefusedError, match="unknown field 'object_position'"):
+        policy.act({**state, "object_position": np.zeros(3)})
+    with pytest.raises(RefusedError, match="lacks 'q'"):
+        policy.reset(dataclasses.replace(request, q=None))
+
+
 class Recorder(EpisodePolicy):
     """Keeps the fields of each query, and wants every joint at zero."""
 

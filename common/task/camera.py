@@ -1,0 +1,195 @@
+"""Depth camera instead of a tracker: a cloud of the visible part of an object's surface, and no pose of the object.
+
+An image is taken periodically or once, before the reach (`SensingConfig`). Its points are the object's surface points
+that no other part of the object hides (z-buffer on a coarse grid) nor the hand's capsules, with errors. The policy's
+object frame is the world frame: surface and goal of its scene are the cloud and the goal as stated at the start, both
+with the camera's constant error. The true pose is not part of that scene.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from congrasp.common import rotations
+from congrasp.common.hands import kinematics
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.constraints import known
+from congrasp.common.task.sensing import Sensors, arrival
+from congrasp.common.task.types import Array, Goal, Surface
+
+
+class Camera(NamedTuple):
+    """State of the cameras of B episodes after a control step; world frame."""
+
+    sensors: Sensors
+    origin: Array
+    """(B, 3) true position of the object at the start; the constant rotation error is about it."""
+    poses: Array
+    """(B, K, 7) true poses of the object in the last K control steps, newest first."""
+    goal: Goal
+    """Goal of the episode, with the constant error."""
+    cloud: Surface
+    """Latest cloud, N points with labels."""
+
+
+class Capsules(NamedTuple):
+    """Capsules that hide what is behind them; world frame."""
+
+    ends: Array
+    """(B, C, 2, 3) m."""
+    radii: Array
+    """(C,) m."""
+
+
+def begin(task: TaskConfig, sensors: Sensors, steps: int, pose: Array, surface: Surface, goal: Goal) -> Camera:
+    """Returns cameras with one image before the reach, in which the hand hides nothing.
+
+    Args:
+      task: the task.
+      sensors: cameras and their errors.
+      steps: control steps K for which a pose may be in transit.
+      pose: (B, 7) resting poses of the objects.
+      surface: their labelled surface points, object frame.
+      goal: goals, object frame.
+    """
+    origin = pose[:, :3]
+    position = origin + sensors.position_bias
+    quaternion = rotations.multiply(rotations.from_rotation_vector(sensors.rotation_bias), pose[:, 3:])
+    empty = Surface(jnp.broadcast_to(position[:, None], surface.points.shape), jnp.zeros_like(surface.avoid))
+    poses = jnp.broadcast_to(pose[:, None], (len(pose), steps, 7))
+    camera = Camera(sensors, origin, poses, goal_in_world(task, goal, position, quaternion), empty)
+    return _image(camera, jnp.zeros(len(pose), jnp.int32), jnp.ones(len(pose), bool), pose, surface, None)
+
+
+def look(hand: Hand, camera: Camera, time: Array, state: Any, start: Any, surface: Surface) -> Camera:
+    """Advances the cameras by one control step.
+
+    An image that arrives shows the object as it was `Sensors.delay` steps ago, behind the hand of this step.
+
+    Args:
+      hand: the hand.
+      camera: state after the previous step.
+      time: (B,) int control steps since the start of the episodes, including this one.
+      state: true state of the engine after the step (`actors.physics.engine.PhysicsState`).
+      start: initial state of the episodes (`actors.physics.engine.ResetState`), for the wrist's base.
+      surface: labelled surface points, object frame.
+    """
+    pose = jnp.concatenate([state.object_position, state.object_quaternion], -1)
+    poses, arrived, due = arrival(camera.sensors, camera.poses, time, pose)
+    turn = rotations.euler_to_quaternion(state.u[:, 3:])
+    wrist = rotations.compose_pose(start.base_position, start.base_quaternion, state.u[:, :3], turn)
+    capsules = hand_capsules(hand, state.q, *wrist)
+    return _image(camera._replace(poses=poses), time, due, arrived, surface, capsules)
+
+
+def world(batch: int) -> Array:
+    """Returns the pose (B, 7) of the policy's object frame: position, m, and quaternion."""
+    return jnp.broadcast_to(jnp.array((0.0, 0, 0, 1, 0, 0, 0)), (batch, 7))
+
+
+def hand_capsules(hand: Hand, q: Array, position: Array, quaternion: Array) -> Capsules:
+    """Returns the capsules of hands with fingers at q (B, F) and wrists at (B, 3), (B, 4)."""
+    turn, shift = kinematics.link_transforms(hand, q)
+    links = hand.capsule_links
+    ends = rotations.apply(turn[:, links], jnp.asarray(hand.capsules)) + shift[:, links, None]
+    flat = rotations.transform(position, quaternion, ends.reshape(len(q), -1, 3))
+    return Capsules(flat.reshape(ends.shape), jnp.asarray(hand.capsule_radii))
+
+
+def _image(camera: Camera, time: Array, due: Array, pose: Array, surface: Surface, hand: Capsules | None) -> Camera:
+    """Replaces the clouds of cameras with a due image (B,) in which any point is visible."""
+    sensors, count = camera.sensors, surface.points.shape[1]
+
+    def errors(key: Array, time: Array) -> tuple[Array, Array]:
+        noise, loss = jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key), time))
+        return jax.random.normal(noise, (count,)), jax.random.uniform(loss, (count,))
+
+    noise, luck = jax.vmap(errors)(sensors.key, time)
+    eye = camera.origin + sensors.eye
+    points = rotations.transform(pose[:, :3], pose[:, 3:], surface.points)
+    visible = facing(eye, points) & (luck >= sensors.dropout[:, None])
+    if hand is not None:
+        visible &= ~behind(eye, points, hand)
+    ray = points - eye[:, None]
+    ray = ray / jnp.maximum(jnp.linalg.norm(ray, axis=-1, keepdims=True), 1e-6)
+    measured = points + (sensors.position_noise[:, None] * noise)[..., None] * ray
+    turn = rotations.from_rotation_vector(sensors.rotation_bias)
+    measured = rotations.transform(camera.origin + sensors.position_bias, turn, measured - camera.origin[:, None])
+    index = _filled(visible)
+    fresh = (due & jnp.any(visible, -1))[:, None]
+    cloud = Surface(
+        jnp.where(fresh[..., None], jnp.take_along_axis(measured, index[..., None], 1), camera.cloud.points),
+        jnp.where(fresh, jnp.take_along_axis(surface.avoid, index, 1), camera.cloud.avoid),
+    )
+    return camera._replace(cloud=cloud)
+
+
+def facing(eye: Array, points: Array) -> Array:
+    """(B, N) bool: points (B, N, 3) that no other point hides from cameras at (B, 3).
+
+    The image of the points is divided into sqrt(N) / 2 by as many cells. Visible are the points of a cell that are no
+    farther than its nearest one by more than the longer side of a cell at the points' middle.
+    """
+    middle = jnp.mean(points, 1)
+    quaternion = rotations.frame_from_axes(middle - eye, jnp.array((0.0, 0.0, 1.0)))
+    depth, *across = jnp.moveaxis(rotations.inverse_transform(eye, quaternion, points), -1, 0)
+    cells = max(int(points.shape[1] ** 0.5 / 2), 1)
+    place, sides = jnp.zeros(depth.shape, jnp.int32), []
+    for tangent in (each / depth for each in across):
+        low = jnp.min(tangent, -1, keepdims=True)
+        side = jnp.maximum(jnp.max(tangent, -1, keepdims=True) - low, 1e-6) / cells
+        place = place * cells + jnp.clip(jnp.floor((tangent - low) / side), 0, cells - 1).astype(jnp.int32)
+        sides.append(side)
+    row = jnp.arange(len(points))[:, None]
+    nearest = jnp.full((len(points), cells**2), jnp.inf).at[row, place].min(depth)
+    thick = jnp.maximum(*sides) * jnp.linalg.norm(middle - eye, axis=-1, keepdims=True)
+    return depth <= jnp.take_along_axis(nearest, place, 1) + thick
+
+
+def behind(eye: Array, points: Array, capsules: Capsules) -> Array:
+    """(B, N) bool: points (B, N, 3) whose ray from the camera (B, 3) meets a capsule.
+
+    The least distance between ray and axis follows Ericson 2005, Real-Time Collision Detection, section 5.1.9.
+    """
+    ray, axis = points - eye[:, None], capsules.ends[:, :, 1] - capsules.ends[:, :, 0]
+    away = eye[:, None] - capsules.ends[:, :, 0]
+    product = functools.partial(jnp.einsum, "bni,bci->bnc", ray, precision=jax.lax.Precision.HIGHEST)
+    a = jnp.sum(ray * ray, -1)[:, :, None]
+    e = jnp.maximum(jnp.sum(axis * axis, -1), 1e-12)[:, None]
+    f = jnp.sum(axis * away, -1)[:, None]
+    b, c = product(axis), product(away)
+    s = jnp.clip((b * f - c * e) / jnp.maximum(a * e - b * b, 1e-12), 0.0, 1.0)
+    t = jnp.clip((b * s + f) / e, 0.0, 1.0)
+    s = jnp.clip((b * t - c) / a, 0.0, 1.0)
+    squared = jnp.sum(away * away, -1)[:, None] + s * (s * a + 2.0 * c) + t * (t * e - 2.0 * f - 2.0 * s * b)
+    return jnp.any(squared <= capsules.radii**2, -1)
+
+
+def _filled(which: Array) -> Array:
+    """Indices (B, N) of the true flags (B, N), repeated evenly until there are N; zeros if there is none."""
+    size, row = which.shape[1], jnp.arange(len(which))[:, None]
+    rank = jnp.where(which, jnp.cumsum(which, -1) - 1, size)
+    numbers = jnp.broadcast_to(jnp.arange(size), which.shape)
+    found = jnp.zeros(which.shape, jnp.int32).at[row, rank].set(numbers, mode="drop")
+    return jnp.take_along_axis(found, jnp.arange(size) * jnp.sum(which, -1, keepdims=True) // size, 1)
+
+
+def goal_in_world(task: TaskConfig, goal: Goal, position: Array, quaternion: Array) -> Goal:
+    """Returns goals of the object frame in the world frame, for objects at (B, 3), (B, 4)."""
+    for constraint in known(task):
+        moved = {}
+        for name, array in constraint.arrays.items():
+            value = getattr(goal[constraint.name], name)
+            turn = jnp.broadcast_to(quaternion.reshape(-1, *[1] * (value.ndim - 2), 4), (*value.shape[:-1], 4))
+            if array.kind == "position":
+                shift = position.reshape(-1, *[1] * (value.ndim - 2), 3)
+                moved[name] = shift + rotations.rotate(turn, value)
+            elif array.kind == "direction":
+                moved[name] = rotations.rotate(turn, value)
+            elif array.kind == "quaternion":
+                moved[name] = rotations.multiply(turn, value)
+        goal = goal.replace(constraint.name, **moved)
+    return goal

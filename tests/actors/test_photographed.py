@@ -1,0 +1,98 @@
+"""Environments whose policy sees a camera's cloud: the true pose of the object is not among its inputs."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.rollout import RolloutWorker
+from congrasp.common import rotations
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.task import observation, privileged
+from congrasp.common.task.config import SensingConfig, TaskConfig
+from congrasp.common.task.control import decode
+from congrasp.common.task.sampling.build import build_bank
+
+HAND = get_hand("human")
+OBJECTS = [procedural.generate(0, "cylinder")]
+TASK = TaskConfig(
+    constraints=("heading",), surface_points=64, approach_steps=16, hold_steps=4, hold_steps_max=4, history=3,
+    observation="camera", sensing=SensingConfig(period=(0.05, 0.05)),
+)  # fmt: skip
+BATCH = 2
+
+
+@pytest.fixture(scope="module")
+def running():
+    """Environments after 18 of an episode's 20 control steps, in which the fingers close."""
+
+    def close(parameters, seen, key):
+        action = jnp.zeros((len(seen), len(HAND.motors) + 6)).at[:, : len(HAND.motors)].set(0.8)
+        return action, jnp.zeros(len(seen))
+
+    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+    worker = RolloutWorker(
+        HAND, TASK, physics, build_bank(HAND, TASK, OBJECTS, 0), close, batch=BATCH, seed=0, half_precision=False,
+        traced=slice(None), taught=True, privileged=OBJECTS,
+    )  # fmt: skip
+    return worker, worker.collect(None, 18)
+
+
+def test_the_true_pose_changes_neither_observation_nor_targets(running):
+    worker, _ = running
+    env, state = worker.env, worker.state
+    physics_state = worker.physics.read(None)
+    moved = physics_state._replace(
+        object_position=physics_state.object_position + 0.3,
+        object_quaternion=jnp.tile(jnp.array([0.0, 0.6, 0.0, 0.8]), (BATCH, 1)),
+        object_velocity=physics_state.object_velocity + 1.0,
+        contact_force=physics_state.contact_force + 5.0,
+    )
+    away = state.reset_state._replace(object_position=state.reset_state.object_position + 0.2)
+    before, after = (
+        env.seen(env.with_scene(one, physics))
+        for one, physics in ((state, physics_state), (state._replace(reset_state=away), moved))
+    )
+    np.testing.assert_array_equal(observation.observe(before), observation.observe(after))
+    action = jnp.ones((BATCH, len(HAND.motors) + 6))
+    for one, other in zip(decode(before, TASK.control, action), decode(after, TASK.control, action), strict=True):
+        np.testing.assert_array_equal(one, other)
+    elsewhere = state.camera._replace(cloud=state.camera.cloud._replace(points=state.camera.cloud.points + 0.01))
+    shifted = env.seen(env.with_scene(state._replace(camera=elsewhere), physics_state))
+    assert np.abs(observation.observe(shifted) - observation.observe(before)).max() > 0.009
+
+
+def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):
+    worker, rollout = running
+    state, trace = worker.state, rollout.trace
+    points, turn = np.asarray(state.camera.cloud.points), np.asarray(trace.object_quaternion)
+    surface = np.asarray(state.surface.points)
+    ages = []
+    for age in range(5):  # an image is at most 5 control steps old
+        step = len(turn) - 1 - age
+        local = rotations.inverse_transform(trace.object_position[step], turn[step], points)
+        ages.append(np.linalg.norm(local[:, :, None] - surface[:, None], axis=-1).min(-1).max(-1))
+    np.testing.assert_allclose(np.min(ages, 0), 0.0, atol=1e-5)
+    scene = worker.env.seen(state)
+    np.testing.assert_array_equal(scene.state.object_position, 0.0)
+    own = observation.observe(scene)
+    start = sum(size for name, size in observation.layout(HAND, TASK)[:1])
+    block = np.asarray(own[:, start : start + 4 * 64]).reshape(BATCH, 64, 4)
+    features = scene.features
+    expected = rotations.inverse_transform(features.wrist_position, features.wrist_quaternion, points)
+    np.testing.assert_allclose(block[..., :3], expected, atol=1e-6)
+    assert not block[..., 3].any()
+
+
+def test_teacher_and_critic_see_the_true_state(running):
+    _, rollout = running
+    full = dataclasses.replace(TASK, observation="full")
+    size = sum(size for _, size in observation.layout(HAND, full))
+    names = [name for name, _ in observation.layout(HAND, full)]
+    assert "cloud" not in names and rollout.teacher_observation.shape[-1] > size
+    assert rollout.privileged.shape[-1] == sum(size for _, size in privileged.layout(HAND, TASK))
+    described = {field.name for block in observation.fields(HAND, TASK).values() for field in block}
+    assert not {"object_displacement", "object_rotation", "past object_position", "force"} & described
