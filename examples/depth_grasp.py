@@ -5,7 +5,7 @@
         --camera 0.5 0 0.4 0.271 -0.653 -0.653 0.271
 
 The image is a PNG of millimetres (16 bit) or an NPY of metres; without one, a cylinder is seen by a simulated camera.
-Points above the table are the object. Joints follow their targets like servos without load; a robot passes its readings.
+Points above the table are the object. Joints follow their targets like unloaded servos; a robot passes its readings.
 """
 
 import dataclasses
