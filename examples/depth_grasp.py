@@ -5,7 +5,7 @@
         --camera 0.5 0 0.4 0.271 -0.653 -0.653 0.271
 
 The image is a PNG of millimetres (16 bit) or an NPY of metres; without one, a cylinder is seen by a simulated camera.
-Points above the table are the object. Joints follow their targets exactly here; a robot passes its readings instead.
+Points above the table are the object. Joints follow their targets like unloaded servos; a robot passes its readings.
 """
 
 import dataclasses
@@ -24,6 +24,8 @@ from congrasp.common.task.constraints.heading import HeadingGoal, heading_wrist_
 
 SIZE = 160, 120
 """Width and height of the simulated image in pixels."""
+SERVO_RATE = 20.0
+"""kp / kv of the servos, 1/s."""
 SCENE = """<mujoco><worldbody><geom type="plane" size="2 2 .1"/>
 <geom type="cylinder" size=".03 .06" pos="0 0 .06"/></worldbody></mujoco>"""
 
@@ -58,7 +60,7 @@ class Arguments:
     steps: int = 200
     """Control steps of the motion."""
     out: pathlib.Path = pathlib.Path("motion.csv")
-    """Time, finger angles and wrist joints of each control step."""
+    """Time, finger targets and wrist targets of each control step."""
 
 
 def simulated(arguments: Arguments) -> np.ndarray:
@@ -111,8 +113,9 @@ def main(arguments: Arguments) -> None:
         rows = []
         for step in range(arguments.steps):
             answer = policy.act({"q": q, "u": u, "table": step < described["approach_steps"]})
-            q, u = answer.q_target, answer.u_target
-            rows.append([step * described["period"], *q, *u])
+            rows.append([step * described["period"], *answer.q_target, *answer.u_target])
+            share = 1.0 - np.exp(-SERVO_RATE * described["period"])
+            q, u = q + share * (answer.q_target - q), u + share * (answer.u_target - u)
     names = ["time", *described["joints"], "x", "y", "z", "rx", "ry", "rz"]
     np.savetxt(arguments.out, rows, "%.6f", ",", header=",".join(names), comments="")
     print(f"{arguments.out}: {len(rows)} control steps for {len(cloud)} points.")
