@@ -1,7 +1,7 @@
 """Initial conditions, given or drawn from a constraint bank (paper, sections Training Setup, Hand Initialization)."""
 
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import jax
@@ -134,9 +134,9 @@ class PlannedEpisodes(NamedTuple):
 
 
 def planned(
-    hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, plan: PlannedEpisodes, asked: Sequence[str]
+    hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, plan: PlannedEpisodes, asked: Mapping[str, Array]
 ) -> InitialConditions:
-    """Draws planned episodes under the constraints of these names, each from a separate key.
+    """Draws planned episodes under the requested constraints, each from a separate key.
 
     An episode therefore does not depend on the others.
 
@@ -146,13 +146,13 @@ def planned(
       bank: the constraint bank; it must allow the constraints (`allowing`).
       key: random key of all episodes under these constraints.
       plan: the episodes.
-      asked: names of the optional constraints of every episode.
+      asked: () bool for each optional constraint by name: True if every episode requests it.
     """
 
     def one(episode: PlannedEpisodes) -> InitialConditions:
         own = jax.random.fold_in(jax.random.fold_in(key, episode.names), episode.numbers)
         draw = Draw(bank, episode.objects[None], episode.rests[None])
-        wanted = {c.name: jnp.array([c.name in asked]) for c in optional(task)}
+        wanted = {name: jnp.reshape(wish, 1) for name, wish in asked.items()}
         return _drawn(hand, task, draw, own, wanted, False, _nominal(task, 1))
 
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(one)(plan))
