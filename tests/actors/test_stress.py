@@ -233,7 +233,7 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     for each in probed:
         each.adjust(protocol=protocols.stress(task, OBJECTS, 10), probe_data=distance_field(OBJECTS))
     ended, measured = probed
-    measured.state = measured.state._replace(after=jnp.full(4, after))
+    measured.state = measured.state._replace(after=jnp.full_like(measured.state.after, after))
     bare, one, other = (each.collect(None, 30) for each in (plain, ended, measured))
     np.testing.assert_array_equal(one.action, other.action)
     np.testing.assert_array_equal(one.episodes, other.episodes)
@@ -242,6 +242,7 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     np.testing.assert_allclose(bare.episodes, one.episodes, rtol=1e-5, atol=1e-6)
     assert one.terminal[-1].all() and one.has_episode.all() and other.has_episode.all() and not other.terminal.any()
     rest = measured.collect(None, after)
+    assert [program._cache_size() for program in (measured._decide_jit, measured._advance_jit)] == [1, 1]
     np.testing.assert_array_equal(rest.episodes, one.episodes)
     assert not rest.has_episode.any() and rest.terminal[-1].all() and not rest.terminal[:-1].any()
     samples = jax.tree.map(lambda *x: np.concatenate(x), other.probed, rest.probed)
