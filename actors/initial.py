@@ -263,7 +263,7 @@ def handover_speed(task: TaskConfig) -> float:
 
 
 def given(
-    hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int, speed: float = 0.0
+    hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: Array | int, speed: Array | float
 ) -> tuple[InitialConditions, Resolution]:
     """Returns requested episodes of one object of nominal mass and friction, and the effects of the priority rules.
 

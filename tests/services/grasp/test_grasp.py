@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from congrasp.actors.attempts import Outcome
+from congrasp.actors.attempts import Outcome, Phases
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Trace
@@ -46,7 +46,7 @@ def block(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def grasper():
-    grasper = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, threads=2)
+    grasper = Grasper(bundles.load(policy_file(None)), attempts=4, phases=Phases(hold=0.25), threads=2)
     yield grasper
     grasper.close()
 
@@ -129,7 +129,7 @@ def test_what_holds_comes_first_then_what_is_firm_clean_and_as_asked():
 
 def test_a_grasp_lifts_the_block_off_a_table_that_stays(block):
     """By physics: the hand goes up and the block with it, because the hand holds it."""
-    lifting = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, approach=0.3, lift=0.1, threads=2)
+    lifting = Grasper(bundles.load(policy_file(None)), attempts=4, phases=Phases(0.3, 0.1, 0.25), threads=2)
     upright = int(np.argmax(block.rest_poses[:, 2]))
     found = lifting.grasp(block, GraspRequest(rest=upright))
     lifting.close()

@@ -90,7 +90,7 @@ def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, headi
 def test_where_no_way_leads_is_said(ball) -> None:
     hand = get_hand("human")
     first = beginning(hand, np.array([0.0, 0.0, 1.0]), ball, 0.16)  # from below, through the table
-    with pytest.raises(CongraspError, match=r"no way leads to a grasp of .* Leave out --approach"):
+    with pytest.raises(CongraspError, match=r"no way leads to a grasp of .* Leave out the approach"):
         plan_reach(hand, ball, np.asarray(ball.rest_poses[0], float), np.array([0.0, 0.0, 1.0]), first, 1.0, DT)
 
 
