@@ -21,9 +21,9 @@ from congrasp.services.viz.shapes import capsule_shapes, fit
 _AZIMUTHS, _ELEVATIONS = np.arange(0, 360, 30), (16, 28, 40)  # degrees, of the cameras that are compared
 _ASIDE = 75.0  # degrees between the two views of a picture
 _ROWS = 72  # of the pictures that cameras are compared by
-_CONTACT, _FINGER, _OBJECT, _BEHIND, _BEFORE = 2.0, 1.0, 1.0, 1.5, 0.8
-"""Weights of the seen shares of touching links, of all fingers and of the object, and of a view along the forearm from
-behind and from the front of the hand."""
+_CONTACT, _FINGER, _OBJECT, _BROAD, _BEHIND, _BEFORE = 2.0, 1.0, 1.0, 1.0, 1.5, 0.8
+"""Weights of the seen shares of touching links, of all fingers and of the object, of the object's broad side, and of a
+view along the forearm from behind and from the front of the hand."""
 _FALL = 0.1  # how far the camera follows a falling object, m
 
 
@@ -95,9 +95,15 @@ class _Pictured:
         wrist = Rotation.from_quat(links[1][0], scalar_first=True)
         back = -hand.keypoints[len(hand.links) :].mean(0)
         self._back = wrist.apply(back / np.linalg.norm(back))
+        x, y, z = np.ptp(arrays["visual_vertices"], axis=0)
+        self._faces = np.array([y * z, z * x, x * y]) / np.linalg.norm([y * z, z * x, x * y])  # of its box
+        self._object = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
 
     def score(self, view: View) -> float:
-        """Weighted shares of touching links, fingers and object that a view shows, each from 0 to about 1."""
+        """Weighted shares of touching links, fingers and object that a view shows, each from 0 to about 1.
+
+        A box with faces F along its axes has the silhouette |d| · F from a direction d, at most |F|.
+        """
         camera = fit(self._points, view.direction, 4 / 3)
         size = (_ROWS * 4 // 3, _ROWS)
         counts = _counts(self._shapes, camera, size)
@@ -108,7 +114,10 @@ class _Pictured:
         along = float(self._back @ view.direction)
         hidden = (_BEHIND if along > 0 else _BEFORE) * along**2
         whole = counts[-1] / max(unhidden, 1)
-        return float(_CONTACT * contact + _FINGER * seen[self._finger].mean() + _OBJECT * whole - hidden)
+        broad = np.abs(self._object.inv().apply(view.direction)) @ self._faces
+        return float(
+            _CONTACT * contact + _FINGER * seen[self._finger].mean() + _OBJECT * whole + _BROAD * broad - hidden
+        )
 
 
 def _counts(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:
