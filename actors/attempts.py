@@ -88,7 +88,7 @@ class Attempts:
     @property
     def speed(self) -> float:
         """Initial speed of the wrist along the heading, m/s."""
-        return initial.handover_speed(self._task) if self.phases.approach else 0.0
+        return initial.handover_speed(self._hand, self._task) if self.phases.approach else 0.0
 
     @property
     def _after(self) -> int:
