@@ -72,9 +72,11 @@ def views(episode: Message, steps: Sequence[int]) -> tuple[View, View]:
     return best, options[int(np.argmax(np.where(aside, scores, -np.inf)))]
 
 
-def camera_of(episode: Message, steps: Sequence[int], aspect: float = 4 / 3, view: View | None = None) -> Camera:
+def camera_of(
+    episode: Message, steps: Sequence[int], aspect: float = 4 / 3, view: View | None = None, *, overlays: bool = False
+) -> Camera:
     """A camera that holds everything that happens in the steps, from a view or from the best one."""
-    points = np.concatenate([_extent(episode, step) for step in steps])
+    points = np.concatenate([_extent(episode, step, overlays=overlays) for step in steps])
     points = points[ConvexHull(points).vertices]  # what holds these holds all
     return fit(points, (view or views(episode, steps)[0]).direction, aspect)
 
@@ -91,7 +93,7 @@ class _Pictured:
         self._areas = np.array([2 * r * (2 * half + 2 * r) for r, half in (c.size for c in self._capsules)])
         self._finger = hand.capsule_links > 0
         self._touching = np.linalg.norm(arrays["contact_force"][step], axis=-1)[hand.capsule_links] > TOUCH
-        self._points = _extent(episode, step)
+        self._points = _extent(episode, step, overlays=False)
         wrist = Rotation.from_quat(links[1][0], scalar_first=True)
         back = -hand.keypoints[len(hand.links) :].mean(0)
         self._back = wrist.apply(back / np.linalg.norm(back))
@@ -126,8 +128,8 @@ def _counts(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> n
     return np.bincount(seen[seen >= 0], minlength=len(shapes))
 
 
-def _extent(episode: Message, step: int) -> np.ndarray:
-    """(N, 3) points that a picture of a step must hold: skin without sleeve, the object's box and a trajectory.
+def _extent(episode: Message, step: int, *, overlays: bool) -> np.ndarray:
+    """(N, 3) points that a picture of a step must hold: skin without sleeve, the object's box, as overlay a trajectory.
 
     An object that has fallen far may leave the picture.
     """
@@ -142,5 +144,6 @@ def _extent(episode: Message, step: int) -> np.ndarray:
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
     low, high = arrays["visual_vertices"].min(0), arrays["visual_vertices"].max(0)
     points = [np.where(np.indices((2, 2, 2)).reshape(3, -1).T, high, low)]
-    points += [marker.points for _, marker in markers(arrays) if isinstance(marker, Polyline)]
+    if overlays:
+        points += [marker.points for _, marker in markers(arrays) if isinstance(marker, Polyline)]
     return np.concatenate([around, turn.apply(np.concatenate(points)) + arrays["object_position"][step]])

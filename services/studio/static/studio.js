@@ -132,7 +132,7 @@ export class StudioPanel {
     this.state = state;
     fill($("hand"), state.hands.map((name) => [name, name]), state.hand);
     fill($("object"), state.objects.map((name) => [name, name]), state.chosen);
-    fill($("material"), [["", "as it is"], ...state.weight.materials.map((name) => [name, name])], state.weight.material);
+    fill($("material"), [["", "unchanged"], ...state.weight.materials.map((name) => [name, name])], state.weight.material);
     $("mass").value = state.weight.mass_g || "";
     for (const input of document.querySelectorAll("[data-phase]")) input.value = state.phases[input.dataset.phase];
     this.#rests(state);
