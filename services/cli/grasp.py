@@ -93,7 +93,7 @@ def grasp(
 
     Examples:
       congrasp grasp examples/mug.obj --video
-      congrasp grasp mug:7 --rest upright --approach 1 --lift 0.15
+      congrasp grasp mug:7 --rest upright --approach 0.7 --lift 0.15
       congrasp grasp mug:7 --hand allegro --arm panda --base "-0.7 0 0 0"
     """
     from congrasp.actors.attempts import Phases
