@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+from collections.abc import Sequence
 
 import numba
 import numpy as np
@@ -145,7 +146,7 @@ def shade(
 
 
 @_compiled
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
+def _dot(a: Sequence[float] | np.ndarray, b: Sequence[float] | np.ndarray) -> float:
     """Of two vectors (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 

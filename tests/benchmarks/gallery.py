@@ -33,7 +33,7 @@ python -m tests.benchmarks gallery --scans object_sim    # these grasps, picture
 Each picture is the end of the hold, after a reach from the side of the table and a lift. The scans are MyoSuite's
 (Apache-2.0, `simhive/object_sim`). `runs/gallery` holds the grasps; two of them serve as references of others.
 
-| grasp | command, and attempts that hold the object |
+| grasp | command, attempts that hold the object |
 |---|---|
 """
 
@@ -148,8 +148,8 @@ def save_film(path: pathlib.Path, episode: Message) -> None:
     steps = [int(step) for step in steps if step < len(episode.arrays["table"])]
     begin, lift = grasp_steps(episode)
     view = views(episode, [lift, steps[-1]])[0]
-    # The hand comes into the picture while it reaches.
-    camera = camera_of(episode, [s for s in steps if s >= begin // 2], _FILM_SIZE[0] / _FILM_SIZE[1], view)
+    # The hand comes into the picture as it reaches.
+    camera = camera_of(episode, [step for step in steps if step >= begin], _FILM_SIZE[0] / _FILM_SIZE[1], view)
     frames = [
         Image.fromarray(frame) for frame in render_episode_frames(episode, steps, _FILM_SIZE, camera, overlays=False)
     ]
