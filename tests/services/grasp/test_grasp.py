@@ -89,7 +89,7 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
 def test_a_left_hand_with_its_own_model_does_what_the_mirrored_right_one_did(block, grasper, monkeypatch):
     begun = []
     initial = grasper._attempts._initial
-    monkeypatch.setattr(grasper._attempts, "_initial", lambda request: begun.append(initial(request)) or begun[-1])
+    monkeypatch.setattr(grasper._attempts, "_initial", lambda *a, **k: begun.append(initial(*a, **k)) or begun[-1])
     monkeypatch.setattr(grasper, "_left", True)
     monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
     found = grasper.grasp(block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}}))
