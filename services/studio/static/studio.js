@@ -134,7 +134,8 @@ export class StudioPanel {
     fill($("object"), state.objects.map((name) => [name, name]), state.chosen);
     fill($("material"), [["", "unchanged"], ...state.weight.materials.map((name) => [name, name])], state.weight.material);
     $("mass").value = state.weight.mass_g || "";
-    for (const input of document.querySelectorAll("[data-phase]")) input.value = state.phases[input.dataset.phase];
+    for (const input of document.querySelectorAll("[data-phase]"))
+      if (input !== document.activeElement) input.value = state.phases[input.dataset.phase]; // it may be being typed in
     this.#rests(state);
     this.#unit(state.upload);
     const { size_cm: size, mass_g: mass, faces } = studio.object;
