@@ -257,13 +257,17 @@ def own_key(key: Array, name: str, stage: int) -> Array:
     return jax.random.fold_in(jax.random.fold_in(key, zlib.crc32(name.encode())), stage)
 
 
-def handover_speed(task: TaskConfig) -> float:
-    """Wrist speed (m/s) at the end of a planned reach: three quarters of the fastest start in training."""
-    return 0.75 * task.initial_speed * task.back_off / task.back_off_range[1]
+def handover_speed(hand: Hand, task: TaskConfig) -> float:
+    """Wrist speed (m/s) at the end of a planned reach: nine tenths of that at which the guidance moves it on.
+
+    A target that leads by d moves the wrist at d stiffness / damping. A slower reach has a second peak after it.
+    """
+    stiffness, damping = hand.wrist_servos[:, 0]
+    return float(0.9 * task.control.approach_position_limit * stiffness / damping)
 
 
 def given(
-    hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int, speed: float = 0.0
+    hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: Array | int, speed: Array | float
 ) -> tuple[InitialConditions, Resolution]:
     """Returns requested episodes of one object of nominal mass and friction, and the effects of the priority rules.
 

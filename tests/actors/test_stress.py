@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors import stress as protocols
-from congrasp.actors.attempts import Attempts
+from congrasp.actors.attempts import Attempts, Phases
 from congrasp.actors.env import GraspEnv, Settings
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.physics.mjx import MjxPhysics
@@ -290,13 +290,13 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     rest = np.concatenate([drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1)
     surface = Surface(np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1)))
     asked = {constraint.name: np.zeros(2, bool) for constraint in optional(task)}
-    attempts = Attempts(HAND, task, policy, hold=5, threads=1, lift=0.06)
+    attempts = Attempts(HAND, task, policy, threads=1, phases=Phases(lift=0.06, hold=0.0))
     outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
     attempts.close()
     lift = protocols.lift_steps(task, 0.06)
     assert attempts.steps == 60 + lift + 5 == len(outcome.trace.q)
     dt = task.control_dt
-    assert attempts.phases == {"grasp": 0.0, "lift": 60 * dt, "hold": pytest.approx((60 + lift) * dt)}
+    assert attempts.begins == {"grasp": 0.0, "lift": 60 * dt, "hold": pytest.approx((60 + lift) * dt)}
     assert set(outcome.metrics) > WITHOUT_MESHES
     way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[59]
     slid = (outcome.trace.u[-1] - outcome.trace.u[59])[:, :3]
