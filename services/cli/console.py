@@ -65,7 +65,7 @@ def bars() -> Iterator[Progress]:
         TimeElapsedColumn(),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True) as progress:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         told = contextlib.nullcontext() if console.is_terminal else announced(functools.partial(_current, progress))
         with told:
             yield progress
