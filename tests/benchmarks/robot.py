@@ -182,6 +182,8 @@ def bench_robot(seconds: float, kill_every: float, folder: pathlib.Path) -> bool
         end, kill = time.monotonic() + seconds, time.monotonic() + kill_every
         try:
             while time.monotonic() < end:
+                with congrasp.PolicyClient(server.url, hand="allegro", wait=180.0) as client:
+                    client.metadata()  # the node itself does not wait for a server that is still compiling
                 rig.begin(server.url, "--lift", "0.1")
                 counts["episodes"] += 1
                 rig.run(lambda: "follow" in "\n".join(rig.lines), 240.0)
