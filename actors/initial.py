@@ -152,7 +152,7 @@ def planned(
     def one(episode: PlannedEpisodes) -> InitialConditions:
         own = jax.random.fold_in(jax.random.fold_in(key, episode.names), episode.numbers)
         draw = Draw(bank, episode.objects[None], episode.rests[None])
-        wanted = {name: jnp.reshape(wish, 1) for name, wish in asked.items()}
+        wanted = {name: jnp.reshape(flag, 1) for name, flag in asked.items()}
         return _drawn(hand, task, draw, own, wanted, False, _nominal(task, 1))
 
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(one)(plan))

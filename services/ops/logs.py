@@ -70,18 +70,21 @@ def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> Non
 
 @contextlib.contextmanager
 def announced(what: str | Callable[[], str], first: float = 3.0, every: float = 10.0) -> Iterator[None]:
-    """Prints what takes long, and for how long already, after `first` and then every `every` seconds (to stderr)."""
+    """Prints what takes long, and for how long already, after `first` and then every `every` seconds (to stderr).
+
+    Args:
+      what: names it, or returns its present name.
+      first: seconds until the first line.
+      every: seconds from one line to the next.
+    """
     done, began = threading.Event(), time.monotonic()
 
     def tell() -> None:
         """Prints until it is done."""
         pause = first
         while not done.wait(pause):
-            print(
-                f"{what if isinstance(what, str) else what()}: {time.monotonic() - began:.0f} s so far.",
-                file=sys.stderr,
-                flush=True,
-            )
+            task = what if isinstance(what, str) else what()
+            print(f"{task}: {time.monotonic() - began:.0f} s so far.", file=sys.stderr, flush=True)
             pause = every
 
     threading.Thread(target=tell, daemon=True, name="announced").start()

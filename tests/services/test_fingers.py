@@ -33,6 +33,7 @@ from congrasp.services.studio.grasping import PolicyGrasping
 from congrasp.services.studio.lanes import for_page, lanes
 from congrasp.services.studio.state import Studio
 from congrasp.services.train.command import untrained
+from tests.printed import errors
 
 HAND = get_hand("human")
 TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))
@@ -76,7 +77,7 @@ def test_the_command_refuses_it_in_one_line(
     trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
     options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures"]
     assert load("grasp")([str(tmp_path / "block.stl"), *options, "--fingers", "thumb", "index"])() == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line and not line.endswith(" s so far.")]
+    (line,) = errors(capsys.readouterr().err)
     assert line.startswith(
         "congrasp: error: The policy does not support the constraint 'fingers'. It supports heading, "
     )

@@ -26,6 +26,7 @@ from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.studio import description
 from congrasp.services.studio.state import Studio
 from congrasp.services.train.command import untrained
+from tests.printed import errors
 from tests.services.test_fingers import query
 
 __all__ = ["query"]
@@ -46,7 +47,7 @@ def test_a_policy_that_does_not_know_it_says_so(paper_policy, tmp_path: pathlib.
     trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
     options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures", *option]
     assert load("grasp")([str(tmp_path / "block.stl"), *options])() == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line and not line.endswith(" s so far.")]
+    (line,) = errors(capsys.readouterr().err)
     assert line.startswith("congrasp: error: The policy does not support the constraint 'force'. It supports heading, ")
 
 

@@ -36,6 +36,7 @@ from congrasp.services.record.channels import Entry
 from congrasp.services.record.entries import Converter
 from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
+from tests.printed import errors
 
 T = 7
 MODULES: dict[str, ModuleType] = {"glb": glb, "usd": usd, "bvh": bvh, "ros2": ros2, "lerobot": lerobot}
@@ -471,7 +472,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
         ([], "No motion was given"),
     ):
         assert run(*arguments) == 2
-        (said,) = [line for line in capsys.readouterr().err.splitlines() if line and not line.endswith(" s so far.")]
+        (said,) = errors(capsys.readouterr().err)
         assert words in said
 
 
