@@ -27,6 +27,21 @@ from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
 
 
+class Phases(NamedTuple):
+    """Requested durations and heights around a grasp."""
+
+    approach: float = 0.0
+    """Seconds in which the hand first comes from beside the table; 0 begins near the object."""
+    lift: float = 0.0
+    """Metres by which the hand lifts the object off the table, which then stays; 0 removes the table."""
+    hold: float = 2.0
+    """Seconds of the hold, at least those that count for success."""
+
+
+PLAIN = Phases()
+"""The hand begins near the object, and the table is removed."""
+
+
 class Outcome(NamedTuple):
     """Outcome of a batch of attempts."""
 
@@ -43,48 +58,50 @@ class Outcome(NamedTuple):
 
 
 class Attempts:
-    """Grasps objects one after another with a policy's mean action, each in several ways in parallel."""
+    """Grasps objects one after another with a policy's mean action, each in several ways in parallel.
 
-    def __init__(
-        self,
-        hand: Hand,
-        task: TaskConfig,
-        bundle: PolicyBundle,
-        *,
-        hold: int,
-        threads: int,
-        lift: float = 0.0,
-        speed: float = 0.0,
-    ):
+    Attributes:
+      phases: of the next run.
+    """
+
+    def __init__(self, hand: Hand, task: TaskConfig, bundle: PolicyBundle, *, threads: int, phases: Phases = PLAIN):
         """Sets up the attempts; nothing is compiled yet.
 
         Args:
           hand: the hand.
           task: the task; only the part of its hold that counts for success is used.
           bundle: the policy.
-          hold: control steps without the table, or after the lift.
           threads: threads of the physics.
-          lift: height by which the hand rises after the approach, m; the table then stays until the end.
-          speed: initial speed of the wrist along the heading, m/s.
+          phases: durations and heights.
         """
-        self.speed = speed
-        self._lift = lift
+        self.phases = phases
         self._hand, self._task, self._bundle = hand, task, bundle
-        self._hold, self._threads = protocols.lift_steps(task, lift) + hold, threads
+        self._threads = threads
         self._worker: RolloutWorker | None = None
-        self._initial = jax.jit(functools.partial(initial.given, hand, task, hold=self._hold, speed=speed))
+        self._initial = jax.jit(functools.partial(initial.given, hand, task))
 
     @property
     def steps(self) -> int:
         """T, control steps of an episode."""
-        return self._task.approach_steps + self._hold
+        return self._task.approach_steps + self._after
 
     @property
-    def phases(self) -> dict[str, float]:
+    def speed(self) -> float:
+        """Initial speed of the wrist along the heading, m/s."""
+        return initial.handover_speed(self._hand, self._task) if self.phases.approach else 0.0
+
+    @property
+    def _after(self) -> int:
+        """Control steps of lift and hold."""
+        hold = max(self._task.hold_steps, round(self.phases.hold / self._task.control_dt))
+        return protocols.lift_steps(self._task, self.phases.lift) + hold
+
+    @property
+    def begins(self) -> dict[str, float]:
         """Start times of the grasp, a lift and the hold, in seconds from the first step."""
         removal = self._task.approach_steps
-        begins = {"grasp": 0, "hold": removal + protocols.lift_steps(self._task, self._lift)}
-        if self._lift:
+        begins = {"grasp": 0, "hold": removal + protocols.lift_steps(self._task, self.phases.lift)}
+        if self.phases.lift:
             begins["lift"] = removal
         return {name: step * self._task.control_dt for name, step in sorted(begins.items(), key=lambda item: item[1])}
 
@@ -98,16 +115,16 @@ class Attempts:
           request: the episodes.
           progress: called with the number of completed control steps.
         """
-        conditions, resolution = self._initial(request)
+        task, hold, lift = self._task, self._after, self.phases.lift
+        conditions, resolution = self._initial(request, hold=hold, speed=self.speed)
         batch = len(request.rest)
         if self._worker is None or self._worker.batch != batch:
             self.close()
             self._worker = self._new_worker(obj, batch)
-        task, hold = self._task, self._hold
-        height = 0.0 if self._lift else protocols.LIFT_HEIGHT  # duration of the lift after the hold
+        height = 0.0 if lift else protocols.LIFT_HEIGHT  # duration of the lift after the hold
         protocol = protocols.stress(task, [obj], hold, height)
-        if self._lift:
-            protocol = protocols.lift_first(task, [obj], hold, self._lift)
+        if lift:
+            protocol = protocols.lift_first(task, [obj], hold, lift)
         self._worker.replace_objects([obj], None)
         self._worker.adjust(protocol=protocol, probe_data=distance_field([obj]))
         self._worker.begin(conditions)
@@ -121,7 +138,7 @@ class Attempts:
         metrics |= protocols.assess(samples, metrics["held"] > 0, task, hold, height)
         flags = (np.asarray(resolution.redirected), np.asarray(resolution.aligned))
         trace = Trace(*(field[: self.steps] for field in trace))
-        if self._lift:
+        if lift:
             trace = trace._replace(table=np.ones_like(trace.table))
         return Outcome(resolution.goal, *flags, metrics, trace)
 
@@ -132,7 +149,7 @@ class Attempts:
         metrics = {name: float(column[index]) for name, column in outcome.metrics.items()}
         trace = Trace(*(field[:, index] for field in outcome.trace))
         meta = {"version": self._bundle.version, "success": metrics["success"] > 0, "metrics": metrics}
-        meta |= {"phases": self.phases, **about}
+        meta |= {"phases": self.begins, **about}
         return episode_message(self._hand, self._task, trace, outcome.goal.row(index), surface, obj, meta)
 
     def renew(self, bundle: PolicyBundle) -> None:

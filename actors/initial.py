@@ -1,7 +1,7 @@
 """Initial conditions, given or drawn from a constraint bank (paper, sections Training Setup, Hand Initialization)."""
 
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import jax
@@ -134,9 +134,9 @@ class PlannedEpisodes(NamedTuple):
 
 
 def planned(
-    hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, plan: PlannedEpisodes, asked: Sequence[str]
+    hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, plan: PlannedEpisodes, asked: Mapping[str, Array]
 ) -> InitialConditions:
-    """Draws planned episodes under the constraints of these names, each from a separate key.
+    """Draws planned episodes under the requested constraints, each from a separate key.
 
     An episode therefore does not depend on the others.
 
@@ -146,13 +146,13 @@ def planned(
       bank: the constraint bank; it must allow the constraints (`allowing`).
       key: random key of all episodes under these constraints.
       plan: the episodes.
-      asked: names of the optional constraints of every episode.
+      asked: () bool for each optional constraint by name: True if every episode requests it.
     """
 
     def one(episode: PlannedEpisodes) -> InitialConditions:
         own = jax.random.fold_in(jax.random.fold_in(key, episode.names), episode.numbers)
         draw = Draw(bank, episode.objects[None], episode.rests[None])
-        wanted = {c.name: jnp.array([c.name in asked]) for c in optional(task)}
+        wanted = {name: jnp.reshape(wish, 1) for name, wish in asked.items()}
         return _drawn(hand, task, draw, own, wanted, False, _nominal(task, 1))
 
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(one)(plan))
@@ -257,13 +257,17 @@ def own_key(key: Array, name: str, stage: int) -> Array:
     return jax.random.fold_in(jax.random.fold_in(key, zlib.crc32(name.encode())), stage)
 
 
-def handover_speed(task: TaskConfig) -> float:
-    """Wrist speed (m/s) at the end of a planned reach: three quarters of the fastest start in training."""
-    return 0.75 * task.initial_speed * task.back_off / task.back_off_range[1]
+def handover_speed(hand: Hand, task: TaskConfig) -> float:
+    """Wrist speed (m/s) at the end of a planned reach: nine tenths of that at which the guidance moves it on.
+
+    A target that leads by d moves the wrist at d stiffness / damping. A slower reach has a second peak after it.
+    """
+    stiffness, damping = hand.wrist_servos[:, 0]
+    return float(0.9 * task.control.approach_position_limit * stiffness / damping)
 
 
 def given(
-    hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: int, speed: float = 0.0
+    hand: Hand, task: TaskConfig, request: RequestedEpisodes, hold: Array | int, speed: Array | float
 ) -> tuple[InitialConditions, Resolution]:
     """Returns requested episodes of one object of nominal mass and friction, and the effects of the priority rules.
 

@@ -334,8 +334,7 @@ class RolloutWorker:
         state: EnvState,
         physics_state: PhysicsState,
         decision: _Decision,
-        keys: Array,
-        step: Array,
+        key_data: Array,
     ) -> tuple[dict[str, Any], Transition, tuple[Trace, Any], _Decision]:
         """Completes a control step and decides on the next one: one call between two steps of the engine.
 
@@ -343,7 +342,7 @@ class RolloutWorker:
         """
         after, transition = self.env.advance(state, decision.target, physics_state, settings)
         kept = self._kept(after, decision.action, transition, settings)
-        following = self._decide(parameters, settings, after, jax.random.wrap_key_data(keys[step]))
+        following = self._decide(parameters, settings, after, jax.random.wrap_key_data(key_data))
         changed = {name: new for name, new in after._asdict().items() if new is not getattr(state, name)}
         changed.pop("views")
         return changed, transition, kept, following
@@ -352,7 +351,7 @@ class RolloutWorker:
         """Collects a rollout with an engine that JAX cannot trace; see `collect`."""
         # One more key than steps: the decision after the last step only yields `last_observation`.
         keys = jax.random.split(key, steps + 1)
-        key_data = jax.random.key_data(keys)
+        key_data = np.asarray(jax.random.key_data(keys))
         parameters, settings = _on_device((parameters, self._settings))
         assert self.state is not None
         decision = self._decide_jit(parameters, settings, self.state, keys[0])
@@ -363,7 +362,7 @@ class RolloutWorker:
             _, physics_state = self.physics.step(None, *map(np.asarray, decision.command))
             decided = decision
             changed, transition, kept, decision = self._advance_jit(
-                parameters, settings, state, physics_state, decision, key_data, step
+                parameters, settings, state, physics_state, decision, key_data[step]
             )
             state = state._replace(**changed)
             rows.append(_row(decided.seen, decided.action, decided.log_probability, transition))

@@ -118,7 +118,9 @@ def frame(protocol: Protocol, task: TaskConfig, time: Array) -> Frame:
         speeding = jnp.clip(seconds, 0.0, rise)
         way = 0.5 * LIFT_ACCELERATION * speeding**2 + LIFT_SPEED * jnp.maximum(seconds - rise, 0.0)
         speeds_up = (seconds > 0.0) & (seconds < rise)
-        return Frame(way, LIFT_ACCELERATION * speeding, jnp.where(speeds_up, LIFT_ACCELERATION, 0.0))
+        # Zeros of this type, or the frame's weak type would compile every program of an episode again.
+        pull = jnp.where(speeds_up, LIFT_ACCELERATION, jnp.zeros_like(seconds))
+        return Frame(way, LIFT_ACCELERATION * speeding, pull)
 
     begun, ended = ramp(since), ramp(since - protocol.lift_height / LIFT_SPEED)
     return Frame(*(first - second for first, second in zip(begun, ended, strict=True)))

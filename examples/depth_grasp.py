@@ -10,6 +10,7 @@ Points above the table are the object. Joints follow their targets like unloaded
 
 import dataclasses
 import pathlib
+import sys
 
 import mujoco
 import numpy as np
@@ -88,18 +89,29 @@ def cloud_of(depth: np.ndarray, arguments: Arguments) -> np.ndarray:
     points = np.asarray(rotations.transform(position, quaternion, local))
     points = points[points[:, 2] > arguments.floor]
     if not len(points):
-        raise SystemExit("No point of the depth image is above the table. Check --camera, --intrinsics and --floor.")
+        raise congrasp.CongraspError(
+            "No point of the depth image is above the table.", "Check --camera, --intrinsics and --floor."
+        )
     return points.astype(np.float32)
+
+
+def read_depth(file: pathlib.Path) -> np.ndarray:
+    """(height, width) depth of a file, m."""
+    try:
+        if file.suffix == ".npy":
+            depth = np.load(file, allow_pickle=False)
+        else:
+            depth = np.asarray(Image.open(file), np.float32) / 1000.0
+    except (OSError, ValueError) as error:
+        raise congrasp.CongraspError(f"--depth: {file} cannot be read ({error}).", "Pass a PNG or an NPY.") from None
+    if depth.ndim != 2:
+        raise congrasp.CongraspError(f"--depth: {file} has shape {depth.shape}.", "Pass one depth a pixel.")
+    return depth
 
 
 def main(arguments: Arguments) -> None:
     """Writes the motion for the object in the image."""
-    if arguments.depth is None:
-        depth = simulated(arguments)
-    elif arguments.depth.suffix == ".npy":
-        depth = np.load(arguments.depth, allow_pickle=False)
-    else:
-        depth = np.asarray(Image.open(arguments.depth), np.float32) / 1000.0
+    depth = simulated(arguments) if arguments.depth is None else read_depth(arguments.depth)
     cloud = cloud_of(depth, arguments)
     direction = np.asarray(arguments.heading) / np.linalg.norm(arguments.heading)
     cross = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
@@ -122,4 +134,7 @@ def main(arguments: Arguments) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments, description=__doc__))
+    try:
+        main(tyro.cli(Arguments, description=__doc__))
+    except congrasp.CongraspError as error:
+        sys.exit(f"depth_grasp: error: {error}")

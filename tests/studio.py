@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from congrasp.actors.attempts import Phases
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
@@ -35,14 +36,14 @@ class MadeUpGrasping:
 
     def __init__(self) -> None:
         self.hand, self.task = get_hand("human"), TaskConfig()
-        self.asked: list[tuple[GraspObject, GraspRequest]] = []
+        self.asked: list[tuple[GraspObject, GraspRequest, Phases]] = []
         self.fails = ""
 
     def newest(self) -> dict[str, Any]:
         return {"source": "made up", "version": 7, "trouble": ""}
 
-    def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
-        self.asked.append((obj, request))
+    def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
+        self.asked.append((obj, request, phases))
         progress("grasping", 0.5)
         if self.fails:
             raise RuntimeError(self.fails)

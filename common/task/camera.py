@@ -7,6 +7,7 @@ with the camera's constant error. The true pose is not part of that scene.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -179,17 +180,24 @@ def _filled(which: Array) -> Array:
 
 def goal_in_world(task: TaskConfig, goal: Goal, position: Array, quaternion: Array) -> Goal:
     """Returns goals of the object frame in the world frame, for objects at (B, 3), (B, 4)."""
+
+    def turned(value: Array, turn: Callable[[Array, Array], Array]) -> Array:
+        return turn(jnp.broadcast_to(_rows(quaternion, value), (*value.shape[:-1], 4)), value)
+
     for constraint in known(task):
         moved = {}
         for name, array in constraint.arrays.items():
             value = getattr(goal[constraint.name], name)
-            turn = jnp.broadcast_to(quaternion.reshape(-1, *[1] * (value.ndim - 2), 4), (*value.shape[:-1], 4))
             if array.kind == "position":
-                shift = position.reshape(-1, *[1] * (value.ndim - 2), 3)
-                moved[name] = shift + rotations.rotate(turn, value)
+                moved[name] = _rows(position, value) + turned(value, rotations.rotate)
             elif array.kind == "direction":
-                moved[name] = rotations.rotate(turn, value)
+                moved[name] = turned(value, rotations.rotate)
             elif array.kind == "quaternion":
-                moved[name] = rotations.multiply(turn, value)
+                moved[name] = turned(value, rotations.multiply)
         goal = goal.replace(constraint.name, **moved)
     return goal
+
+
+def _rows(array: Array, like: Array) -> Array:
+    """An array (B, n) as (B, 1, ..., n), with as many axes as another (B, ..., m)."""
+    return jnp.expand_dims(array, tuple(range(1, like.ndim - 1)))

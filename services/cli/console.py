@@ -1,6 +1,7 @@
 """Console output of commands: tables on standard output, progress bars and errors on standard error."""
 
 import contextlib
+import functools
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
@@ -9,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from rich.table import Table
 
 from congrasp.common.errors import CongraspError
+from congrasp.services.ops.logs import announced
 
 Track = Callable[[str, int | None], Callable[[int], None]]
 """(label, total if known) -> function to call with the number done."""
@@ -49,8 +51,12 @@ def report_error(error: CongraspError) -> None:
     print(f"congrasp: error: {error}", file=sys.stderr)
 
 
-def bars() -> Progress:
-    """Progress display with a line for each task: text, bar, counts, time; it is erased at the end."""
+@contextlib.contextmanager
+def bars() -> Iterator[Progress]:
+    """Progress display with a line for each task: text, bar, counts, time; it is erased at the end.
+
+    Where standard error is not a terminal, a line every 10 s names the current task instead.
+    """
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
@@ -58,7 +64,20 @@ def bars() -> Progress:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    return Progress(*columns, console=Console(stderr=True), transient=True)
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True) as progress:
+        told = contextlib.nullcontext() if console.is_terminal else announced(functools.partial(_current, progress))
+        with told:
+            yield progress
+
+
+def _current(progress: Progress) -> str:
+    """The newest unfinished task and its counts."""
+    tasks = [task for task in progress.tasks if task.visible and not task.finished] or progress.tasks
+    if not tasks:
+        return "Starting"
+    task = tasks[-1]
+    return task.description + (f", {task.completed:g} of {task.total:g}" if task.total else "")
 
 
 @contextlib.contextmanager

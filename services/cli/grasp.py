@@ -93,9 +93,10 @@ def grasp(
 
     Examples:
       congrasp grasp examples/mug.obj --video
-      congrasp grasp mug:7 --rest upright --approach 1 --lift 0.15
+      congrasp grasp mug:7 --rest upright --approach 0.7 --lift 0.15
       congrasp grasp mug:7 --hand allegro --arm panda --base "-0.7 0 0 0"
     """
+    from congrasp.actors.attempts import Phases
     from congrasp.common.hands import get_hand
     from congrasp.common.hands.left import right_name
     from congrasp.common.policy import bundle as bundles
@@ -134,7 +135,8 @@ def grasp(
         identity = (*identity, planner.identity)
     drawn = film, view_of(camera)
     settings = Settings(out, mesh, dataclasses.asdict(constraint), identity, *drawn, pictures, again, rest)
-    grasper = Grasper(bundle, attempts=attempts, approach=approach, lift=lift, seed=seed, arm=planner, left=left)
+    phases = Phases(approach, lift)
+    grasper = Grasper(bundle, attempts=attempts, phases=phases, seed=seed, arm=planner, left=left)
 
     for result in results:
         _show(result)

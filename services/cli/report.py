@@ -52,14 +52,13 @@ def report(
     from congrasp.services.cli.console import at_least, tracked
     from congrasp.services.evaluate.reporting import report_on
     from congrasp.services.evaluate.scores import write_json
-    from congrasp.services.ops.logs import announced
 
     at_least(1, episodes=episodes, pool=pool)
     if out.is_dir():
         raise CongraspError(f"--out is the folder {out}.", f"Pass a file in it: --out {out / 'report.html'}")
     run_dir = source if source is not None and source.is_dir() else None
     file = _policy_of_run(run_dir) if run_dir else policy_file(source, hand)
-    with announced("Making the report", every=30.0), tracked() as track:
+    with tracked() as track:
         made = report_on(
             file,
             out,

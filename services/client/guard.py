@@ -22,6 +22,7 @@ Fallback = Literal["freeze", "open"]
 Mode = Literal["follow", "hold", "freeze", "open"]
 _END = 2.0  # seconds that the asking thread has to end
 _LIFTED = 0.02  # m above its first height from which on an object counts as held
+_OBJECT = {"object_position": 3, "object_quaternion": 4}  # measurements by a tracker and their sizes
 
 
 @dataclasses.dataclass
@@ -90,7 +91,7 @@ class Guard:
     policy continues from the commanded targets, not from those that it requested.
 
     An object may be held once it was 2 cm above its first height, or `table` of a state was false, until the next
-    `reset`.
+    `reset`; a policy with a camera has no height, so that only `table` counts.
 
     Attributes:
       counters: what has happened.
@@ -147,7 +148,7 @@ class Guard:
         self._period, self._wait, self._stale, self._hold = period, wait, stale, hold
         self._fallback, self._clock, self._fingers = fallback, clock, fingers
         self._table = np.array(table, float)
-        self._needed = {"q": fingers, "u": 6, "object_position": 3, "object_quaternion": 4}
+        self._needed: dict[str, int] = {}
         self._limiter: Limiter | None = None
         self._wanted, self._fresh = np.zeros(fingers + 6), clock()
         self._answer: Answer | None = None
@@ -175,6 +176,7 @@ class Guard:
         self._wanted, self._fresh = self._limiter.target, self._clock()
         self._answer, self._latched, self._held = None, None, False
         self._height = as_numbers(request.object_pose and request.object_pose[0], 3)[2]
+        self._needed = {"q": self._fingers, "u": 6, **(_OBJECT if request.cloud is None else {})}
         self._asker.begin(request)
 
     def open(self) -> None:
@@ -244,7 +246,8 @@ class Guard:
         self._held |= not np.all(state.get("table", True)) or bool(height > self._height + _LIFTED)
         age = self._clock() - self._fresh
         if self._latched is None and not 0.0 <= age <= self._hold:
-            measured = np.isfinite(np.append((self._height, height), self._measured(state))).all()
+            heights = (self._height, height) if "object_position" in self._needed else ()
+            measured = np.isfinite(np.append(heights, self._measured(state))).all()
             self._latched = self._fallback if measured and not self._held else "freeze"
         if self._latched is not None:
             return self._latched

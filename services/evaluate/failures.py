@@ -7,7 +7,8 @@ import numpy as np
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.evaluator import Evaluator
-from congrasp.services.viz.render import episode_strip
+from congrasp.services.record.goals import phases_of
+from congrasp.services.viz.render import episode_strip, grasp_steps
 from congrasp.services.viz.sheets import contact_sheet
 
 _FRAMES = 5
@@ -22,19 +23,24 @@ def cause(episode: Message, drop_height: float) -> str:
         return "the physics diverged"
     if metrics["held"]:
         return "held"
+    moment = "the lift began" if "lift" in phases_of(episode.meta) else "the table was removed"
     if metrics["moved_at_removal"] > _PUSHED:
-        return "pushed away before the table was removed"
+        return f"pushed away before {moment}"
     if not metrics["links_at_removal"]:
-        return "not touched when the table was removed"
-    removal = int(np.argmin(episode.arrays["table"]))
-    seconds = (fall_step(episode, drop_height) - removal) * episode.meta["control_dt"]
-    return f"slipped {seconds:.2f} s after the table was removed"
+        return f"not touched when {moment}"
+    seconds = (fall_step(episode, drop_height) - grasp_steps(episode)[1]) * episode.meta["control_dt"]
+    return f"slipped {seconds:.2f} s after {moment}"
 
 
 def fall_step(episode: Message, drop_height: float) -> int:
-    """Step at which the object is `drop_height` (m) below its height at the table's removal, or the last one."""
-    removal = int(np.argmin(episode.arrays["table"]))
+    """Step at which the object is `drop_height` (m) below its height at the table's removal, or the last one.
+
+    In a lift the height is relative to the wrist.
+    """
+    removal = grasp_steps(episode)[1]
     height = np.asarray(episode.arrays["object_position"])[:, 2]
+    if "lift" in phases_of(episode.meta):
+        height = height - episode.arrays["link_position"][:, 0, 2]
     below = np.flatnonzero(height[removal:] < height[removal] - drop_height)
     return removal + int(below[0]) if len(below) else len(height) - 1
 

@@ -105,7 +105,7 @@ def batches(
       seed: seed of the evaluation; draws also depend on the row's constraints.
       size: size of a batch.
     """
-    asked = tuple(c.name for c in optional(task) if c.name in plan.constraint.split("+"))
+    asked = {c.name: c.name in plan.constraint.split("+") for c in optional(task)}
     task = dataclasses.replace(task, aligned_references=plan.aligned)
     key = jax.random.fold_in(jax.random.key(seed), zlib.crc32(plan.constraint.encode()))
     for start in range(0, plan.total, size):
@@ -114,7 +114,8 @@ def batches(
         yield conditions, min(size, plan.total - start)
 
 
-_planned = jax.jit(initial.planned, static_argnums=(0, 1, 5))
+_planned = jax.jit(initial.planned, static_argnums=(0, 1))
+"""One program for all rows: the requested constraints are arguments."""
 
 
 def repeated_rests(rest: np.ndarray) -> np.ndarray:

@@ -78,19 +78,20 @@ def save_grasp(
     steps = _steps_to_draw(*grasp_steps(episode), len(episode.arrays["table"]) - 1)
     last = steps[-1]
     if pictures:
-        camera = camera_of(episode, steps, view=view)
+        camera = camera_of(episode, steps, view=view, overlays=True)
         save_png(folder / PICTURE, episode_sheet(episode, steps=steps, camera=camera))
         save_png(folder / PORTRAIT, grasp_picture(episode, last, view=view))
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if film:
         until = min(found.first("hold") + round(_HELD / float(episode.meta["control_dt"])), last)
-        filmed, aspect = [*range(0, until, _FRAMED), until], film.size[0] / film.size[1]
+        filmed = [*range(found.first("grasp") // 2, until, _FRAMED), until]  # the hand comes into the picture
+        aspect = film.size[0] / film.size[1]
         if arm := found.arm:
             camera = robot_camera(arm, episode, [*steps[:-1], until], aspect)
             around = functools.partial(robot_shapes, arm, episode)
             save_episode_video(folder / VIDEO, episode, film, camera, until=until, around=around)
         else:
-            seen_from = camera_of(episode, filmed, aspect, view or views(episode, steps)[0])
+            seen_from = camera_of(episode, filmed, aspect, view or views(episode, steps)[0], overlays=film.overlays)
             save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)
     write_atomically(folder / RESULT, json.dumps({**found.facts(), **about}, indent=2).encode())
 

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from congrasp.actors.attempts import Attempts, Outcome
-from congrasp.actors.initial import RequestedEpisodes, handover_speed
+from congrasp.actors.attempts import PLAIN, Attempts, Outcome, Phases
+from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common import mirror
 from congrasp.common.errors import CongraspError, ContradictionError
@@ -39,7 +38,7 @@ from congrasp.services.client.left import mirrored_request
 from congrasp.services.export.motion_file import GraspMotion, motion_of_episode
 from congrasp.services.grasp.approaches import headings, prescribed, valid_rests
 from congrasp.services.grasp.parse import read_request
-from congrasp.services.grasp.reach import NoReachError, Reach, plan_reach, with_reach
+from congrasp.services.grasp.reach import NoReachError, with_planned_reach
 
 if TYPE_CHECKING:
     from congrasp.services.arm.planner import ArmMotion, ArmPlanner
@@ -48,8 +47,6 @@ ATTEMPTS = 16
 """Grasps that are simulated side by side."""
 ROUNDS = 4
 """Number of further rounds of attempts while none holds."""
-HOLD_SECONDS = 2.0
-"""Required hold of the object without the table."""
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
 _SCALES |= {"moved_at_removal": 0.01, "force_link_max": 10.0, "slip": 0.02}
 """Scales that make costs of grasps that hold comparable: errors, displacement of the object before table removal (m),
@@ -61,7 +58,6 @@ _UNLIKELY = 0.5
 _TOUCHED = 0.2
 """Share of touches on what must not be touched from which others are attempted."""
 
-_BEGIN = ("object_position", "object_quaternion", "link_position", "link_quaternion", "q", "goal/heading_direction")
 Progress = Callable[[str, int, int], None]
 """Told what is done, how much of it, and of how much."""
 
@@ -138,9 +134,7 @@ class Grasper:
         *,
         attempts: int = ATTEMPTS,
         rounds: int = ROUNDS,
-        seconds: float = HOLD_SECONDS,
-        approach: float = 0.0,
-        lift: float = 0.0,
+        phases: Phases = PLAIN,
         threads: int = 0,
         seed: int = 0,
         arm: "ArmPlanner | None" = None,
@@ -152,9 +146,7 @@ class Grasper:
           policy: the policy, which names the hand.
           attempts: grasps side by side.
           rounds: how often that many others are attempted while none holds.
-          seconds: how long the object should be held without the table, or after the lift.
-          approach: seconds in which the hand comes from beside the table to where the grasp begins, before it.
-          lift: metres by which the hand lifts the object off the table, which then stands to the end.
+          phases: reach, lift and hold.
           threads: of the physics; 0 takes one a core.
           seed: draws what is attempted.
           arm: the arm that must be able to do it.
@@ -166,17 +158,7 @@ class Grasper:
         self.task = dataclasses.replace(policy.task, end_when_fallen=False)
         self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
         self._compiled = False
-        self._approach, self._lift = approach, lift
-        hold = max(self.task.hold_steps, round(seconds / self.task.control_dt))
-        self._attempts = Attempts(
-            self._hand,
-            self.task,
-            policy,
-            hold=hold,
-            lift=lift,
-            threads=threads or cores(),
-            speed=handover_speed(self.task) if approach else 0.0,
-        )
+        self._attempts = Attempts(self._hand, self.task, policy, threads=threads or cores(), phases=phases)
 
     def grasp(
         self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
@@ -210,7 +192,7 @@ class Grasper:
             )
             _check_aligned(outcome)
             removal = self.task.approach_steps - 1
-            cost = costs(outcome, tuple(request.constraints), removal, self._lift)
+            cost = costs(outcome, tuple(request.constraints), removal, self._attempts.phases.lift)
             cost = (cost + _UNLIKELY * _places(obj, rests, request))[:different]
             attempted += different
             holds = outcome.metrics["held"][:different] > 0
@@ -306,8 +288,9 @@ class Grasper:
             "object_file_origin": [-x for x in obj.origin],
         }
         episode = self._attempts.episode(outcome, index, surface_of(self.task, labelled), obj, about)
-        if self._approach:
-            episode = with_reach(episode, self._hand, self._reach(obj, episode))
+        if approach := self._attempts.phases.approach:
+            side = self._arm.side if self._arm else None
+            episode = with_planned_reach(episode, self._hand, obj, approach, self._attempts.speed, side)
         if self._left:
             episode = _mirrored(episode, self.hand)
         asked = tuple(request.constraints)
@@ -316,16 +299,6 @@ class Grasper:
         avoid = labelled.non_graspable_points
         active += [found.message for found in contradictions(self._hand, obj.points, avoid, wanted.row(index), written)]
         return Grasp(episode, motion_of_episode(episode), attempts, held, int(rests[index]), tuple(active))
-
-    def _reach(self, obj: GraspObject, episode: Message) -> Reach:
-        """The way from beside the table to where an episode begins."""
-        arrays = {name: np.asarray(value, float) for name, value in episode.arrays.items() if name in _BEGIN}
-        rest = np.concatenate([arrays["object_position"][0], arrays["object_quaternion"][0]])
-        turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
-        first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
-        heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(arrays["goal/heading_direction"])
-        dt, speed, side = self.task.control_dt, self._attempts.speed, self._arm.side if self._arm else None
-        return plan_reach(self._hand, obj, rest, heading, first, self._approach, dt, speed, side)
 
 
 def grasp(

@@ -29,7 +29,8 @@ SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
 CLEARANCE = 0.01
 """m between the hand and object or table, as long as the start of the grasp is not nearer and not far."""
 _NEAR_END = 0.8  # share of the curve from which the hand may come as near as the grasp begins
-_BESIDE, _ABOVE = 0.34, 0.04  # of the wrist from the object's centre, of the hand above the table, at first, m
+_BESIDE, _ABOVE = 0.45, 0.04  # of the wrist from the object's centre, of the hand above the table, at first, m
+_WAY = 0.22  # of the wrist further from the object at first than where the grasp begins, at least, m
 _BESIDE_WITH_ARM, _ABOVE_WITH_ARM, _DOWN_WITH_ARM = 0.12, 0.2, math.radians(60.0)
 """The same of a hand whose arm needs room to table and base, m, and how far its fingers then point down."""
 _RELAXED = 0.15  # share of the way from the open to the closed pose, before it sets out
@@ -40,6 +41,7 @@ _MOST_STRETCH = 50.0  # of the requested time
 _BACK = (0.08, 0.15, 0.22)  # of the curve's middle point from its end, against the heading, m
 _UP = (0.0, 0.10, 0.20, 0.32)  # and upwards, m
 _TOLERANCE = 1e-3  # m
+_BEGIN = ("object_position", "object_quaternion", "link_position", "link_quaternion", "q", "goal/heading_direction")
 
 
 class NoReachError(CongraspError):
@@ -135,7 +137,7 @@ def plan_reach(
             return curve.at(np.arange(steps) / steps, steps * dt, speed)
     raise NoReachError(
         f"From beside the table no way leads to a grasp of '{obj.name}' without touching it or the table.",
-        "Leave out --approach, or set another --heading.",
+        "Leave out the approach, or set another heading.",
     )
 
 
@@ -151,15 +153,16 @@ def _curves(
     """Ways to try, the plainest first; `fingers` (2, F) at both ends, `height` (m) of the wrist on the table."""
     end = first.position[0]
     height += _ABOVE if side is None else _ABOVE_WITH_ARM
-    beside = _BESIDE if side is None else _BESIDE_WITH_ARM
-    aside = end - rest[:3] if np.linalg.norm((end - rest[:3])[:2]) > 0.03 else -heading
+    out = float(np.linalg.norm((end - rest[:3])[:2]))
+    beside = max(_BESIDE, out + _WAY) if side is None else _BESIDE_WITH_ARM
+    aside = end - rest[:3] if out > 0.03 else -heading
     ahead = math.atan2(aside[1], aside[0]) if side is None else side
     for up, azimuth, back in itertools.product(_UP, _AZIMUTHS, _BACK):
-        out = np.array([np.cos(ahead + azimuth), np.sin(ahead + azimuth), 0.0])
-        begin = np.array([*(rest[:3] + beside * out)[:2], height])
+        outward = np.array([np.cos(ahead + azimuth), np.sin(ahead + azimuth), 0.0])
+        begin = np.array([*(rest[:3] + beside * outward)[:2], height])
         middle = end - back * heading + [0.0, 0.0, up]
         middle[2] = max(middle[2], 0.06)
-        turns = Rotation.concatenate([_first_turn(hand, -out, side), first.rotation[0]])
+        turns = Rotation.concatenate([_first_turn(hand, -outward, side), first.rotation[0]])
         s = np.linspace(0, 1, _FINE)[:, None]
         last = end - back / 3 * heading
         points = (1 - s) ** 3 * begin + 3 * s * (1 - s) ** 2 * middle + 3 * s**2 * (1 - s) * last + s**3 * end
@@ -231,6 +234,19 @@ def _duration(curve: _Curve, seconds: float, speed: float) -> float:
         if max(fastest, hardest, turning) <= 1.0:
             break
     return float(found)
+
+
+def with_planned_reach(
+    episode: Message, hand: Hand, obj: GraspObject, seconds: float, speed: float, side: float | None = None
+) -> Message:
+    """The episode with the planned way of the hand before it; see `plan_reach` for the arguments and errors."""
+    arrays = {name: np.asarray(value, float) for name, value in episode.arrays.items() if name in _BEGIN}
+    rest = np.concatenate([arrays["object_position"][0], arrays["object_quaternion"][0]])
+    turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
+    first = Reach(arrays["link_position"][:1, 0], turns, arrays["q"][:1])
+    heading = Rotation.from_quat(rest[3:], scalar_first=True).apply(arrays["goal/heading_direction"])
+    dt = float(episode.meta["control_dt"])
+    return with_reach(episode, hand, plan_reach(hand, obj, rest, heading, first, seconds, dt, speed, side))
 
 
 def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:

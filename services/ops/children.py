@@ -29,7 +29,9 @@ class Child:
 
     def start(self) -> int:
         """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies with its parent."""
-        environment = {**os.environ, **self.environment, PARENT_VARIABLE: str(os.getpid())}
+        # Unfiltered, so that an error is the last line of the log, and not JAX's remark that it has left out some.
+        jax = {"JAX_TRACEBACK_FILTERING": "off"}
+        environment = {**jax, **os.environ, **self.environment, PARENT_VARIABLE: str(os.getpid())}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "congrasp", *self.arguments],

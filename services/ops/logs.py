@@ -7,7 +7,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
 LogFormat = Literal["text", "json"]
@@ -69,7 +69,7 @@ def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> Non
 
 
 @contextlib.contextmanager
-def announced(what: str, first: float = 3.0, every: float = 10.0) -> Iterator[None]:
+def announced(what: str | Callable[[], str], first: float = 3.0, every: float = 10.0) -> Iterator[None]:
     """Prints what takes long, and for how long already, after `first` and then every `every` seconds (to stderr)."""
     done, began = threading.Event(), time.monotonic()
 
@@ -77,7 +77,11 @@ def announced(what: str, first: float = 3.0, every: float = 10.0) -> Iterator[No
         """Prints until it is done."""
         pause = first
         while not done.wait(pause):
-            print(f"{what}: {time.monotonic() - began:.0f} s so far.", file=sys.stderr, flush=True)
+            print(
+                f"{what if isinstance(what, str) else what()}: {time.monotonic() - began:.0f} s so far.",
+                file=sys.stderr,
+                flush=True,
+            )
             pause = every
 
     threading.Thread(target=tell, daemon=True, name="announced").start()

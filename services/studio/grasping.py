@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.attempts import Attempts, Outcome
+from congrasp.actors.attempts import Attempts, Outcome, Phases
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.hands import get_hand
@@ -20,13 +20,13 @@ from congrasp.common.task.constraints import get_constraint, known, require_know
 from congrasp.common.task.constraints.priority import explain
 from congrasp.common.wire.codec import Message
 from congrasp.services.grasp.grasper import costs, repeated, surface_of
+from congrasp.services.grasp.reach import with_planned_reach
 from congrasp.services.serve.server import Source
 from congrasp.services.studio.diagnosis import why_nothing_held
 from congrasp.services.studio.jobs import SECONDS, Progress
 
 ATTEMPTS = 8
 """Grasps side by side: the one that was drawn, and others near it."""
-HOLD_SECONDS = 2.0
 _ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
 """Deviation of the others from what was drawn: m, rad, rad (one standard deviation)."""
 _COMPILING = 60
@@ -58,8 +58,7 @@ class PolicyGrasping:
         self._trouble = ""
         self.hand = get_hand(first.spec.hand)
         self.task = dataclasses.replace(first.task, end_when_fallen=False)
-        hold = max(self.task.hold_steps, round(HOLD_SECONDS / self.task.control_dt))
-        self._attempts = Attempts(self.hand, self.task, first, hold=hold, threads=threads or cores())
+        self._attempts = Attempts(self.hand, self.task, first, threads=threads or cores())
         self._compiled = False
 
     def newest(self) -> dict[str, Any]:
@@ -79,20 +78,27 @@ class PolicyGrasping:
         except CongraspError as error:
             self._trouble = str(error)
 
-    def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
+    def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
         """The episode of the grasp that was drawn if it holds, else of the best of those near it.
 
         Its meta `note` says which it is; where none held, why.
+
+        Raises:
+          CongraspError: the policy lacks a constraint, or no reach leads to the grasp.
         """
+        self._attempts.phases = phases
         first_time = not self._compiled
         progress(f"compiling, {SECONDS} s of about {_COMPILING}" if first_time else "newest weights", 0.02)
         self.refresh()
         require_known(request.constraints, self.task)
         outcome, aside = self._attempt(obj, request, lambda share: progress("grasping", share))
         self._compiled = True
-        index = _best(outcome, tuple(request.constraints), self.task.approach_steps - 1)
+        index = _best(outcome, tuple(request.constraints), self.task.approach_steps - 1, phases.lift)
         about = {"actor": "studio", "note": _note(outcome, index, aside)}
         episode = self._attempts.episode(outcome, index, surface_of(self.task, obj), obj, about)
+        if phases.approach:
+            progress("reach", 1.0)
+            episode = with_planned_reach(episode, self.hand, obj, phases.approach, self._attempts.speed)
         if (outcome.metrics["held"] > 0).any():
             return episode
 
@@ -146,9 +152,9 @@ def _episodes(
     return drawn._replace(goal=goal), np.linalg.norm(shift, axis=-1)
 
 
-def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int) -> int:
+def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float) -> int:
     """The one that was drawn, unless another is clearly better: it holds, or keeps to the constraints."""
-    return int(np.argmin(costs(outcome, constraints, removal) + _OTHER * (np.arange(ATTEMPTS) > 0)))
+    return int(np.argmin(costs(outcome, constraints, removal, lift) + _OTHER * (np.arange(ATTEMPTS) > 0)))
 
 
 def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:

@@ -16,6 +16,7 @@ from congrasp.common.task.reward import GRASP
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record.goals import active_blocks, active_constraints, markers
+from congrasp.services.viz.render import grasp_steps
 
 TOUCH = 0.05
 """Newtons from which a link counts as touching."""
@@ -42,7 +43,7 @@ class Lane(NamedTuple):
 def lanes(episode: Message) -> dict[str, Lane]:
     """The lanes of an episode: contact, then the active constraints whose errors it has recorded, by name."""
     arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
-    table = arrays["table"].astype(bool)
+    table = np.arange(len(arrays["table"])) < grasp_steps(episode)[1]
     links = (np.linalg.norm(arrays["contact_force"], axis=-1) > TOUCH).sum(-1)
     found = {"contact": Lane(links >= 2, ~table, "two links or more touch the object", {"links": links.astype(float)})}
     active, blocks = active_constraints(arrays), active_blocks(arrays)

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from congrasp.actors.attempts import PLAIN, Phases
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
@@ -36,6 +37,7 @@ from congrasp.services.studio.training import TrainingWindow
 from congrasp.services.viz.shapes import skin_colours
 
 LIGHTEST_G, HEAVIEST_G = 1, 5000
+LONGEST = Phases(approach=10.0, lift=0.5, hold=10.0)
 _OWN_WEIGHT = {"mass_g": 0.0, "material": ""}
 """The object weighs what it came with."""
 _DRAWING = "drawing"
@@ -53,8 +55,8 @@ class Grasping(Protocol):
     def newest(self) -> dict[str, Any]:
         """Source of the policy and its version, after a check for newer weights."""
 
-    def grasp(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> Message:
-        """The episode of a grasp."""
+    def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
+        """The episode of a grasp with these phases."""
 
 
 class Session:
@@ -84,7 +86,7 @@ class Session:
         self._lock = threading.RLock()
         self._jobs, self._motions, self._thumbnails = Jobs(), Motions(), Thumbnails()
         self._drawn: Download | None = None
-        self._weight = dict(_OWN_WEIGHT)
+        self._weight, self._phases = dict(_OWN_WEIGHT), PLAIN
         self._hand = next(iter(hands))
         self._object, self._shown = objects.names[0], 0
         self._take_hand(hands[self._hand](), objects.get(self._object))
@@ -128,6 +130,7 @@ class Session:
                 "training": self._window is not None,
                 "recordings": self._recordings is not None,
                 "weight": {**self._weight, "materials": list(MATERIALS)},
+                "phases": self._phases._asdict(),
                 "saves": [*DRAWN, *DATA],
                 "drawn": DRAWN,
                 "job": self._jobs.state(),
@@ -204,6 +207,7 @@ class Session:
                 "object": self._choose_object,
                 "unit": self._choose_unit,
                 "weigh": self._weigh,
+                "time": self._time,
                 "grasp": self._grasp,
                 "draw_motion": self._draw_motion,
                 "delete": lambda id: self._motions.delete(str(id)),
@@ -243,6 +247,15 @@ class Session:
         obj = self._objects.get(self._object)
         self._studio.obj = with_mass(obj, mass_g / 1000 if mass_g else None, material)
         self._weight = {"mass_g": mass_g, "material": material}
+
+    def _time(self, **phases: float) -> None:
+        """Sets approach (s), lift (m) or hold (s) of the coming grasps."""
+        for name, value in phases.items():
+            most = getattr(LONGEST, name, None)
+            if most is None or not 0 <= float(value) <= most:
+                limits = ", ".join(f"{phase} 0 to {value:g}" for phase, value in LONGEST._asdict().items())
+                raise CongraspError(f"The {name[:20]} cannot be {str(value)[:20]}.", f"Write (s, m, s): {limits}.")
+        self._phases = self._phases._replace(**{name: float(value) for name, value in phases.items()})
 
     def _import(self, file: str, load: Callable[[], str]) -> dict[str, Any]:
         """Begins an import, which returns the object's name; shows the object."""
@@ -302,11 +315,11 @@ class Session:
     def _grasp(self) -> None:
         """Begins the grasp that is requested; its motion is kept."""
         request, obj = self._studio.request, self._studio.labelled
-        grasping = self._grasping
+        grasping, phases = self._grasping, self._phases
 
         def work(progress: Progress) -> str:
             """Grasps; returns the motion's key."""
-            episode = grasping.grasp(obj, request, progress)
+            episode = grasping.grasp(obj, request, phases, progress)
             with self._lock:
                 return self._motions.keep(episode)
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+from collections.abc import Sequence
 
 import numba
 import numpy as np
@@ -130,20 +131,22 @@ def shade(
             depth = 1 / (first + second + third)
             for n in range(len(here)):
                 here[n] = depth * (first * values[i, n] + second * values[j, n] + third * values[k, n])
-            place, normal, colour, lit, sky, shine = here[:3], here[3:6], here[6:9], here[9], here[10], here[11]
-            ray, length = np.sqrt(_dot(place - eye, place - eye)), np.sqrt(_dot(normal, normal)) + 1e-12
-            half = key - (place - eye) / ray
+            lit, sky, shine = here[9], here[10], here[11]
+            # Tuples: a new array for each sample would take most of the time.
+            ray, normal = (here[0] - eye[0], here[1] - eye[1], here[2] - eye[2]), (here[3], here[4], here[5])
+            away, length = np.sqrt(_dot(ray, ray)), np.sqrt(_dot(normal, normal)) + 1e-12
+            half = key[0] - ray[0] / away, key[1] - ray[1] / away, key[2] - ray[2] / away
             facing = max(_dot(normal, key) / length, 0.0)
             light = _KEY_STRENGTH * lit * facing + _SKY_STRENGTH * sky * (0.6 + 0.4 * normal[2] / length) + _BOUNCE
             gloss = shine * lit * max(_dot(normal, half) / length / np.sqrt(_dot(half, half)), 0.0) ** _HIGHLIGHT
             cover = alpha * here[12]
             for n in range(3):
-                srgb = min(max(colour[n] * light + gloss, 0.0), 1.0) ** (1 / GAMMA)
+                srgb = np.float32(min(max(here[6 + n] * light + gloss, 0.0), 1.0)) ** np.float32(1 / GAMMA)
                 image[row, column, n] = cover * srgb + (1 - cover) * image[row, column, n]
 
 
 @_compiled
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
+def _dot(a: Sequence[float] | np.ndarray, b: Sequence[float] | np.ndarray) -> float:
     """Of two vectors (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 

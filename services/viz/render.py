@@ -68,7 +68,7 @@ def render_episode_frames(
       around: further shapes at a control step.
     """
     steps = list(steps)
-    seen_from = camera or camera_of(episode, steps, size[0] / size[1])
+    seen_from = camera or camera_of(episode, steps, size[0] / size[1], overlays=overlays)
 
     def drawn(step: int) -> np.ndarray:
         return render_scene([*episode_shapes(episode, step, overlays=overlays), *around(step)], seen_from, size)

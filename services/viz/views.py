@@ -21,9 +21,9 @@ from congrasp.services.viz.shapes import capsule_shapes, fit
 _AZIMUTHS, _ELEVATIONS = np.arange(0, 360, 30), (16, 28, 40)  # degrees, of the cameras that are compared
 _ASIDE = 75.0  # degrees between the two views of a picture
 _ROWS = 72  # of the pictures that cameras are compared by
-_CONTACT, _FINGER, _OBJECT, _BEHIND, _BEFORE = 2.0, 1.0, 1.0, 1.5, 0.8
-"""Weights of the seen shares of touching links, of all fingers and of the object, and of a view along the forearm from
-behind and from the front of the hand."""
+_CONTACT, _FINGER, _OBJECT, _BROAD, _BEHIND, _BEFORE = 2.0, 1.0, 1.0, 1.0, 1.5, 0.8
+"""Weights of the seen shares of touching links, of all fingers and of the object, of the object's broad side, and of a
+view along the forearm from behind and from the front of the hand."""
 _FALL = 0.1  # how far the camera follows a falling object, m
 
 
@@ -72,9 +72,11 @@ def views(episode: Message, steps: Sequence[int]) -> tuple[View, View]:
     return best, options[int(np.argmax(np.where(aside, scores, -np.inf)))]
 
 
-def camera_of(episode: Message, steps: Sequence[int], aspect: float = 4 / 3, view: View | None = None) -> Camera:
+def camera_of(
+    episode: Message, steps: Sequence[int], aspect: float = 4 / 3, view: View | None = None, *, overlays: bool = False
+) -> Camera:
     """A camera that holds everything that happens in the steps, from a view or from the best one."""
-    points = np.concatenate([_extent(episode, step) for step in steps])
+    points = np.concatenate([_extent(episode, step, overlays=overlays) for step in steps])
     points = points[ConvexHull(points).vertices]  # what holds these holds all
     return fit(points, (view or views(episode, steps)[0]).direction, aspect)
 
@@ -91,13 +93,19 @@ class _Pictured:
         self._areas = np.array([2 * r * (2 * half + 2 * r) for r, half in (c.size for c in self._capsules)])
         self._finger = hand.capsule_links > 0
         self._touching = np.linalg.norm(arrays["contact_force"][step], axis=-1)[hand.capsule_links] > TOUCH
-        self._points = _extent(episode, step)
+        self._points = _extent(episode, step, overlays=False)
         wrist = Rotation.from_quat(links[1][0], scalar_first=True)
         back = -hand.keypoints[len(hand.links) :].mean(0)
         self._back = wrist.apply(back / np.linalg.norm(back))
+        x, y, z = np.ptp(arrays["visual_vertices"], axis=0)
+        self._faces = np.array([y * z, z * x, x * y]) / np.linalg.norm([y * z, z * x, x * y])  # of its box
+        self._object = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
 
     def score(self, view: View) -> float:
-        """Weighted shares of touching links, fingers and object that a view shows, each from 0 to about 1."""
+        """Weighted shares of touching links, fingers and object that a view shows, each from 0 to about 1.
+
+        A box with faces F along its axes has the silhouette |d| · F from a direction d, at most |F|.
+        """
         camera = fit(self._points, view.direction, 4 / 3)
         size = (_ROWS * 4 // 3, _ROWS)
         counts = _counts(self._shapes, camera, size)
@@ -108,7 +116,10 @@ class _Pictured:
         along = float(self._back @ view.direction)
         hidden = (_BEHIND if along > 0 else _BEFORE) * along**2
         whole = counts[-1] / max(unhidden, 1)
-        return float(_CONTACT * contact + _FINGER * seen[self._finger].mean() + _OBJECT * whole - hidden)
+        broad = np.abs(self._object.inv().apply(view.direction)) @ self._faces
+        return float(
+            _CONTACT * contact + _FINGER * seen[self._finger].mean() + _OBJECT * whole + _BROAD * broad - hidden
+        )
 
 
 def _counts(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:
@@ -117,8 +128,8 @@ def _counts(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> n
     return np.bincount(seen[seen >= 0], minlength=len(shapes))
 
 
-def _extent(episode: Message, step: int) -> np.ndarray:
-    """(N, 3) points that a picture of a step must hold: skin without sleeve, the object's box and a trajectory.
+def _extent(episode: Message, step: int, *, overlays: bool) -> np.ndarray:
+    """(N, 3) points that a picture of a step must hold: skin without sleeve, the object's box, as overlay a trajectory.
 
     An object that has fallen far may leave the picture.
     """
@@ -133,5 +144,6 @@ def _extent(episode: Message, step: int) -> np.ndarray:
     turn = Rotation.from_quat(arrays["object_quaternion"][step], scalar_first=True)
     low, high = arrays["visual_vertices"].min(0), arrays["visual_vertices"].max(0)
     points = [np.where(np.indices((2, 2, 2)).reshape(3, -1).T, high, low)]
-    points += [marker.points for _, marker in markers(arrays) if isinstance(marker, Polyline)]
+    if overlays:
+        points += [marker.points for _, marker in markers(arrays) if isinstance(marker, Polyline)]
     return np.concatenate([around, turn.apply(np.concatenate(points)) + arrays["object_position"][step]])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.initial import initial_hand, sample
+from congrasp.actors.initial import InitialConditions, initial_hand, sample
 from congrasp.common.hands.kinematics import hand_center, keypoints, link_transforms
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import optional
@@ -68,10 +68,10 @@ def _bank(valid: np.ndarray) -> ConstraintBank:
     )
 
 
-@functools.cache
-def _sampler(task: TaskConfig) -> Callable:
-    """Initial conditions of many episodes, from a bank and a key."""
-    return jax.jit(lambda bank, key: sample(HAND, task, bank, key, BATCH))
+@functools.partial(jax.jit, static_argnums=0)
+def _sample(task: TaskConfig, bank: ConstraintBank, together: float) -> InitialConditions:
+    """Initial conditions of many episodes; `together` is the task's `p_together`."""
+    return sample(HAND, dataclasses.replace(task, p_together=together), bank, jax.random.key(3), BATCH)
 
 
 @jax.jit
@@ -93,10 +93,12 @@ def _heading(task: TaskConfig) -> Callable:
     return jax.jit(found)
 
 
-def _drawn(task: TaskConfig, valid: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+def _drawn(
+    task: TaskConfig, valid: np.ndarray, together: float = 0.0
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
     """Which blocks are active, and numbers of pose and trajectory, in many episodes; an affordance that a pose
     overrides is not active, but is told by the region."""
-    drawn = _sampler(task)(_bank(valid), jax.random.key(3))
+    drawn = _sample(task, _bank(valid), together)
     active = {name: np.asarray(block) for name, block in drawn.goal.active.items()} | {
         "region": np.asarray(drawn.region) == 1
     }
@@ -115,7 +117,7 @@ def test_a_trajectory_that_ends_nearer_to_the_avoid_region_is_never_drawn_beside
 def test_a_disturbance_never_makes_a_trajectory_contradict_an_affordance():
     """Trajectories 3, 4 and 5 end 5, 15 and 25 mm on the graspable side, and disturbances have up to 10 mm."""
     task = dataclasses.replace(TASK, disturbed_references=1.0)
-    drawn = _sampler(task)(_bank(np.ones(M, bool)), jax.random.key(3))
+    drawn = _sample(task, _bank(np.ones(M, bool)), 0.0)
     region, on = np.asarray(drawn.region) == 1, np.asarray(drawn.goal.active["trajectory"])
     end = np.asarray(drawn.goal["trajectory"].position)[:, -1]
     both = region & on
@@ -129,8 +131,7 @@ def test_a_disturbance_never_makes_a_trajectory_contradict_an_affordance():
 @pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
 def test_a_share_of_the_affordances_gets_a_trajectory_as_well(share):
     """By hand: 1/2 of the episodes have an affordance, 1/2 of these no pose, 1/2 of these a trajectory anyway."""
-    task = dataclasses.replace(TASK, p_together=share)
-    active, _, trajectory = _drawn(task, np.ones(M, bool))
+    active, _, trajectory = _drawn(TASK, np.ones(M, bool), share)
     both = active["trajectory"] & active["affordance"]
     assert both.mean() == pytest.approx(0.25 * (0.5 + 0.5 * share), abs=0.03)
     assert set(trajectory[both]) == {3, 4, 5}
@@ -143,7 +144,7 @@ def test_a_share_of_the_affordances_gets_a_trajectory_as_well(share):
 
 
 def test_no_object_gets_a_trajectory_that_its_affordance_excludes():
-    active, _, _ = _drawn(dataclasses.replace(TASK, p_together=1.0), np.arange(M) < 3)
+    active, _, _ = _drawn(TASK, np.arange(M) < 3, together=1.0)
     assert not (active["trajectory"] & active["region"]).any() and active["affordance"].any()
 
 

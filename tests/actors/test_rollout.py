@@ -280,11 +280,15 @@ def test_an_environment_that_goes_on_keeps_its_contacts_when_another_restarts(ba
 
 
 def test_a_rollout_compiles_once_wherever_its_parameters_are(bank):
-    """Those of the first policy are committed to no device, those of an update are: a start must not compile twice."""
+    """Those of the first policy are committed to no device, those of an update are: a start must not compile twice.
+
+    Nor does the number of steps matter.
+    """
     worker = _worker(bank)
     first = jnp.zeros(1)
-    for parameters in (first, jax.device_put(first, jax.local_devices()[0]), np.zeros(1, np.float32)):
-        worker.collect(parameters, 2)
+    placed = (first, jax.device_put(first, jax.local_devices()[0]), np.zeros(1, np.float32))
+    for steps, parameters in enumerate(placed, 1):
+        worker.collect(parameters, steps)
         worker.restart()
     programs = worker._decide_jit, worker._advance_jit, worker._sample_jit, worker._with_scene_jit
     assert [program._cache_size() for program in programs] == [1, 1, 1, 1]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors import stress as protocols
-from congrasp.actors.attempts import Attempts
+from congrasp.actors.attempts import Attempts, Phases
 from congrasp.actors.env import GraspEnv, Settings
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.physics.mjx import MjxPhysics
@@ -233,7 +233,7 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     for each in probed:
         each.adjust(protocol=protocols.stress(task, OBJECTS, 10), probe_data=distance_field(OBJECTS))
     ended, measured = probed
-    measured.state = measured.state._replace(after=jnp.full(4, after))
+    measured.state = measured.state._replace(after=jnp.full_like(measured.state.after, after))
     bare, one, other = (each.collect(None, 30) for each in (plain, ended, measured))
     np.testing.assert_array_equal(one.action, other.action)
     np.testing.assert_array_equal(one.episodes, other.episodes)
@@ -242,6 +242,7 @@ def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
     np.testing.assert_allclose(bare.episodes, one.episodes, rtol=1e-5, atol=1e-6)
     assert one.terminal[-1].all() and one.has_episode.all() and other.has_episode.all() and not other.terminal.any()
     rest = measured.collect(None, after)
+    assert [program._cache_size() for program in (measured._decide_jit, measured._advance_jit)] == [1, 1]
     np.testing.assert_array_equal(rest.episodes, one.episodes)
     assert not rest.has_episode.any() and rest.terminal[-1].all() and not rest.terminal[:-1].any()
     samples = jax.tree.map(lambda *x: np.concatenate(x), other.probed, rest.probed)
@@ -289,13 +290,13 @@ def test_attempts_with_a_lift_end_higher_in_the_world():
     rest = np.concatenate([drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1)
     surface = Surface(np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1)))
     asked = {constraint.name: np.zeros(2, bool) for constraint in optional(task)}
-    attempts = Attempts(HAND, task, policy, hold=5, threads=1, lift=0.06)
+    attempts = Attempts(HAND, task, policy, threads=1, phases=Phases(lift=0.06, hold=0.0))
     outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
     attempts.close()
     lift = protocols.lift_steps(task, 0.06)
     assert attempts.steps == 60 + lift + 5 == len(outcome.trace.q)
     dt = task.control_dt
-    assert attempts.phases == {"grasp": 0.0, "lift": 60 * dt, "hold": pytest.approx((60 + lift) * dt)}
+    assert attempts.begins == {"grasp": 0.0, "lift": 60 * dt, "hold": pytest.approx((60 + lift) * dt)}
     assert set(outcome.metrics) > WITHOUT_MESHES
     way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[59]
     slid = (outcome.trace.u[-1] - outcome.trace.u[59])[:, :3]

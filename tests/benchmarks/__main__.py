@@ -41,12 +41,12 @@ def gallery(
     out: pathlib.Path = pathlib.Path("docs/gallery"),
     attempts: int = 16,
 ) -> int:
-    """Grasps of 24 objects as one contact sheet and three short films.
+    """Grasps of 24 objects as a page with pictures and short films.
 
     Args:
       scans: Folder of the scanned objects; the others come with the repository.
       work: Folder for the grasps; those that are finished in it are drawn again, not made again.
-      out: Folder for the pictures.
+      out: Folder for page and pictures.
       attempts: Grasps that are simulated side by side, for each object.
 
     Examples:
@@ -60,6 +60,28 @@ def gallery(
         print(f"{result.name}: {result.line()}", flush=True)
         results.append(result)
     return 0 if all(result.held for result in results) else 1
+
+
+def speeds(
+    grasps: pathlib.Path = pathlib.Path("runs/gallery"),
+    out: pathlib.Path = pathlib.Path("docs/notes/speeds.png"),
+    count: int = 12,
+) -> int:
+    """Wrist speed of the gallery's grasps over time, with the range of human reaches, as one sheet.
+
+    Args:
+      grasps: Folder of the gallery's grasps.
+      out: The picture.
+      count: Number of grasps, by the order of their names.
+
+    Examples:
+      python -m tests.benchmarks speeds
+      python -m tests.benchmarks speeds --grasps runs/gallery --out speeds.svg
+    """
+    from tests.benchmarks.speeds import bench_speeds
+
+    bench_speeds(grasps, out, count)
+    return 0
 
 
 def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int = 0, repeats: int = 5) -> int:
@@ -280,6 +302,7 @@ def arms(
 COMMANDS = {
     "pieces": pieces,
     "gallery": gallery,
+    "speeds": speeds,
     "measures": measures,
     "robot": robot,
     "shutdown": shutdown,

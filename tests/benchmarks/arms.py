@@ -5,6 +5,7 @@ import json
 import pathlib
 from typing import Any
 
+from congrasp.actors.attempts import Phases
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.io.files import write_atomically
@@ -73,7 +74,7 @@ def bench_arms(
         for name in arms
     }
     every = AllArms(planners)
-    grasper = Grasper(bundle, attempts=attempts, rounds=1, approach=3.0, lift=0.15, arm=every)
+    grasper = Grasper(bundle, attempts=attempts, rounds=1, phases=Phases(3.0, 0.15), arm=every)
     rows: dict[str, Any] = {}
     for folder in sorted(path for path in objects.iterdir() if path.is_dir()):
         every.begin()

@@ -1,4 +1,4 @@
-"""The gallery of docs/gallery: grasps of scanned and made-up objects under each constraint, by three hands."""
+"""The gallery of docs/gallery: grasps of scanned and generated objects under each constraint, by three hands."""
 
 import pathlib
 from collections.abc import Iterator
@@ -7,23 +7,35 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
+from congrasp.actors.attempts import Phases
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.grasp.files import MOTION, RECORDING
+from congrasp.services.grasp.files import RECORDING
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.jobs import Result, Settings, find_objects, grasp_object
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.viz.render import grasp_steps, render_episode_frames
-from congrasp.services.viz.sheets import contact_sheet, save_png
 from congrasp.services.viz.views import camera_of, views
 
-_SIZE, _COLUMNS = (320, 240), 6
-_FILM_SIZE, _FILM_FPS, _HELD = (320, 240), 12.5, 0.5  # pixels, frames a second, s of the hold
-_COLOURS = 224  # of a film
-_APPROACH, _LIFT = 1.0, 0.12  # s, m
+_SIZE, _QUALITY = (480, 360), 88  # pixels, of JPEG
+_FILM_SIZE, _FILM_FPS, _HELD = (400, 300), 12.5, 0.5  # pixels, frames a second, s of the hold
+_COLOURS = 256  # of a film
+_PHASES = Phases(approach=0.7, lift=0.12)
+_HEAD = """# Gallery
+
+```sh
+python -m tests.benchmarks gallery --scans object_sim    # these grasps, pictures and this page
+```
+
+Each picture is the end of the hold, after a reach from the side of the table and a lift. The scans are MyoSuite's
+(Apache-2.0, `simhive/object_sim`). `runs/gallery` holds the grasps; two of them serve as references of others.
+
+| grasp | command, attempts that hold the object |
+|---|---|
+"""
 
 
 class Shown(NamedTuple):
@@ -42,13 +54,13 @@ class Shown(NamedTuple):
 
 SHOWN = (
     Shown("mug", "examples/mug.obj", options={"affordance": "examples/handle.obj"}, film=True),
-    Shown("teapot", "teapot"),
+    Shown("drill", "drill:2", options={"affordance": "grip"}),
     Shown("wine-glass", "wineglass", rest="upright"),
-    Shown("water-bottle", "waterbottle", rest="upright", film=True),
+    Shown("water-bottle", "waterbottle", rest="upright"),
     Shown("hammer", "hammer", options={"heading": "above"}),
     Shown("banana", "banana", options={"heading": "above"}),
     Shown("light-bulb", "lightbulb", options={"gentle": True}),
-    Shown("apple", "apple", options={"fingers": "thumb index middle"}),
+    Shown("apple", "apple", options={"fingers": "thumb index middle"}, film=True),
     Shown("camera", "camera"),
     Shown("binoculars", "binoculars", options={"heading": "above"}),
     Shown("rubber-duck", "duck"),
@@ -56,11 +68,15 @@ SHOWN = (
     Shown("flashlight", "flashlight"),
     Shown("stapler", "stapler", options={"force": "5"}),
     Shown("coffee-mug", "coffeemug", rest="upright"),
-    Shown("mug-7", "mug:7", options={"affordance": "handle"}, rest="upright"),
+    Shown("hollow-mug", "hollow_mug:7", options={"affordance": "handle"}),
     Shown("bottle-pose", "waterbottle", options={"pose": "{out}/water-bottle/waterbottle/grasp.npz"}, rest="upright"),
-    Shown("bulb-path", "lightbulb", options={"trajectory": "{out}/light-bulb/lightbulb/grasp.npz"}),
+    Shown(
+        "bulb-path",
+        "lightbulb",
+        options={"trajectory": "{out}/light-bulb/lightbulb/grasp.npz", "fingers": "thumb index middle"},
+    ),
     Shown("allegro-bottle", "waterbottle", "allegro", rest="upright"),
-    Shown("allegro-teapot", "teapot", "allegro"),
+    Shown("allegro-mug", "coffeemug", "allegro", rest="upright"),
     Shown("allegro-hammer", "hammer", "allegro", options={"heading": "above"}, film=True),
     Shown("sharpa-duck", "duck", "sharpa"),
     Shown("sharpa-ring", "torusmedium", "sharpa"),
@@ -69,26 +85,23 @@ SHOWN = (
 
 
 def make_gallery(scans: pathlib.Path, work: pathlib.Path, out: pathlib.Path, attempts: int) -> Iterator[Result]:
-    """Grasps what is not finished in `work`, and draws the sheet and the films in `out`; yields each result."""
+    """Grasps what is not finished in `work`, and draws pictures, films and the page in `out`; yields each result."""
     graspers: dict[str, Grasper] = {}
-    tiles, labels = [], []
+    out.mkdir(parents=True, exist_ok=True)
+    rows = []
     for shown in SHOWN:
         file = policy_file(None, shown.hand)
         if shown.hand not in graspers:
-            graspers[shown.hand] = Grasper(bundles.load(file), attempts=attempts, approach=_APPROACH, lift=_LIFT)
-        path = pathlib.Path(shown.object)
-        (at,), errors = find_objects([scans / shown.object if (scans / shown.object).exists() else path])
+            graspers[shown.hand] = Grasper(bundles.load(file), attempts=attempts, phases=_PHASES)
+        path = scans / shown.object
+        (at,), errors = find_objects([path if path.exists() else pathlib.Path(shown.object)])
         if errors:
             raise CongraspError(errors[0].error)
-        given = {
-            name: value.format(out=work) if isinstance(value, str) else value for name, value in shown.options.items()
-        }
-        identity = bundles.content_hash(file.read_bytes()), attempts, _APPROACH, _LIFT
         settings = Settings(
             out=work / shown.name,
             options=ImportOptions("guess"),
-            constraints=given,
-            identity=identity,
+            constraints={name: _given(value, work) for name, value in shown.options.items()},
+            identity=(bundles.content_hash(file.read_bytes()), attempts, *_PHASES[:2]),
             film=None,
             view=None,
             pictures=False,
@@ -99,20 +112,32 @@ def make_gallery(scans: pathlib.Path, work: pathlib.Path, out: pathlib.Path, att
         yield result._replace(name=shown.name)
         if result.error:
             continue
-        folder = settings.out / at.name
-        assert (folder / MOTION).is_file()
-        episode = pick_episode(folder / RECORDING, -1, success=False)
+        episode = pick_episode(settings.out / at.name / RECORDING, -1, success=False)
         last = len(episode.arrays["table"]) - 1
-        tiles += render_episode_frames(episode, [last], _SIZE, overlays=False)
-        words = " ".join(f"{name} {value}" for name, value in shown.options.items() if name in ("heading", "fingers"))
-        words = words or " ".join(shown.options)
-        verdict = "" if result.held else ": NOT HELD"
-        labels.append(", ".join([f"{shown.hand}: {at.name}", *([words] if words else [])]) + verdict)
+        (picture,) = render_episode_frames(episode, [last], _SIZE, overlays=False)
+        Image.fromarray(picture).save(out / f"{shown.name}.jpg", quality=_QUALITY)
         if shown.film:
             save_film(out / f"{shown.name}.gif", episode)
-    save_png(out / "gallery.png", contact_sheet(tiles, labels, columns=_COLUMNS))
+        held = f"{result.facts['attempts_held']} of {result.facts['attempts']}"
+        rows.append(f"| ![{shown.name}]({shown.name}.jpg) | `{_command(shown, path)}`<br>{held} |\n")
+    (out / "index.md").write_text(_HEAD + "".join(rows))
     for grasper in graspers.values():
         grasper.close()
+
+
+def _given(value: Any, work: pathlib.Path) -> Any:
+    """The value of an option, with the gallery's working folder in it."""
+    return value.format(out=work) if isinstance(value, str) else value
+
+
+def _command(shown: Shown, scan: pathlib.Path) -> str:
+    """The command that makes the grasp."""
+    words = ["congrasp grasp", f"object_sim/{shown.object}" if scan.exists() else shown.object]
+    options = {"hand": shown.hand, "rest": shown.rest, **shown.options}
+    for name, value in options.items():
+        if value and (name, value) != ("hand", "human"):
+            words.append(f"--{name}" if value is True else f"--{name} {_given(value, pathlib.Path('runs/gallery'))}")
+    return " ".join([*words, f"--approach {_PHASES.approach:g} --lift {_PHASES.lift:g}"])
 
 
 def save_film(path: pathlib.Path, episode: Message) -> None:
@@ -121,13 +146,14 @@ def save_film(path: pathlib.Path, episode: Message) -> None:
     hold = float(episode.meta["phases"]["hold"])
     steps = np.arange(0.0, hold + _HELD, 1 / _FILM_FPS) / dt
     steps = [int(step) for step in steps if step < len(episode.arrays["table"])]
-    view = views(episode, [grasp_steps(episode)[1], steps[-1]])[0]
-    camera = camera_of(episode, steps, _FILM_SIZE[0] / _FILM_SIZE[1], view)
+    begin, lift = grasp_steps(episode)
+    view = views(episode, [lift, steps[-1]])[0]
+    # The hand comes into the picture as it reaches.
+    camera = camera_of(episode, [step for step in steps if step >= begin], _FILM_SIZE[0] / _FILM_SIZE[1], view)
     frames = [
         Image.fromarray(frame) for frame in render_episode_frames(episode, steps, _FILM_SIZE, camera, overlays=False)
     ]
-    several = np.hstack([np.asarray(frame) for frame in frames[:: max(1, len(frames) // 4)]])
+    several = np.hstack([np.asarray(frame) for frame in frames[:: max(1, len(frames) // 8)]])
     palette = Image.fromarray(several).quantize(_COLOURS, dither=Image.Dither.NONE)
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    path.parent.mkdir(parents=True, exist_ok=True)
     drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=round(1000 / _FILM_FPS), loop=0)

@@ -30,9 +30,7 @@ from congrasp.services.export.policy import export_policy
 HAND = get_hand("allegro")
 NETWORK = NetworkConfig(hidden=(32,), encoder=4, points=(8, 16))
 POINTS = 64
-TASK = TaskConfig(
-    hand="allegro", constraints=("heading", "affordance"), surface_points=POINTS, observation="camera", history=2
-)
+TASK = TaskConfig(hand="allegro", surface_points=POINTS, observation="camera", history=2)
 
 
 def cube():
@@ -92,6 +90,10 @@ def test_a_calibration_error_is_one_rigid_motion_of_cloud_and_goal():
     np.testing.assert_allclose(off.goal["heading"].position, pose[:, :3] + sensors.position_bias, atol=1e-6)
     down = rotations.rotate(turn, exact.goal["heading"].direction)
     np.testing.assert_allclose(off.goal["heading"].direction, down, atol=1e-6)
+    path = exact.goal["trajectory"]
+    turned = rotations.multiply(jnp.broadcast_to(turn[:, None], path.quaternion.shape), path.quaternion)
+    np.testing.assert_allclose(off.goal["trajectory"].quaternion, turned, atol=1e-6)
+    np.testing.assert_array_equal(off.goal["force"].limit, exact.goal["force"].limit)
 
 
 class Shown(NamedTuple):

@@ -99,10 +99,10 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_run_within_seconds_and_costs_nothing_that_was_accepted(tmp_path, number):
     run_dir = tmp_path / "run"
-    command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(run_dir), *SMALL]
+    command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(run_dir), "--actors", "1", *SMALL]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
-        _eventually(lambda: _version(run_dir) >= 2, 300, process)
+        _eventually(lambda: _version(run_dir) >= 4, 300, process)  # of one rollout each
         family = psutil.Process(process.pid).children(recursive=True)
         process.send_signal(number)
         process.communicate(timeout=20)

@@ -1,6 +1,7 @@
 """The command line as a user meets it: help, and one clear line for bad input."""
 
 import errno
+import functools
 import logging
 import os
 import re
@@ -16,6 +17,7 @@ import pytest
 import congrasp.services.cli.main as cli
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.ports import free_port
+from congrasp.services.cli import console
 from congrasp.services.cli.main import COMMANDS, load
 from congrasp.services.ops.logs import announced
 
@@ -186,3 +188,14 @@ def test_what_takes_long_says_for_how_long_and_what_does_not_says_nothing(capsys
         while len(lines) < 2:
             lines += capsys.readouterr().err.splitlines()
     assert set(lines) == {"Compiling: 0 s so far."}
+
+
+def test_without_a_terminal_the_current_task_and_its_counts_are_named(capsys, monkeypatch):
+    monkeypatch.setattr(console, "announced", functools.partial(announced, first=0.01, every=0.01))
+    with console.tracked() as track:
+        track("heading", 12)(5)
+        capsys.readouterr()
+        lines: list[str] = []
+        while len(lines) < 2:
+            lines += capsys.readouterr().err.splitlines()
+    assert lines[-1] == "heading, 5 of 12: 0 s so far."

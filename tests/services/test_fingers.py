@@ -9,6 +9,7 @@ import onnxruntime
 import pytest
 import trimesh
 
+from congrasp.actors.attempts import Phases
 from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands import get_hand
@@ -125,7 +126,7 @@ def test_fingers_are_read_by_their_names() -> None:
 
 
 def test_a_grasp_is_asked_for_with_two_fingers(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
-    grasper = Grasper(policy, attempts=2, rounds=1, seconds=0.25, threads=1)
+    grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
     found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index")))
     grasper.close()
     assert found.motion.constraints == ("heading", "fingers") and "fingers_ratio" in found.facts()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from congrasp.actors.attempts import Phases
 from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
@@ -50,7 +51,7 @@ def test_a_policy_that_does_not_know_it_says_so(paper_policy, tmp_path: pathlib.
 
 
 def test_a_grasp_is_made_with_a_limit(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
-    grasper = Grasper(policy, attempts=2, rounds=1, seconds=0.25, threads=1)
+    grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
     found = grasper.grasp(MUG, read_request(MUG, HAND, 15, force="3"))
     grasper.close()
     assert found.motion.constraints == ("heading", "force") and 0.0 <= found.facts()["force_ratio"] <= 1.0

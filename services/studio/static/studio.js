@@ -25,6 +25,8 @@ export class StudioPanel {
     $("unit").addEventListener("change", () => this.act("unit", { unit: $("unit").value }));
     $("mass").addEventListener("change", () => this.act("weigh", { mass_g: Number($("mass").value) }));
     $("material").addEventListener("change", () => this.act("weigh", { material: $("material").value }));
+    for (const input of document.querySelectorAll("[data-phase]"))
+      input.addEventListener("change", () => this.act("time", { [input.dataset.phase]: Number(input.value) }));
     for (const name of ["undo", "redo"]) $(name).addEventListener("click", () => this.act(name, {}));
     addEventListener("keydown", (event) => this.#key(event));
     $("file").addEventListener("change", () => {
@@ -130,8 +132,10 @@ export class StudioPanel {
     this.state = state;
     fill($("hand"), state.hands.map((name) => [name, name]), state.hand);
     fill($("object"), state.objects.map((name) => [name, name]), state.chosen);
-    fill($("material"), [["", "as it is"], ...state.weight.materials.map((name) => [name, name])], state.weight.material);
+    fill($("material"), [["", "unchanged"], ...state.weight.materials.map((name) => [name, name])], state.weight.material);
     $("mass").value = state.weight.mass_g || "";
+    for (const input of document.querySelectorAll("[data-phase]"))
+      if (input !== document.activeElement) input.value = state.phases[input.dataset.phase]; // it may be being typed in
     this.#rests(state);
     this.#unit(state.upload);
     const { size_cm: size, mass_g: mass, faces } = studio.object;

@@ -83,7 +83,8 @@ export class Timeline {
     });
     this.#curve(g, motion.totalForce, motion.lanes.length, width, colour("--force"));
     this.#curve(g, motion.totalReward, motion.lanes.length + 1, width, colour("--accent"));
-    const gone = motion.table.indexOf(0);
+    const lift = motion.meta.phases?.lift;
+    const gone = lift ? Math.round(lift / motion.dt) : motion.table.indexOf(0);
     if (gone > 0) {
       g.strokeStyle = colour("--quiet");
       g.setLineDash([3, 3]);
@@ -93,7 +94,7 @@ export class Timeline {
       g.stroke();
       g.fillStyle = colour("--quiet");
       g.font = "11px system-ui, sans-serif";
-      g.fillText("table removed", gone * cell + 4, height - 4);
+      g.fillText(lift ? "lift" : "table removed", gone * cell + 4, height - 4);
     }
     this.at(this.time ?? 0);
   }

@@ -36,6 +36,14 @@ def test_every_cause_has_its_label(metrics, said):
     assert cause(episode([0.3, 0.3, 0.2, 0.19, 0.16, 0.149, 0.1], **metrics), 0.05) == said
 
 
+def test_what_slips_in_a_lift_is_measured_from_the_wrist():
+    made = episode([0.1] * 8)
+    wrist = np.array([0.2, 0.2, 0.2, 0.22, 0.24, 0.26, 0.28, 0.3])[:, None, None] * [0.0, 0.0, 1.0]
+    arrays = {**made.arrays, "link_position": wrist, "table": np.ones(8, bool)}
+    lifted = Message(arrays, {**made.meta, "phases": {"grasp": 0.0, "lift": 0.02}})
+    assert cause(lifted, 0.05) == "slipped 0.03 s after the lift began"
+
+
 def test_failures_of_an_untrained_policy_are_drawn():
     config = get_preset("quickstart")
     policy = untrained(dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,))))

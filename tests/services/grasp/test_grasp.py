@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from congrasp.actors.attempts import Outcome
+from congrasp.actors.attempts import Outcome, Phases
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Trace
@@ -46,7 +46,7 @@ def block(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def grasper():
-    grasper = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, threads=2)
+    grasper = Grasper(bundles.load(policy_file(None)), attempts=4, phases=Phases(hold=0.25), threads=2)
     yield grasper
     grasper.close()
 
@@ -89,7 +89,7 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
 def test_a_left_hand_with_its_own_model_does_what_the_mirrored_right_one_did(block, grasper, monkeypatch):
     begun = []
     initial = grasper._attempts._initial
-    monkeypatch.setattr(grasper._attempts, "_initial", lambda request: begun.append(initial(request)) or begun[-1])
+    monkeypatch.setattr(grasper._attempts, "_initial", lambda *a, **k: begun.append(initial(*a, **k)) or begun[-1])
     monkeypatch.setattr(grasper, "_left", True)
     monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
     found = grasper.grasp(block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}}))
@@ -129,7 +129,7 @@ def test_what_holds_comes_first_then_what_is_firm_clean_and_as_asked():
 
 def test_a_grasp_lifts_the_block_off_a_table_that_stays(block):
     """By physics: the hand goes up and the block with it, because the hand holds it."""
-    lifting = Grasper(bundles.load(policy_file(None)), attempts=4, seconds=0.25, approach=0.3, lift=0.1, threads=2)
+    lifting = Grasper(bundles.load(policy_file(None)), attempts=4, phases=Phases(0.3, 0.1, 0.25), threads=2)
     upright = int(np.argmax(block.rest_poses[:, 2]))
     found = lifting.grasp(block, GraspRequest(rest=upright))
     lifting.close()

@@ -7,11 +7,13 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from congrasp.actors.initial import handover_speed
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.objects import procedural
 from congrasp.common.rotations import rotate
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.export.motion_file import motion_of_episode
 from congrasp.services.grasp.files import _steps_to_draw
@@ -65,7 +67,8 @@ def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, headi
     first = beginning(hand, way, ball, 0.16)
     rest = np.asarray(ball.rest_poses[0], float)
     reach = plan_reach(hand, ball, rest, way, first, 0.2, DT, speed)
-    assert np.linalg.norm((reach.position[0] - rest[:3])[:2]) > 0.3  # beside the table
+    away, end = (np.linalg.norm((place - rest[:3])[:2]) for place in (reach.position[0], first.position[0]))
+    assert away == pytest.approx(max(0.45, end + 0.22), abs=1e-6)
     whole = Reach(
         np.concatenate([reach.position, first.position]),
         Rotation.concatenate([reach.rotation, first.rotation]),
@@ -87,10 +90,17 @@ def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, headi
     assert (steps[1:] * steps[:-1]).sum(-1).min() > -1e-9  # it never goes back
 
 
+def test_the_reach_ends_nine_tenths_as_fast_as_the_guidance_moves_the_wrist() -> None:
+    hand, task = get_hand("human"), TaskConfig()
+    further = dataclasses.replace(task, control=dataclasses.replace(task.control, approach_position_limit=0.04))
+    found = [handover_speed(hand, one) for one in (task, further)]  # its servos: 20/s
+    assert found == pytest.approx([0.9 * 0.02 * 20, 0.9 * 0.04 * 20])
+
+
 def test_where_no_way_leads_is_said(ball) -> None:
     hand = get_hand("human")
     first = beginning(hand, np.array([0.0, 0.0, 1.0]), ball, 0.16)  # from below, through the table
-    with pytest.raises(CongraspError, match=r"no way leads to a grasp of .* Leave out --approach"):
+    with pytest.raises(CongraspError, match=r"no way leads to a grasp of .* Leave out the approach"):
         plan_reach(hand, ball, np.asarray(ball.rest_poses[0], float), np.array([0.0, 0.0, 1.0]), first, 1.0, DT)
 
 

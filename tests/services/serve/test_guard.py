@@ -140,6 +140,20 @@ def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
         assert guard.step(STATE).mode == "hold"
 
 
+def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
+    """Its hand opens after a silence, unless the table's absence says that something may be held."""
+    state = {name: STATE[name] for name in ("q", "u")}
+    for table, mode in ((True, "open"), (False, "freeze")):
+        clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+        with guarded(policy, clock, fallback="open") as guard:
+            guard.reset(dataclasses.replace(REQUEST, object_pose=None, cloud=np.zeros((8, 3))))
+            assert guard.step({**state, "table": table}).mode == "follow"
+            policy.outcome = TransportError("Nobody is there.")
+            clock.now += 2.5
+            assert guard.step({**state, "table": table}).mode == mode
+        assert policy.states[0].keys() == {"q", "u", "table", "q_target", "u_target"}
+
+
 def test_a_lasting_nan_holds_and_then_freezes_with_the_torque_of_the_last_measurement():
     """2 N.m/rad from the joints at 0 to the targets at 0.2 and 0.1 rad."""
     clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))

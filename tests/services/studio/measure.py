@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 from playwright.sync_api import sync_playwright
 
+from congrasp.actors.attempts import Phases
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
@@ -39,8 +40,8 @@ def many_faces() -> trimesh.Trimesh:
 class Fine(MadeUpGrasping):
     """Its grasps are of that object."""
 
-    def grasp(self, obj: GraspObject, request: GraspRequest, progress: object) -> Message:
-        made, mesh = super().grasp(obj, request, lambda text, share: None), many_faces()
+    def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: object) -> Message:
+        made, mesh = super().grasp(obj, request, phases, lambda text, share: None), many_faces()
         arrays = {**made.arrays, "visual_vertices": np.asarray(mesh.vertices, np.float32)}
         return Message(arrays | {"visual_faces": np.asarray(mesh.faces, np.int32)}, made.meta)
 

@@ -98,7 +98,7 @@ def test_what_was_drawn_is_shown_unless_another_is_clearly_better(
 ) -> None:
     found = outcome(held, error)
     removal = int(found.trace.table[:, 0].sum()) - 1
-    assert grasping._best(found, (), removal) == index
+    assert grasping._best(found, (), removal, 0.0) == index
     assert says in grasping._note(found, index, np.full(ATTEMPTS, 0.004))
     assert bool(says) == bool(grasping._note(found, index, np.full(ATTEMPTS, 0.004)))
 

@@ -39,6 +39,14 @@ def test_the_made_up_grasp_meets_what_it_was_made_for() -> None:
     assert trajectory.met.all()
 
 
+def test_with_a_lift_the_grasp_counts_from_its_begin_though_the_table_stays() -> None:
+    made = episode(STEPS, removal=REMOVAL)
+    stays = {**made.arrays, "table": np.ones(STEPS, bool)}
+    lifted = lanes(Message(stays, {**made.meta, "phases": {"grasp": 0.0, "lift": 0.2, "hold": 0.25}}))
+    assert lifted["contact"].counts.tolist() == [False] * 20 + [True] * (STEPS - 20)
+    assert lifted["trajectory"].counts.tolist() == [True] * 20 + [False] * (STEPS - 20)
+
+
 def test_tolerances_are_those_of_a_grasp_that_may_become_a_reference() -> None:
     assert HEADING == (0.25, 0.03) and TRAJECTORY == (0.3, 0.03)
     assert [error.tolerance for error in get_constraint("pose").errors] == [0.25, 0.03]

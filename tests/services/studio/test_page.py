@@ -256,6 +256,9 @@ def test_an_older_recording_is_played_with_its_constraints_and_contact_alone(ope
 def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_path: pathlib.Path) -> None:
     assert opened.input_value("#hand") == "of the run"
     still, tail = picture(opened), handle(opened, "tail")
+    opened.fill("[data-phase=lift]", "0.15")
+    opened.press("[data-phase=lift]", "Enter")
+    eventually(lambda: site.session.state()["phases"]["lift"] == 0.15)
     grasp(opened, site)
     assert [item.get_attribute("data-lane") for item in opened.locator("#lanes [data-lane]").all()] == [
         "contact", "heading",
@@ -288,7 +291,7 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
     assert Image.open(tmp_path / "motion.png").size == (1280, 720)
     opened.click("#edit")
     opened.wait_for_selector("#player", state="hidden")
-    assert site.grasping.asked[-1][0].name == "mug_1"
+    assert site.grasping.asked[-1][0].name == "mug_1" and site.grasping.asked[-1][2] == (0.0, 0.15, 2.0)
     assert handle(opened, "tail") == pytest.approx(tail, abs=1.0)  # the constraints are seen from where they were
 
 

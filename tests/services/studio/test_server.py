@@ -216,6 +216,17 @@ def test_an_object_weighs_what_it_is_said_to(page: Page, grasping: made_up.MadeU
     assert mass() == own
 
 
+def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+    page.do("time", approach=1.5, lift=0.2)
+    page.do("time", hold=1)
+    page.do("grasp")
+    assert page.wait()["error"] == "" and grasping.asked[-1][2] == (1.5, 0.2, 1.0)
+    for phase in ({"lift": 0.6}, {"hold": -1}, {"speed": 1.0}):
+        code, found = page.ask("POST", "/api/do", json.dumps({"action": "time", **phase}).encode())
+        assert code == 200 and "approach 0 to 10, lift 0 to 0.5" in json.loads(found)["error"], phase
+    assert json.loads(page.ask("GET", "/api/state")[1])["phases"] == {"approach": 1.5, "lift": 0.2, "hold": 1.0}
+
+
 def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasping, tmp_path: pathlib.Path) -> None:
     page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, avoid=True)
     page.do("grasp")

@@ -226,6 +226,8 @@ def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
     camera = camera_of(episode(), [0, 6, 11], 1.0)
     for step in (0, 11):
         assert np.abs(projected(camera, episode().arrays["link_position"][step].astype(float))).max() < 1
+    near, far = (camera_of(episode(), [11], overlays=overlays) for overlays in (False, True))
+    assert np.linalg.norm(far.position - far.target) > 1.1 * np.linalg.norm(near.position - near.target)  # its path
     frames = list(render_episode_frames(episode(), [0, 11], (64, 48)))
     fallen = episode()
     fallen.arrays["object_position"][-1, 2] -= 5.0
