@@ -17,8 +17,8 @@ class FailureWeights:
 
     With n episodes of an object of which f failed, both forgotten exponentially, its failure rate is estimated as p =
     (f + k p_family) / (n + k), k = 5, where the family's rate is regularised in the same way towards that of all
-    objects, m. The weight is (p + m) / 2m, between a half and two: an object that fails as often as the others keeps
-    its weight.
+    objects. With its variance v = p (1 - p) and the mean of all objects, m, the weight is (v + m) / 2m, between a half
+    and two: most is learnt where success is most uncertain.
     """
 
     def __init__(self, weight: np.ndarray, families: Sequence[str]):
@@ -57,11 +57,12 @@ class FailureWeights:
     @property
     def _factors(self) -> np.ndarray:
         """Factors (N,) on the weights."""
-        mean = self._rate
+        rates = (self._failures + _PRIOR * self._family_rates[self._family]) / (self._episodes + _PRIOR)
+        variance = rates * (1 - rates)
+        mean = variance.mean()
         if mean == 0.0:
             return np.ones(len(self._weight))
-        rates = (self._failures + _PRIOR * self._family_rates[self._family]) / (self._episodes + _PRIOR)
-        return np.clip((rates + mean) / (2 * mean), 1 / _BOUND, _BOUND)
+        return np.clip((variance + mean) / (2 * mean), 1 / _BOUND, _BOUND)
 
     @property
     def _family_rates(self) -> np.ndarray:

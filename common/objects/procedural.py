@@ -10,8 +10,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.families import BASIC, BUILDERS, HOUSEHOLD, SCANS, Draft
 from congrasp.common.objects.resting import rest_poses
-from congrasp.common.objects.spec import GraspObject
-from congrasp.common.objects.surface import halves, mass_properties, sample_union
+from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
+from congrasp.common.objects.surface import DENSE, balanced, halves, mass_properties, sample_union
 from congrasp.common.runtime.parallel import parallel_map
 
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)
@@ -39,8 +39,8 @@ _ATTEMPTS = 100
 def generate(seed: int, family: str | None = None) -> GraspObject:
     """Generates a random object, the same for the same seed and family.
 
-    Its largest side is between 3 and 25 cm (30 cm in household families) and its mass between 0.02 and 0.6 kg, . Both
-    its graspable and its avoid region cover at least a tenth of the surface. Mass and inertia are those of the sum of
+    Its largest side is between 3 and 25 cm (30 cm in household families) and its mass between 0.02 and 0.6 kg. Both its
+    graspable and its avoid region have at least a tenth of its surface points. Mass and inertia are those of the sum of
     its pieces (overlaps count twice), scaled together if the mass is out of range.
 
     Args:
@@ -108,10 +108,14 @@ def _build(name: str, family: str, draft: Draft, rng: np.random.Generator) -> Gr
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     reach = np.max([shapes.support(piece, axes) for piece in pieces], axis=0)
     size = (reach[:3] + reach[3:]).max()
-    points, normals, owner = sample_union(pieces, rng)
+    part = np.array([piece.part for piece in pieces], np.int32)
+    points, normals, owner = sample_union(pieces, rng, DENSE if draft.thin else SURFACE_POINTS)
+    if draft.thin:
+        chosen = balanced(np.array(draft.graspable)[part[owner]])
+        points, normals, owner = points[chosen], normals[chosen], owner[chosen]
     if draft.part_names:
         part_names, graspable = draft.part_names, np.array(draft.graspable)
-        labels = np.array([piece.part for piece in pieces], np.int32)[owner]
+        labels = part[owner]
     else:
         part_names, first = ("near half", "far half"), rng.random() < 0.5
         graspable = np.array([first, not first])

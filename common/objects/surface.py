@@ -5,6 +5,8 @@ import numpy as np
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import SURFACE_POINTS, Piece
 
+DENSE = 8192
+"""Surface points from which `balanced` chooses."""
 _SEAM = 2e-4  # m; a point is on the outer surface if a step of this length along its normal leaves all pieces
 _REACHABLE = 4e-3  # m; a mesh's surface counts as accessible if the collision pieces end within this distance
 # The generalised golden ratio of four dimensions: the positive root of x^5 = x + 1 (Roberts' R4 sequence).
@@ -87,6 +89,18 @@ def sample_mesh(
         reachable[:] = True
     chosen = np.flatnonzero(reachable)[:SURFACE_POINTS]
     return points[chosen], normals[chosen], face[chosen]
+
+
+def balanced(graspable: np.ndarray) -> np.ndarray:
+    """Indices of `SURFACE_POINTS` surface points of which every other one lies in the graspable region.
+
+    Evenly spread over the whole surface, too few of them are on a thin handle to tell its two sides.
+
+    Args:
+      graspable: (N,) bool, both values occur; any prefix of these points covers the surface evenly.
+    """
+    sides = [np.flatnonzero(graspable == side) for side in (True, False)]
+    return np.stack([np.resize(side, SURFACE_POINTS // 2) for side in sides], -1).ravel()
 
 
 def halves(points: np.ndarray, cut: float) -> np.ndarray:

@@ -11,14 +11,12 @@ from congrasp.common.hands.outline import outline
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.objects.surface import sample_union
+from congrasp.common.objects.surface import DENSE, balanced, sample_union
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.sampling.build import clear_of_table
-from congrasp.common.task.sampling.headings import INWARD, Headings, above, max_width, sample_headings, within_reach
+from congrasp.common.task.sampling.headings import INWARD, above, max_width, sample_headings, within_reach
 
-_ENOUGH = 16  # different headings
-_DENSE = 8192  # points from which those of the two regions are chosen
 _ACROSS = 0.02  # m that opposite normals count as: the two sides of a thin wall may belong to different regions
 
 
@@ -36,17 +34,14 @@ def headings(
         sample_headings,
         rng=rng,
         use_affordance=restricted,
+        inward=hand.object_scale * INWARD,
         max_width=max_width(own, hand.object_scale),
         along=direction,
         at=position,
     )
     if restricted:
         obj = _balanced(obj)
-    # Behind a small handle there is no room for fingertips, so that others reach half as deep.
-    depths = [hand.object_scale * depth for depth in (INWARD, INWARD / 2)]
-    found = max((sample(obj, inward=depth) for depth in depths[: 1 + restricted]), key=_different)
-    if found is None and restricted:
-        found = sample(obj, inward=depths[0], lenient=True)
+    found = sample(obj) or sample(obj, lenient=True)
     if found is None:
         raise CongraspError(
             f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
@@ -79,23 +74,15 @@ def headings(
     return np.array(positions), np.array(directions), np.array(crosses), np.array(rests)
 
 
-def _different(found: Headings | None) -> int:
-    """Number of different headings, up to as many as there are attempts by default."""
-    return 0 if found is None else min(len(np.unique(found.position, axis=0)), _ENOUGH)
-
-
 def _balanced(obj: GraspObject) -> GraspObject:
-    """The object with half of its surface points, and half of the first ones, on the graspable region.
-
-    Evenly spread over the whole surface, too few of them are on a thin handle to tell its two sides.
-    """
-    points, normals, _ = sample_union(obj.pieces, np.random.default_rng(0), _DENSE)
+    """The object with half of its surface points on the graspable region."""
+    points, normals, _ = sample_union(obj.pieces, np.random.default_rng(0), DENSE)
     known = cKDTree(np.hstack([obj.points, _ACROSS * obj.normals]))
     labels = obj.labels[known.query(np.hstack([points, _ACROSS * normals]))[1]]
-    sides = [np.flatnonzero(obj.graspable[labels] == side) for side in (True, False)]
-    if not all(map(len, sides)):
+    graspable = obj.graspable[labels]
+    if graspable.all() or not graspable.any():
         return obj
-    chosen = np.stack([np.resize(side, len(obj.points) // 2) for side in sides], -1).ravel()
+    chosen = balanced(graspable)
     return dataclasses.replace(obj, points=points[chosen], normals=normals[chosen], labels=labels[chosen])
 
 

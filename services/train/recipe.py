@@ -104,6 +104,6 @@ def recipe(hand: Hand) -> RunConfig:
                 affordance_force=own.affordance_force,
             ),
         ),
-        objects=ObjectsConfig(families=("all", *HARD_FAMILIES), count=1600, by_failure=True),
+        objects=ObjectsConfig(families=("all", "scans", *HARD_FAMILIES), count=1600, by_failure=True),
         ppo=PPOConfig(rollouts_per_update=1, gamma=0.99, settling=0.25),
     )

@@ -26,6 +26,7 @@ from congrasp.common.objects.procedural import (
 from congrasp.common.objects.resting import TableScene
 from congrasp.common.objects.spec import MAX_MESH_VERTICES, PRIMITIVE_SLOTS, SURFACE_POINTS
 from congrasp.common.objects.store import digest
+from congrasp.common.objects.surface import sample_union
 from tests.solids import mujoco_mass_properties
 
 MOST_MESHES = 13  # what environments have room for is sized by the object with the most
@@ -147,8 +148,16 @@ def test_no_two_of_many_are_alike():
 def test_groups_stand_for_their_families():
     assert family_turns(3, 0, ("mug", "household")) == ["mug", *HOUSEHOLD_FAMILIES[:2]]
     assert set(family_turns(66, 0, ("all",))) == {*BASIC_FAMILIES, *HOUSEHOLD_FAMILIES}
-    assert set(family_turns(70, 0, ("all", "scans"))) == set(FAMILIES)
+    assert set(family_turns(74, 0, ("all", "scans"))) == set(FAMILIES)
     assert family_turns(30, 7) == family_turns(30, 7, ("basic",))
+
+
+@pytest.mark.parametrize("family", ["teacup", "basket", "lidded", "sieve"])
+def test_half_of_the_points_lie_on_a_thin_handle(family):
+    obj = generate(3, family)
+    owner = sample_union(obj.pieces, np.random.default_rng(0))[2]
+    assert np.mean([obj.pieces[i].part for i in owner]) < 0.3
+    assert obj.graspable[obj.labels].mean() == 0.5 and obj.graspable[obj.labels[:256]].mean() == 0.5
 
 
 @pytest.mark.parametrize(

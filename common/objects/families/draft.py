@@ -25,6 +25,8 @@ class Draft(NamedTuple):
     """Range of the density, kg/m^3."""
     heavier: float = 1.0
     """Factor on the mass. It leaves the shape bitwise unchanged, which another density would not."""
+    thin: bool = False
+    """The graspable region may be less than a tenth of the surface; half of the surface points lie on it."""
 
 
 Builder = Callable[[Rng], Draft]

@@ -1,4 +1,4 @@
-"""Shapes found in scans that other families lack: wire frames, large hollow bodies, wide boxes, thin boards."""
+"""Shapes found in scans that other families lack: wire frames, wide bodies, thin boards, and thin handles and knobs."""
 
 import functools
 
@@ -6,7 +6,8 @@ import numpy as np
 
 from congrasp.common.objects.families import draft
 from congrasp.common.objects.families.draft import Builder, Draft, Rng
-from congrasp.common.objects.families.profiles import slab, sweep, vessel
+from congrasp.common.objects.families.profiles import arc, slab, sweep, vessel
+from congrasp.common.objects.spec import Piece
 
 BUILDERS: dict[str, Builder] = {}
 _family = functools.partial(draft.enter, BUILDERS)
@@ -52,3 +53,56 @@ def board(rng: Rng) -> Draft:
     """A thin plate with round corners: a cutting board, a tile, a clipboard."""
     half = rng.uniform(0.05, 0.09), rng.uniform(0.09, 0.14), rng.uniform(0.004, 0.008)
     return Draft((slab(half, rng.uniform(0.005, 0.03)),), density=(500.0, 1200.0))
+
+
+@_family
+def teacup(rng: Rng) -> Draft:
+    """A vessel held by a thin handle at its side, as wide as one or two fingers."""
+    radius, height, wall = rng.uniform(0.03, 0.05), rng.uniform(0.05, 0.12), rng.uniform(0.003, 0.005)
+    bottom = radius * rng.uniform(0.6, 1.0)
+    body = vessel([(0, bottom), (height, radius)], wall, 7)
+    thick, breadth, half = rng.uniform(0.004, 0.009), rng.uniform(0.006, 0.018), rng.uniform(0.018, 0.4 * height)
+    path = arc(-0.5 * np.pi, 0.5 * np.pi, 5, (rng.uniform(0.02, 0.035), half), (radius, 0, 0.55 * height))
+    path[[0, -1], 0] = np.interp(path[[0, -1], 2], (0, height), (bottom, radius)) - wall / 2
+    return _held((*body, *sweep(path, (0, 1, 0), thick, breadth, rounded=True, part=1)), (400.0, 1500.0))
+
+
+@_family
+def basket(rng: Rng) -> Draft:
+    """A body of any width under a thin bow: a basket, a lunch box, a kettle."""
+    width, depth, height = rng.uniform(0.035, 0.085), rng.uniform(0.03, 0.06), rng.uniform(0.02, 0.045)
+    thick, rise = rng.uniform(0.005, 0.011), rng.uniform(0.04, 0.09)
+    path = arc(np.pi, 0, 6, (0.9 * width, rise), (0, 0, height))
+    handle = sweep(path, (0, 1, 0), thick, thick * rng.uniform(1.0, 2.0), rounded=True, part=1)
+    body = slab((width, depth, height), rng.uniform(0.005, 0.95 * min(width, depth)))
+    return _held((body, *handle), (80.0, 400.0))
+
+
+@_family
+def lidded(rng: Rng) -> Draft:
+    """A wide round body with a knob on its top: a lid, a jar, a sugar bowl."""
+    radius, height = rng.uniform(0.04, 0.09), rng.uniform(0.01, 0.09)
+    neck, knob, length = rng.uniform(0.006, 0.012), rng.uniform(0.012, 0.02), rng.uniform(0.02, 0.04)
+    top = (0, 0, height + length)
+    pieces = (
+        draft.cylinder((0, 0, 0), (0, 0, height), radius),
+        draft.cylinder((0, 0, height), top, neck, part=1),
+        draft.ellipsoid((knob, knob, 0.7 * knob), top, part=1),
+    )
+    return _held(pieces, (100.0, 500.0))
+
+
+@_family
+def sieve(rng: Rng) -> Draft:
+    """A ball, a disc or a block at the end of a thin rod: a lollipop, a sieve, a broom."""
+    half, thick, length = rng.uniform(0.02, 0.055, 3), rng.uniform(0.003, 0.006), rng.uniform(0.08, 0.16)
+    start = np.array((0.95 * half[0], 0, 0))
+    rise = rng.uniform(-0.3, 0.6)
+    end = start + length * np.array((np.cos(rise), 0, np.sin(rise)))
+    body = draft.ellipsoid(tuple(half)) if rng.random() < 0.5 else draft.box(tuple(half))
+    return _held((body, draft.capsule(tuple(start), tuple(end), thick, part=1)), (80.0, 500.0))
+
+
+def _held(pieces: tuple[Piece, ...], density: tuple[float, float]) -> Draft:
+    """An object that may be held by its thin handle alone, part 1."""
+    return Draft(pieces, ("body", "handle"), (False, True), density=density, thin=True)

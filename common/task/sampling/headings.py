@@ -33,6 +33,7 @@ _ROLLS = 4
 _BATCH = 320
 _PREFERENCE = 0.015  # m of width by which a roll becomes e times less likely
 _WIDTH_POINTS = 256
+_FEW = 16  # different headings of a graspable region, below which others at half the depth are tried
 
 
 class Headings(NamedTuple):
@@ -76,8 +77,10 @@ def sample_headings(
       the graspable one, or it is as wide as that where the fingers close, so that they would meet it first (ours: the
       paper's regions were held by humans, so they can be held).
 
-    If fewer than `count` remain after `attempts` batches, those found are repeated. If none remains on the whole
-    surface, the result is the narrowest of the candidates that satisfy the first rule and violate the fewest others.
+    Behind a small handle there is no room for fingertips: if fewer than 16 headings of a graspable region remain after
+    `attempts` batches, others with half the `inward` are tried. Fewer than `count` are repeated. If none remains on the
+    whole surface, the result is the narrowest of the candidates that satisfy the first rule and violate the fewest
+    others.
 
     Args:
       obj: the object.
@@ -103,38 +106,50 @@ def sample_headings(
     avoid = obj.non_graspable_points & use_affordance
     sources = _sources(obj, avoid, along)
     surface = _Surface(obj.points.astype(np.float32), obj.normals.astype(np.float32), avoid)
-    points = surface.points
-    found: list[Headings] = []
-    total = 0
-    for _ in range(attempts):
+
+    def draw(depth: float) -> Headings:
         source = rng.choice(sources, _BATCH)
         direction = _in_cone(-obj.normals[source], _CONE, rng)
         if along is not None:
             direction = np.broadcast_to(np.float32(along), direction.shape)
-        position = points[source] + np.float32(inward) * direction
+        position = surface.points[source] + np.float32(depth) * direction
         if at is not None:
             position = np.broadcast_to(np.float32(at), position.shape)
-        faults = _faults(points, avoid, position, direction, inward, BACK_OFF)
-        position, direction, faults = (part[faults.argsort(kind="stable")] for part in (position, direction, faults))
-        clean = int((faults == 0).sum())
-        cross, width = _roll(surface, position[:clean], direction[:clean], rng, opposed=opposed)
-        good = np.flatnonzero(width <= max_width)
-        found.append(Headings(position[good], direction[good], cross[good]))
-        total += len(good)
-        if total >= count:
-            break
-    if total == 0:
-        last = _last_resort(surface, position, direction, faults, rng, lenient=lenient)
+        return Headings(position, direction, direction)
+
+    def sample(depth: float) -> tuple[Headings, Headings, np.ndarray]:
+        found: list[Headings] = []
+        for _ in range(attempts):
+            drawn = draw(depth)
+            faults = _faults(surface.points, avoid, drawn.position, drawn.direction, depth, BACK_OFF)
+            order = faults.argsort(kind="stable")
+            drawn, faults = Headings(*(part[order] for part in drawn)), faults[order]
+            clean = int((faults == 0).sum())
+            cross, width = _roll(surface, drawn.position[:clean], drawn.direction[:clean], rng, opposed=opposed)
+            good = np.flatnonzero(width <= max_width)
+            found.append(Headings(drawn.position[good], drawn.direction[good], cross[good]))
+            if sum(len(part.position) for part in found) >= count:
+                break
+        return Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True))), drawn, faults
+
+    pool, drawn, faults = sample(inward)
+    if avoid.any() and _different(pool) < _FEW:
+        pool = max(pool, sample(inward / 2)[0], key=_different)
+    if not len(pool.position):
+        last = _last_resort(surface, drawn.position, drawn.direction, faults, rng, lenient=lenient)
         if last is None:
             return None
-        width = local_width(last, points)
+        width = local_width(last, surface.points)
         if not avoid.any() and width.min() > max_width:
             raise TooWideError(obj.name, width.min(), max_width)
-        last = Headings(*(part[width <= max(max_width, width.min())] for part in last))
-        found.append(last)
-    pool = Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        pool = Headings(*(part[width <= max(max_width, width.min())] for part in last))
     chosen = np.resize(np.arange(len(pool.position)), count)
     return Headings(*(part[chosen].astype(np.float32) for part in pool))
+
+
+def _different(headings: Headings) -> int:
+    """Number of different headings, up to `_FEW`."""
+    return min(len(np.unique(headings.position, axis=0)), _FEW)
 
 
 def _sources(obj: GraspObject, avoid: np.ndarray, along: np.ndarray | None) -> np.ndarray:
