@@ -30,8 +30,9 @@ from congrasp.services.export.frames import (
     skin_of_motion,
 )
 from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.unwrap import unwrapped
 
-_KINDS = {1: gltf.SCALAR, 3: gltf.VEC3, 4: gltf.VEC4, 16: gltf.MAT4}
+_KINDS = {1: gltf.SCALAR, 2: gltf.VEC2, 3: gltf.VEC3, 4: gltf.VEC4, 16: gltf.MAT4}
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
@@ -73,7 +74,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 def _add(
     file: gltf.GLTF2, data: bytearray, values: np.ndarray, target: int | None = None, *, bounds: bool = False
 ) -> int:
-    """Appends values (n,), (n, 3), (n, 4) or (n, 4, 4) to the buffer; returns the new accessor's number.
+    """Appends values (n,), (n, 2), (n, 3), (n, 4) or (n, 4, 4) to the buffer; returns the new accessor's number.
 
     Integers (n,) are indices, (n, 4) numbers of joints; matrices are given by rows.
     """
@@ -106,23 +107,30 @@ def _primitive(
     normals = mesh.vertex_normals
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(lengths > 0.5, normals / np.maximum(lengths, 1e-9), [0.0, 0.0, 1.0])  # of unused vertices
+    flat = unwrapped(vertices, faces)
     attributes = gltf.Attributes(
-        POSITION=_add(file, data, mesh.vertices, gltf.ARRAY_BUFFER, bounds=True),
-        NORMAL=_add(file, data, normals, gltf.ARRAY_BUFFER),
+        POSITION=_add(file, data, vertices[flat.source], gltf.ARRAY_BUFFER, bounds=True),
+        NORMAL=_add(file, data, normals[flat.source], gltf.ARRAY_BUFFER),
+        TEXCOORD_0=_add(file, data, flat.uv * [1, -1] + [0, 1], gltf.ARRAY_BUFFER),  # v downwards, as glTF has it
     )
     if colours is not None:
-        attributes.COLOR_0 = _add(file, data, colours**2.2, gltf.ARRAY_BUFFER)  # linear, as glTF has them
+        linear = colours[flat.source] ** 2.2  # as glTF has them
+        attributes.COLOR_0 = _add(file, data, linear, gltf.ARRAY_BUFFER)
         file.materials[-1].pbrMetallicRoughness.baseColorFactor = [1.0, 1.0, 1.0, 1.0]
-    indices = _add(file, data, mesh.faces.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
+    indices = _add(file, data, flat.faces.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
     return gltf.Primitive(attributes=attributes, indices=indices, material=len(file.materials) - 1)
 
 
 def _add_skin(file: gltf.GLTF2, data: bytearray, skin: Skin) -> None:
     """Adds the hand's surface as a node of its own, whose skin has the links' nodes (from 1 on) as joints."""
+    flat = unwrapped(skin.points, skin.faces)
+    own = {name: getattr(skin, name)[flat.source] for name in ("points", "normals", "weights", "material")}
+    skin = skin._replace(faces=flat.faces, **own)
     links, weights = skin.influences()
     attributes = gltf.Attributes(
         POSITION=_add(file, data, skin.points, gltf.ARRAY_BUFFER, bounds=True),
         NORMAL=_add(file, data, skin.normals, gltf.ARRAY_BUFFER),
+        TEXCOORD_0=_add(file, data, flat.uv * [1, -1] + [0, 1], gltf.ARRAY_BUFFER),
         JOINTS_0=_add(file, data, links, gltf.ARRAY_BUFFER),
         WEIGHTS_0=_add(file, data, weights, gltf.ARRAY_BUFFER),
     )

@@ -32,6 +32,7 @@ from congrasp.services.export.frames import (
     skin_of_motion,
 )
 from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.unwrap import unwrapped
 
 _NAME = "congrasp:name"
 _DOUBLE = UsdGeom.XformOp.PrecisionDouble
@@ -138,7 +139,7 @@ def _add_surface(stage: Usd.Stage, path: Sdf.Path, skin: Skin, skeleton: UsdSkel
 
 
 def _new_mesh(stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.ndarray) -> UsdGeom.Mesh:
-    """A mesh of triangles, not subdivided."""
+    """A mesh of triangles with texture coordinates, not subdivided."""
     points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, np.float32))
     mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
@@ -146,6 +147,11 @@ def _new_mesh(stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.
     mesh.CreateFaceVertexCountsAttr([3] * len(faces))
     mesh.CreateFaceVertexIndicesAttr(faces.ravel().tolist())
     mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    flat = unwrapped(vertices, faces)
+    primvars, kind = UsdGeom.PrimvarsAPI(mesh), Sdf.ValueTypeNames.TexCoord2fArray
+    st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
+    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(flat.uv, np.float32)))
+    st.SetIndices(Vt.IntArray(flat.faces.ravel().tolist()))
     return mesh
 
 

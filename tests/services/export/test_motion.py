@@ -32,6 +32,7 @@ from congrasp.services.export.motion_file import (
     motion_of_episode,
     save_motion,
 )
+from congrasp.services.export.unwrap import unwrapped
 from congrasp.services.record.channels import Entry
 from congrasp.services.record.entries import Converter
 from congrasp.services.record.writer import LogWriter
@@ -213,7 +214,14 @@ def test_trimesh_finds_the_first_frame_of_a_glb(human: GraspMotion, tmp_path: pa
         np.testing.assert_allclose(pose[:3, 3], human.link_position[0, i], atol=1e-6)
         turn = Rotation.from_quat(human.link_quaternion[0, i], scalar_first=True)
         np.testing.assert_allclose(pose[:3, :3], turn.as_matrix(), atol=1e-6)
-    np.testing.assert_allclose(scene.geometry[frames.SKIN].vertices, skin_of(get_hand("human")).points, atol=1e-6)
+    skin = skin_of(get_hand("human"))
+    flat = unwrapped(skin.points, skin.faces)
+    np.testing.assert_allclose(scene.geometry[frames.SKIN].vertices, skin.points[flat.source], atol=1e-6)
+    np.testing.assert_allclose(scene.geometry[frames.SKIN].visual.uv, flat.uv, atol=1e-6)
+    flat = unwrapped(human.object_vertices, human.object_faces)
+    shape = scene.geometry[frames.OBJECT]
+    np.testing.assert_allclose(shape.vertices, human.object_vertices[flat.source], atol=1e-6)
+    np.testing.assert_allclose(shape.visual.uv, flat.uv, atol=1e-6)
 
 
 def expected_surface(motion: GraspMotion, t: int) -> np.ndarray:
@@ -246,13 +254,14 @@ def test_the_skin_of_a_glb_follows_its_joints(
     inverse = values(skin.inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
     points = np.pad(values(attributes.POSITION), ((0, 0), (0, 1)), constant_values=1)
     (track,) = glb.read(path)
+    source = unwrapped((surface := frames.skin_of_motion(motion)).points, surface.faces).source
     names = [file.nodes[joint].name for joint in skin.joints]
     assert names == motion.link_names.tolist()
     for t in (0, T - 1):
         matrices = np.stack([track.poses[name][t] for name in names]) @ inverse
         mixed = np.einsum("vk,vkij->vij", weights, matrices[joints])
         found = np.einsum("vij,vj->vi", mixed, points)[:, :3]
-        np.testing.assert_allclose(found, expected_surface(motion, t), atol=2e-6)
+        np.testing.assert_allclose(found, expected_surface(motion, t)[source], atol=2e-6)
 
 
 @pytest.mark.parametrize("which", ["human", "robot"])
@@ -268,7 +277,10 @@ def test_pixars_library_moves_the_skin_of_a_usd(
     cache.Populate(root, Usd.PrimDefaultPredicate)
     (binding,) = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
     skeleton, (target,) = cache.GetSkelQuery(binding.GetSkeleton()), binding.GetSkinningTargets()
-    mesh = UsdGeom.Mesh(target.GetPrim())
+    mesh, surface = UsdGeom.Mesh(target.GetPrim()), frames.skin_of_motion(motion)
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened())  # one a corner, v upwards
+    flat = unwrapped(surface.points, surface.faces)
+    np.testing.assert_allclose(st, flat.uv[flat.faces.ravel()], atol=1e-6)
     for t in (0, T - 1):
         points = mesh.GetPointsAttr().Get()
         assert target.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(float(t)), points, float(t))
