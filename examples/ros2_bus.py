@@ -103,7 +103,11 @@ class ZenohBus:
     """The same topics over Zenoh, as CDR, which rosbags writes and reads."""
 
     def __init__(self, endpoint: str):
-        """Connects to a router, a bridge or a robot."""
+        """Connects to a router, a bridge or a robot.
+
+        Raises:
+          CongraspError: none answers there.
+        """
         import zenoh
         from rosbags.typesys import Stores, get_typestore
         from zenoh.handlers import RingChannel
@@ -113,7 +117,13 @@ class ZenohBus:
         config.insert_json5("mode", '"client"')
         config.insert_json5("connect/endpoints", f'["{endpoint}"]')
         config.insert_json5("scouting/multicast/enabled", "false")
-        self._session = zenoh.open(config)
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise congrasp.CongraspError(
+                f"--zenoh: nothing answers at {endpoint} ({str(error).partition('  at /')[0]}).",
+                "Start the router or the bridge, or correct the endpoint.",
+            ) from None
         self._subscribers = {
             topic: self._session.declare_subscriber(topic, RingChannel(1 if kind == POSE else _MOST))
             for topic, kind in INPUTS.items()

@@ -35,6 +35,7 @@ from congrasp.common.hands import get_hand
 from congrasp.services.assets.objects.named import find_object
 from congrasp.services.cli.grasp import Constraints
 from congrasp.services.grasp.parse import read_request
+from congrasp.services.ops.logs import announced
 
 WAITING = 2.0
 """Seconds after which the node says what it waits for."""
@@ -76,6 +77,8 @@ class Arguments:
     """What the grasp must keep to; the hand comes along the object's -z axis where nothing guides it."""
     connect: str = "tcp/127.0.0.1:7457"
     """The policy server's endpoint."""
+    wait: float = 120.0
+    """Seconds to wait for the server, which compiles its policy first."""
     certs: pathlib.Path | None = None
     """Folder of a client's certificate, for a server that asks for one."""
     zenoh: str = ""
@@ -306,9 +309,9 @@ def slowed(limits: congrasp.JointLimits, share: float) -> congrasp.JointLimits:
     return dataclasses.replace(limits, speed=limits.speed * share, acceleration=limits.acceleration * share**2)
 
 
-def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient) -> None:
-    """Commands until it is interrupted, and prints what changes."""
-    described, slow = client.metadata(), arguments.slow
+def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described: dict[str, Any]) -> None:
+    """Commands by a policy and its metadata until it is interrupted, and prints what changes."""
+    slow = arguments.slow
     if described["limits"] is None:
         raise congrasp.CongraspError(f"Joints of the hand '{arguments.hand}' share motors.", "This node is for others.")
     obj, period = find_object(arguments.object), described["period"] / slow
@@ -318,7 +321,7 @@ def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient) -> None:
     constraints = {**request.constraints, "heading": heading}
     request = dataclasses.replace(request, constraints=constraints, surface=obj.points)
     object_age = arguments.object_age or (TRACKER_AGE if described["observation"] == "tracked" else arguments.robot_age)
-    sensors = Sensors(arguments, described["joints"], obj.origin, object_age)
+    sensors = Sensors(arguments, described["joints"], np.asarray(obj.origin), object_age)
     steps = round(arguments.approach / described["period"]) or described["approach_steps"]
     plan = Plan(arguments.world, steps, arguments.lift, LIFT_SPEED * described["period"], arguments.dry_run)
     limits = slowed(congrasp.JointLimits(**described["limits"]), slow)
@@ -354,11 +357,16 @@ def main() -> int:
     arguments = tyro.cli(Arguments, description=__doc__)
     if not 0.0 < arguments.slow <= 1.0 or not 0.0 <= arguments.lift <= 0.3:
         raise congrasp.CongraspError("--slow is above 0 and at most 1, --lift from 0 to 0.3 m.")
-    with (
-        contextlib.closing(ZenohBus(arguments.zenoh) if arguments.zenoh else RosBus()) as bus,
-        congrasp.PolicyClient(arguments.connect, hand=arguments.hand, timeout=0.2, certs=arguments.certs) as client,
-    ):
-        run(arguments, bus, client)
+    with contextlib.ExitStack() as stack:
+        bus: Bus = stack.enter_context(contextlib.closing(ZenohBus(arguments.zenoh) if arguments.zenoh else RosBus()))
+        with announced(f"Waiting for the policy server at {arguments.connect}", first=WAITING):
+            client = stack.enter_context(
+                congrasp.PolicyClient(
+                    arguments.connect, hand=arguments.hand, timeout=0.2, wait=arguments.wait, certs=arguments.certs
+                )
+            )
+            described = client.metadata()
+        run(arguments, bus, client, described)
     return 0
 
 

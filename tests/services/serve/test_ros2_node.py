@@ -271,6 +271,14 @@ def test_without_rclpy_it_is_one_line(example, monkeypatch):
     assert "\n" not in str(caught.value)
 
 
+def test_without_a_router_it_is_one_line(example, monkeypatch):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py", "mug:7", "--zenoh", endpoint])
+    with pytest.raises(congrasp.CongraspError, match=f"--zenoh: nothing answers at {endpoint} .*bridge") as caught:
+        example.main()
+    assert "\n" not in str(caught.value) and "cargo" not in str(caught.value)
+
+
 def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
     """A robot that calls the first joint `motor_1`, says nothing of its wrist, and sees the object in a lost frame."""
     bus = Wire()
