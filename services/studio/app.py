@@ -27,6 +27,7 @@ from congrasp.services.studio.grasping import PolicyGrasping
 from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
+from congrasp.services.studio.sessions import Sessions
 from congrasp.services.studio.training import Follower, TrainingWindow
 
 _GUESS = ImportOptions(unit="guess")
@@ -69,11 +70,11 @@ def open_view(
             hands = {"of the policy": functools.partial(PolicyGrasping, follow_file(policy), policy.name)}
         else:
             hands = _pretrained()
-        session = Session(
-            hands, catalogue(objects), MeshImporter(), window, Recordings(recordings) if recordings else None
-        )
-        stack.callback(session.close)
-        server = PageServer(session.gets, session.posts, host, port)
+        recorded = Recordings(recordings) if recordings else None
+        loaded = {name: functools.cache(load) for name, load in hands.items()}  # programs are compiled once for all
+        sessions = Sessions(lambda: Session(loaded, catalogue(objects), MeshImporter(), window, recorded))
+        stack.callback(sessions.close)
+        server = PageServer(sessions.routes, host, port)
         stack.callback(server.close)
         yield server.url
 

@@ -1,6 +1,7 @@
 """Grasps of a policy as the studio asks for them: exactly as drawn, and close to it where that fails."""
 
 import dataclasses
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -59,7 +60,7 @@ class PolicyGrasping:
         self.hand = get_hand(first.spec.hand)
         self.task = dataclasses.replace(first.task, end_when_fallen=False)
         self._attempts = Attempts(self.hand, self.task, first, threads=threads or cores())
-        self._compiled = False
+        self._compiled, self._free = False, threading.Lock()
 
     def newest(self) -> dict[str, Any]:
         """Source and version; `trouble` says why newer weights were not taken."""
@@ -86,6 +87,16 @@ class PolicyGrasping:
         Raises:
           CongraspError: the policy lacks a constraint, or no reach leads to the grasp.
         """
+        if not self._free.acquire(blocking=False):
+            progress(f"another browser's grasp is before this one, {SECONDS} s", 0.0)
+            self._free.acquire()
+        try:
+            return self._grasp(obj, request, phases, progress)
+        finally:
+            self._free.release()
+
+    def _grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
+        """See `grasp`; one at a time."""
         self._attempts.phases = phases
         first_time = not self._compiled
         progress(f"compiling, {SECONDS} s of about {_COMPILING}" if first_time else "newest weights", 0.02)

@@ -108,7 +108,11 @@ def _by_index(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, 
             if statistics.message_start_time > end or statistics.message_end_time < begin:
                 return []
             topics = [channel.topic for channel in summary.channels.values() if is_episode(channel.topic)]
-            messages = make_reader(stream, validate_crcs=True).iter_messages(topics, begin, end) if topics else ()
+            messages = (
+                make_reader(stream, validate_crcs=True).iter_messages(topics, starting_at=begin, ending_before=end)
+                if topics
+                else ()
+            )
             return [
                 (message.log_time, channel.topic, message.data)
                 for schema, channel, message in messages

@@ -1,9 +1,12 @@
 """Serves a studio over HTTP to browsers on this machine: files, JSON, and messages of arrays."""
 
 import contextlib
+import http.cookies
 import http.server
 import json
 import pathlib
+import re
+import secrets
 import socket
 import threading
 import urllib.parse
@@ -24,6 +27,8 @@ _TYPES = {
     ".svg": "image/svg+xml",
 }
 _POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
+_ROUTES = "/api/"
+_TOKEN = re.compile("[0-9a-f]{32}")
 _TIMEOUT = 30.0  # seconds that a request may take to arrive
 _DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes of a refused body, so that the refusal arrives before the end does
 
@@ -52,15 +57,21 @@ Post = Callable[[Mapping[str, str], bytes], Answer]
 """Query parameters and body to answer."""
 
 
+class Routes(NamedTuple):
+    """What answers requests, by path."""
+
+    gets: Mapping[str, Get]
+    posts: Mapping[str, Post]
+
+
 class PageServer:
     """Serves the page and the routes of a studio until it is closed."""
 
-    def __init__(self, gets: Mapping[str, Get], posts: Mapping[str, Post], host: str, port: int):
+    def __init__(self, routes: Callable[[str], Routes], host: str, port: int):
         """Listens.
 
         Args:
-          gets: what answers GET requests, by path.
-          posts: the same for POST.
+          routes: returns the routes of a browser, by the token in its cookie; an empty one without a cookie.
           host: interface; requests by another name than that of loopback are only answered on others.
           port: TCP port; 0 takes a free one (see `port`).
 
@@ -70,7 +81,11 @@ class PageServer:
         server = self
 
         class Handler(_Handler):
-            routes = (gets, posts)
+            cookie = property(lambda handler: f"congrasp-{server.port}")  # a host's ports share their cookies
+
+            def routes(self) -> Routes:
+                """Routes of this browser."""
+                return routes(self.browser())
 
             def allowed(self) -> bool:
                 """True if it comes from the page itself."""
@@ -129,7 +144,11 @@ class _Server(http.server.ThreadingHTTPServer):
 class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     timeout = _TIMEOUT
-    routes: tuple[Mapping[str, Get], Mapping[str, Post]]
+    cookie: str
+
+    def routes(self) -> Routes:
+        """Routes of the browser that asks."""
+        raise NotImplementedError
 
     def allowed(self) -> bool:
         """True if the request may be answered."""
@@ -140,8 +159,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         path, query = self._route()
         if self._refused():
             return
-        if path in self.routes[0]:
-            self._answer(lambda: self.routes[0][path](query))
+        if path.startswith(_ROUTES) and (route := self.routes().gets.get(path)):
+            self._answer(lambda: route(query))
         else:
             self._file("index.html" if path == "/" else path.removeprefix("/static/"))
 
@@ -158,12 +177,19 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             message = "The request has no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
             self._send(413, "application/json", json.dumps({"error": message}).encode())
             self._drain(length)
-        elif path not in self.routes[1]:
+        elif (route := self.routes().posts.get(path)) is None:
             self._send(404, "application/json", b'{"error": "There is nothing of this name."}')
             self._drain(length)
         else:
             body = self.rfile.read(length)
-            self._answer(lambda: self.routes[1][path](query, body))
+            self._answer(lambda: route(query, body))
+
+    def browser(self) -> str:
+        """The token in the browser's cookie; empty without one."""
+        with contextlib.suppress(http.cookies.CookieError):
+            found = http.cookies.SimpleCookie(self.headers.get("Cookie", "")).get(self.cookie)
+            return found.value if found and _TOKEN.fullmatch(found.value) else ""
+        return ""
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not logged."""
@@ -196,7 +222,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if file is None:
             self._send(404, "text/plain", b"There is nothing of this name.")
             return
-        self._send(200, _TYPES[file.suffix], file.read_bytes())
+        new = {}
+        if file.suffix == ".html" and not self.browser():
+            new = {"Set-Cookie": f"{self.cookie}={secrets.token_hex(16)}; Path=/; HttpOnly; SameSite=Strict"}
+        self._send(200, _TYPES[file.suffix], file.read_bytes(), new)
 
     def _answer(self, work: Callable[[], Answer]) -> None:
         """Sends what `work` returns, or its error."""

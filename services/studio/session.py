@@ -30,7 +30,7 @@ from congrasp.services.studio.jobs import Jobs, Progress
 from congrasp.services.studio.lanes import for_page
 from congrasp.services.studio.motions import Motions
 from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.server import BadRequest, Download, Get, Picture, Post
+from congrasp.services.studio.server import BadRequest, Download, Get, Picture, Routes
 from congrasp.services.studio.state import Studio
 from congrasp.services.studio.thumbnails import Thumbnails
 from congrasp.services.studio.training import TrainingWindow
@@ -60,7 +60,7 @@ class Grasping(Protocol):
 
 
 class Session:
-    """Everything behind the page; its routes are `gets` and `posts`."""
+    """Everything behind the page; its routes are `routes`."""
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class Session:
         self._object, self._shown = objects.names[0], 0
         self._take_hand(hands[self._hand](), objects.get(self._object))
         describe(self._studio)  # compiles the rules
-        self.gets: dict[str, Get] = {
+        gets: dict[str, Get] = {
             "/api/state": lambda query: self.state(),
             "/api/job": lambda query: self._jobs.state(),
             "/api/hand": lambda query: self.hand(query.get("name", "")),
@@ -104,7 +104,7 @@ class Session:
             "/api/training": lambda query: self.training(query.get("names", "")),
             "/api/episodes": lambda query: self.episodes_around(query.get("time", ""), query.get("seconds", "")),
         }
-        self.posts: dict[str, Post] = {"/api/do": self._do, "/api/upload": self._upload}
+        self.routes = Routes(gets, {"/api/do": self._do, "/api/upload": self._upload})
 
     def close(self) -> None:
         """Ends what runs, and removes uploaded meshes."""

@@ -56,7 +56,7 @@ def fine_object() -> GraspObject:
 def studio() -> Iterator[str]:
     """The address of a studio on that object."""
     session = Session({"human": Fine}, Catalogue({"ball": fine_object}), MadeUpImporter())
-    server = PageServer(session.gets, session.posts, "127.0.0.1", 0)
+    server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
     yield server.url
     server.close()
     session.close()

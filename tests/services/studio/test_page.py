@@ -37,14 +37,14 @@ class Site:
         self.grasping = made_up.MadeUpGrasping()
         self.window: TrainingWindow = made_up.window(100)
         self.session: Session = made_up.session(self.grasping, window=self.window, recordings=Recordings(folder))
-        self.server = PageServer(self.session.gets, self.session.posts, "127.0.0.1", 0)
+        self.server = PageServer(lambda browser: self.session.routes, "127.0.0.1", 0)
 
     @property
     def studio(self) -> dict[str, Any]:
         return self.session.state()["studio"]
 
     def do(self, action: str, **values: Any) -> None:
-        self.session.posts["/api/do"]({}, json.dumps({"action": action, **values}).encode())
+        self.session.routes.posts["/api/do"]({}, json.dumps({"action": action, **values}).encode())
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     grasping = made_up.MadeUpGrasping()
     grasping.task = TaskConfig(constraints=("heading", "affordance", "fingers"))
     session = made_up.session(grasping)
-    server = PageServer(session.gets, session.posts, "127.0.0.1", 0)
+    server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
 
     def fingers() -> list[str]:
         return [name for name, on in session.state()["studio"]["others"][0]["flags"]["allowed"].items() if on]

@@ -23,9 +23,10 @@ from congrasp.services.cli.main import main
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
 from congrasp.services.studio import files
+from congrasp.services.studio import sessions as sessions_module
 from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.server import PageServer, _Server
+from congrasp.services.studio.server import PageServer, Routes, _Server
 from congrasp.services.studio.session import Session
 from tests import studio as made_up
 
@@ -64,7 +65,7 @@ def grasping() -> made_up.MadeUpGrasping:
 @pytest.fixture(scope="module")
 def page(grasping: made_up.MadeUpGrasping) -> Iterator[Page]:
     session: Session = made_up.session(grasping, window=made_up.window(5))
-    server = PageServer(session.gets, session.posts, "127.0.0.1", 0)
+    server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
     yield Page(server.port)
     server.close()
     session.close()
@@ -79,10 +80,47 @@ def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: 
 
 
 def test_a_result_that_is_not_json_is_answered() -> None:
-    server = PageServer({"/api/nan": lambda query: {"x": float("nan")}}, {}, "127.0.0.1", 0)
+    server = PageServer(lambda browser: Routes({"/api/nan": lambda query: {"x": float("nan")}}, {}), "127.0.0.1", 0)
     code, found = Page(server.port).ask("GET", "/api/nan")
     server.close()
     assert code == 500 and "ValueError" in json.loads(found)["error"]
+
+
+def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which a cookie finds again; what one undoes is its own, and the least recent one of too many ends."""
+    monkeypatch.setattr(sessions_module, "MOST", 2)
+    made: list[Session] = []
+
+    def new() -> Session:
+        made.append(made_up.session(made_up.MadeUpGrasping()))
+        return made[-1]
+
+    sessions = sessions_module.Sessions(new)
+    server = PageServer(sessions.routes, "127.0.0.1", 0)
+    page = Page(server.port)
+
+    def open_page(**headers: str) -> str:
+        connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
+        connection.request("GET", "/", headers=headers)
+        with contextlib.closing(connection):
+            return connection.getresponse().headers["Set-Cookie"] or ""
+
+    def undoable(cookie: str) -> bool:
+        return bool(json.loads(page.ask("GET", "/api/state", Cookie=cookie)[1])["history"]["undo"])
+
+    try:
+        cookies = [open_page().partition(";")[0] for _ in range(3)]
+        assert len(set(cookies)) == 3 and all(c.startswith(f"congrasp-{server.port}=") for c in cookies)
+        assert open_page(Cookie=cookies[0]) == "" and "HttpOnly; SameSite=Strict" in open_page(Cookie="congrasp=x")
+        body = json.dumps({"action": "fill", "avoid": True}).encode()
+        assert page.ask("POST", "/api/do", body, Cookie=cookies[0])[0] == 200
+        assert [undoable(cookie) for cookie in cookies[:2]] == [True, False] and len(made) == 2
+        assert undoable(cookies[0])  # used more recently than the second
+        assert not undoable(cookies[2]) and len(made) == 3
+        assert undoable(cookies[0]) and not undoable(cookies[1]) and len(made) == 4
+    finally:
+        server.close()
+        sessions.close()
 
 
 def test_a_hundred_connections_at_once_find_room() -> None:
@@ -158,7 +196,7 @@ def test_a_refused_request_is_answered_before_its_body_comes(page: Page, header:
 
 @pytest.mark.parametrize("host", ["", "Host:\r\n", "Host:  \r\n"])
 def test_a_request_for_no_host_is_refused_on_every_interface(host: str) -> None:
-    server = PageServer({"/api/state": lambda query: {}}, {}, "0.0.0.0", 0)
+    server = PageServer(lambda browser: Routes({"/api/state": lambda query: {}}, {}), "0.0.0.0", 0)
     try:
         with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
             connection.sendall(f"GET /api/state HTTP/1.1\r\n{host}\r\n".encode())
@@ -185,7 +223,7 @@ def test_paint_of_no_colour_leaves_the_studio_working(page: Page) -> None:
 def test_what_no_page_asks_is_a_bad_request(tmp_path: pathlib.Path) -> None:
     made_up.record(tmp_path, [(made_up.BEGIN, 1)])
     session = made_up.session(recordings=Recordings(tmp_path))
-    server = PageServer(session.gets, session.posts, "127.0.0.1", 0)
+    server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
     page = Page(server.port)
     try:
         for name in ("..", "a/..", "a%00.stl", "a%0A.stl", "a" * 300, "%F0%9F%8D%90" * 64):
@@ -362,7 +400,7 @@ def test_a_busy_port_and_an_open_interface_are_refused_in_one_line(
     page: Page, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(CongraspError, match="--port"):
-        PageServer({}, {}, "127.0.0.1", page.port)
+        PageServer(lambda browser: Routes({}, {}), "127.0.0.1", page.port)
     for arguments, says in (
         (["--host", "0.0.0.0"], "would be reachable from other machines"),
         (["--policy", __file__, "--connect", "tcp/127.0.0.1:1"], "Give one of --policy and --connect"),
