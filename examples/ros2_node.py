@@ -314,6 +314,11 @@ def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described
     slow = arguments.slow
     if described["limits"] is None:
         raise congrasp.CongraspError(f"Joints of the hand '{arguments.hand}' share motors.", "This node is for others.")
+    if described["observation"] == "camera":
+        raise congrasp.CongraspError(
+            "The server's policy observes a point cloud, this node an object's pose.",
+            "Serve the hand's other policy or a student, or see examples/depth_grasp.py.",
+        )
     obj, period = find_object(arguments.object), described["period"] / slow
     hand, waypoints = get_hand(arguments.hand), described["trajectory_points"]
     request = read_request(obj, hand, waypoints, **dataclasses.asdict(arguments.constraint))

@@ -279,6 +279,12 @@ def test_without_a_router_it_is_one_line(example, monkeypatch):
     assert "\n" not in str(caught.value) and "cargo" not in str(caught.value)
 
 
+def test_a_policy_with_a_camera_is_refused(example):
+    described = {"limits": {}, "observation": "camera"}
+    with pytest.raises(congrasp.CongraspError, match=r"observes a point cloud.*depth_grasp\.py"):
+        example.run(example.Arguments("mug:7"), Wire(), None, described)
+
+
 def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
     """A robot that calls the first joint `motor_1`, says nothing of its wrist, and sees the object in a lost frame."""
     bus = Wire()
