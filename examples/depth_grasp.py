@@ -1,7 +1,7 @@
 """A motion from one depth image, by a policy with a camera (docs/camera.md).
 
-    python examples/depth_grasp.py --policy runs/allegro-camera/policy.safetensors
-    python examples/depth_grasp.py --policy … --depth depth.png --intrinsics 615 615 320 240 \
+    python examples/depth_grasp.py
+    python examples/depth_grasp.py --depth depth.png --intrinsics 615 615 320 240 \
         --camera 0.5 0 0.4 0.271 -0.653 -0.653 0.271
 
 The image is a PNG of millimetres (16 bit) or an NPY of metres; without one, a cylinder is seen by a simulated camera.
@@ -35,8 +35,8 @@ SCENE = """<mujoco><worldbody><geom type="plane" size="2 2 .1"/>
 class Arguments:
     """Image, camera and grasp."""
 
-    policy: pathlib.Path
-    """A policy trained with --method camera."""
+    policy: str = "allegro-camera"
+    """A policy trained with --method camera: a file, or the name of a pretrained one."""
     depth: pathlib.Path | None = None
     """Depth along the optical axis: PNG, mm, or NPY, m; zero or not finite where there is none."""
     intrinsics: tuple[float, float, float, float] = (150.0, 150.0, 79.5, 59.5)
