@@ -58,7 +58,7 @@ Post = Callable[[Mapping[str, str], bytes], Answer]
 
 
 class Routes(NamedTuple):
-    """What answers requests, by path."""
+    """Handlers of requests, by path."""
 
     gets: Mapping[str, Get]
     posts: Mapping[str, Post]

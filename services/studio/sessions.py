@@ -1,4 +1,4 @@
-"""A session for each browser, so that nobody paints or undoes on another's object."""
+"""A session for each browser: painting and undoing in one leave the others' objects alone."""
 
 import collections
 import threading
