@@ -48,13 +48,13 @@ def bundle(version, run_id):
     return Message(arrays, {**meta, "format": 1})
 
 
-def rollout(steps, value, version):
+def rollout(steps, value, version, *, actions=A, schema="s"):
     """All values are the same, so that a corrupted one shows."""
-    arrays = RolloutForm(steps, B, D, A, half=True).zeros()
+    arrays = RolloutForm(steps, B, D, actions, half=True).zeros()
     for array in arrays.values():
         if array.dtype != bool:
             array.fill(value)
-    return Message(arrays, {"version": version, "schema": "s", "steps": steps * B})
+    return Message(arrays, {"version": version, "schema": schema, "steps": steps * B})
 
 
 # --- the two roles ---
@@ -110,8 +110,8 @@ def save(path, content):
     os.replace(temporary, path)
 
 
-def run_actor(folder, endpoint, *, name, steps=T, pause=0.0):
-    """Makes rollouts until the run is finished; writes each outcome down."""
+def run_actor(folder, endpoint, *, name, steps=T, pause=0.0, **kind):
+    """Makes rollouts of a kind until the run is finished; writes each outcome down."""
     journal = Journal(folder / AUDIT / f"{name}.jsonl")
     with (
         open(folder / f"{name}.log", "a", buffering=1) as log,
@@ -122,13 +122,13 @@ def run_actor(folder, endpoint, *, name, steps=T, pause=0.0):
         with contextlib.suppress(RunFinished):
             while True:
                 try:
-                    work(link, steps, pause, made, log)
+                    work(link, steps, pause, made, log, kind)
                 except RunRestarted:
                     log.write(json.dumps({"restarted": link.config(20).run_id}) + "\n")
         link.flush(5)
 
 
-def work(link, steps, pause, made, log):
+def work(link, steps, pause, made, log, kind):
     link.config(20)
     version = -1
     while True:
@@ -138,7 +138,7 @@ def work(link, steps, pause, made, log):
         pulled = link.weights(version)
         version = pulled.meta["version"] if pulled else version
         time.sleep(pause)
-        future = link.upload(rollout(steps, len(made) % 1000, version), ticket)
+        future = link.upload(rollout(steps, len(made) % 1000, version, **kind), ticket)
         entry = {"incarnation": link.incarnation, "sequence": len(made)}
         made.append(future)
         future.add_done_callback(
