@@ -3,7 +3,7 @@
 Peers share the server's time: the one that has had least of it comes next, and each has a limited share of the queue.
 The size of a batch follows from the seconds that each size takes. While several peers send queries, long ones are
 answered in parts that take little longer than the shortest query, and in at most half of the time. A peer that floods
-the server therefore delays another's query by about the time that this query takes itself.
+the server therefore delays another's query by about the time that this query takes itself, if there are free cores.
 """
 
 import bisect

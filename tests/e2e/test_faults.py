@@ -178,6 +178,16 @@ def test_a_slow_link_slows_its_actor_alone(cluster, proxy):
     cluster.stop(learner)
 
 
+def test_a_disk_slower_than_an_actor_waits_costs_no_rollout(cluster):
+    """Uploads time out although the rollout has arrived, and are sent again."""
+    learner = cluster.start_learner(disk=0.6)
+    cluster.start_actor(request_timeout=0.3)
+    status = cluster.wait_for_updates(3)
+    assert status["counters"]["duplicate"] > 0
+    final, _ = cluster.stop(learner)
+    assert final["counters"]["missing"] == 0
+
+
 def test_wall_clocks_do_not_matter(cluster):
     """The clocks of learner and actor jump by weeks with every look at them."""
     learner = cluster.start_learner(clock="jumps")

@@ -152,7 +152,7 @@ def test_a_full_queue_lets_a_short_item_in_for_the_longest(several):
     batcher.close()
 
 
-def test_long_items_take_half_of_the_time_beside_short_ones(several):
+def test_long_items_take_half_of_the_time_alongside_short_ones(several):
     """A part takes 0.1 s, and so does the rest after it, in which a short item runs at once in its caller's thread."""
     began, threads = [], []
 
