@@ -48,20 +48,35 @@ def bundle(version, run_id):
     return Message(arrays, {**meta, "format": 1})
 
 
-def rollout(steps, value, version):
+def rollout(steps, value, version, *, actions=A, schema="s"):
     """All values are the same, so that a corrupted one shows."""
-    arrays = RolloutForm(steps, B, D, A, half=True).zeros()
+    arrays = RolloutForm(steps, B, D, actions, half=True).zeros()
     for array in arrays.values():
         if array.dtype != bool:
             array.fill(value)
-    return Message(arrays, {"version": version, "schema": "s", "steps": steps * B})
+    return Message(arrays, {"version": version, "schema": schema, "steps": steps * B})
+
+
+class SlowLog(WriteAheadLog):
+    """Of a disk that takes some seconds for a rollout."""
+
+    def __init__(self, *arguments, seconds, **options):
+        super().__init__(*arguments, **options)
+        self._seconds = seconds
+
+    def add(self, *arguments):
+        time.sleep(self._seconds)
+        return super().add(*arguments)
 
 
 # --- the two roles ---
 
 
-def run_learner(folder, endpoint, *, run_id="e", steps=T, every=1, pause=0.0, write_ahead=True):
-    """Consumes batches and checkpoints after `every` updates, until it is told to stop (SIGTERM) or killed."""
+def run_learner(folder, endpoint, *, run_id="e", steps=T, every=1, pause=0.0, write_ahead=True, disk=0.0):
+    """Consumes batches and checkpoints after `every` updates, until it is told to stop (SIGTERM) or killed.
+
+    Its disk takes `disk` seconds for a rollout.
+    """
     path = folder / "checkpoint"
     saved = json.loads(path.read_text()) if path.exists() else {"durable": None, "history": [], "version": 0}
     history, version = saved["history"], saved["version"]
@@ -75,7 +90,7 @@ def run_learner(folder, endpoint, *, run_id="e", steps=T, every=1, pause=0.0, wr
             transport, run="chaos", config_json="{}", run_id=run_id, schema="s",
             form=RolloutForm(steps, B, D, A, half=True), staleness=StalenessManager(1, BATCH),
             durable=saved["durable"], audit=AuditLog(folder, "0"),
-            log=WriteAheadLog(folder / FOLDER / "0", 1, write=write_ahead),
+            log=SlowLog(folder / FOLDER / "0", 1, write=write_ahead, seconds=disk),
         )  # fmt: skip
         save(published, version)
         hub.publish_weights(bundle(version, run_id), version)
@@ -110,25 +125,25 @@ def save(path, content):
     os.replace(temporary, path)
 
 
-def run_actor(folder, endpoint, *, name, steps=T, pause=0.0):
-    """Makes rollouts until the run is finished; writes each outcome down."""
+def run_actor(folder, endpoint, *, name, steps=T, pause=0.0, request_timeout=3.0, **kind):
+    """Makes rollouts of a kind until the run is finished; writes each outcome down."""
     journal = Journal(folder / AUDIT / f"{name}.jsonl")
     with (
         open(folder / f"{name}.log", "a", buffering=1) as log,
         urls.connect(endpoint, "actor") as transport,
-        ActorLink(transport, "chaos", name, window=2, request_timeout=3.0, journal=journal) as link,
+        ActorLink(transport, "chaos", name, window=2, request_timeout=request_timeout, journal=journal) as link,
     ):
         made = []
         with contextlib.suppress(RunFinished):
             while True:
                 try:
-                    work(link, steps, pause, made, log)
+                    work(link, steps, pause, made, log, kind)
                 except RunRestarted:
                     log.write(json.dumps({"restarted": link.config(20).run_id}) + "\n")
         link.flush(5)
 
 
-def work(link, steps, pause, made, log):
+def work(link, steps, pause, made, log, kind):
     link.config(20)
     version = -1
     while True:
@@ -138,7 +153,7 @@ def work(link, steps, pause, made, log):
         pulled = link.weights(version)
         version = pulled.meta["version"] if pulled else version
         time.sleep(pause)
-        future = link.upload(rollout(steps, len(made) % 1000, version), ticket)
+        future = link.upload(rollout(steps, len(made) % 1000, version, **kind), ticket)
         entry = {"incarnation": link.incarnation, "sequence": len(made)}
         made.append(future)
         future.add_done_callback(

@@ -16,7 +16,7 @@ from congrasp.actors.episode import episode_message
 from congrasp.actors.followed import Followed, Follower
 from congrasp.actors.physics import make_physics
 from congrasp.actors.process.failure_weights import FailureWeights
-from congrasp.actors.process.link import ActorLink, RunFinished, RunRestarted, Ticket
+from congrasp.actors.process.link import ActorLink, RunFinished, RunInfo, RunRestarted, Ticket
 from congrasp.actors.process.own_references import save_references, with_kept_references
 from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
 from congrasp.actors.training_set import training_set
@@ -75,7 +75,7 @@ def run_actor(
                 info = link.config(patience)
                 config = run_config_from_json(info.config)
                 engine = physics or config.physics
-                _Actor(config, info.arrays, link, transport, engine, threads, on_rollout, references).act(stop)
+                _Actor(config, info, link, transport, engine, threads, on_rollout, references).act(stop)
                 link.flush(_FLUSH_SECONDS)
                 return
             except RunFinished:
@@ -99,7 +99,7 @@ class _Actor:
     def __init__(
         self,
         config: RunConfig,
-        arrays: tuple[str, ...],
+        info: RunInfo,
         link: ActorLink,
         transport: Transport,
         physics: PhysicsName,
@@ -107,13 +107,15 @@ class _Actor:
         on_rollout: Callable[[dict[str, float]], None],
         references: pathlib.Path | None,
     ):
+        arrays, remedy = info.arrays, "Start the actor with the learner's version of congrasp."
         if unknown := set(arrays) - RECORDABLE.keys():
-            raise CongraspError(
-                f"The learner's algorithm needs arrays that actors do not record: {', '.join(sorted(unknown))}.",
-                "Start the actor with the learner's version of congrasp.",
-            )
+            what = f"The learner's algorithm needs arrays that actors do not record: {', '.join(sorted(unknown))}."
+            raise CongraspError(what, remedy)
         self._config, self._arrays, self._link, self._transport = config, arrays, link, transport
-        self._hand = get_hand(config.task.hand)
+        self._hand, self._spec = get_hand(config.task.hand), policy_spec(config.task, config.network)
+        if self._spec.schema != info.schema:
+            what = f"The learner's policies have the schema {info.schema}; this actor's have {self._spec.schema}."
+            raise CongraspError(what, remedy)
         self._number = zlib.crc32(link.actor.encode())
         self._references = references if config.task.own_references else None
         self._saved = time.monotonic()
@@ -122,7 +124,6 @@ class _Actor:
             bank = with_kept_references(self._references, bank)
         with stage("engine"):
             self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
-        self._spec = policy_spec(config.task, config.network)
         with stage("first episodes"):
             self._worker = RolloutWorker(
                 self._hand,

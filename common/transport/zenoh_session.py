@@ -90,9 +90,10 @@ def _open_files() -> int:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
     if most < _FILES:
         _log.warning(
-            "This process may open %d files: as many silent connections keep new peers out. Raise the hard limit to %d "
-            "(ulimit -n, LimitNOFILE=).",
+            "This process may open %d files: more than %d silent connections keep new peers out. Raise the hard limit "
+            "to %d (ulimit -n, LimitNOFILE=).",
             most,
+            most // 4,
             _FILES,
         )
     return most

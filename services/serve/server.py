@@ -19,7 +19,7 @@ from congrasp.common.transport.keys import Keys, account, below
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.ops.logs import log
 from congrasp.services.serve.batching import Batcher, Parts
-from congrasp.services.serve.inference import BATCH_SIZES, Inference, PolicyFunction
+from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.requests import Query
 
 Source = Callable[[int], PolicyBundle | None]
@@ -30,10 +30,9 @@ DEPTH = 64
 """Limit of queued queries; further ones are refused at once."""
 SHARE = 16
 """Limit of queued queries of one peer."""
-SHARED = BATCH_SIZES[1]
-"""Limit of a batch's states while several peers share it: small enough for their control loops."""
 _TIMEOUT, _MAX_TIMEOUT = 1.0, 60.0  # deadline of a query by default and at most, s
 _FOLLOW_SECONDS = 0.5
+_NEWEST = 0.02  # share of the newest batch in the server's estimate of its speed
 
 
 class _Held(NamedTuple):
@@ -81,17 +80,17 @@ class PolicyServer:
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
         self._seconds = self._function.warm_up(self._held.inference_parameters)
+        self._slowness = 1.0
         self._answered = 0
         self._trouble = ""
         self._closed = threading.Event()
         self._batcher: Batcher[Query, _Answered] = Batcher(
             self._infer,
-            weigh=lambda query: len(query.vectors),
-            size=BATCH_SIZES[-1],
+            seconds=self._seconds,
             window=WINDOW,
             depth=DEPTH,
             share=SHARE,
-            parts=Parts(SHARED, _cut, self._join),
+            parts=Parts(_weigh, _cut, self._join),
         )
         transport.serve(keys.health, self._describe)
         transport.serve(
@@ -103,8 +102,8 @@ class PolicyServer:
     def health(self) -> dict[str, Any]:
         """Readiness, version, hand, queue, and why a newer policy was refused, as JSON.
 
-        The server takes no more than `queue_limit` queries that wait, `peer_limit` of one peer, and answers no more
-        than `states_per_second`, as measured at its start.
+        At most `queue_limit` queries are queued, `peer_limit` of one peer. `states_per_second` is the most that the
+        server can answer, by the times of its latest batches.
         """
         held = self._held
         return {
@@ -117,7 +116,7 @@ class PolicyServer:
             "queue": len(self._batcher),
             "queue_limit": DEPTH,
             "peer_limit": SHARE,
-            "states_per_second": round(max(size / seconds for size, seconds in self._seconds.items())),
+            "states_per_second": round(max(size / seconds for size, seconds in self._seconds.items()) / self._slowness),
             "answered": self._answered,
             "trouble": self._trouble,
         }
@@ -189,10 +188,12 @@ class PolicyServer:
 
     def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[_Answered | Exception]:
         """Answers a batch."""
-        held, began = self._held, time.monotonic()
-        self._on_batch(sum(len(query.vectors) for query in queries))
+        held, began, states = self._held, time.monotonic(), sum(map(_weigh, queries))
+        self._on_batch(states)
         answers = self._function(held.inference_parameters, queries)
         spent = time.monotonic() - began
+        expected = next(seconds for size, seconds in self._seconds.items() if size >= states)
+        self._slowness += _NEWEST * (spent / expected - self._slowness)
         return [
             answer if isinstance(answer, Exception) else (answer, held, waited, spent)
             for answer, waited in zip(answers, queued, strict=True)
@@ -231,9 +232,14 @@ class PolicyServer:
         self._trouble = ""
 
 
+def _weigh(query: Query) -> int:
+    """Returns the number of states of a query."""
+    return len(query.vectors)
+
+
 def _cut(query: Query, first: int, end: int) -> Query:
     """Returns some states of a query."""
-    return query._replace(vectors=query.vectors[first:end])
+    return query._replace(vectors=query.vectors[first:end], first=first)
 
 
 def _hold(bundle: PolicyBundle) -> _Held:

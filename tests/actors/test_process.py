@@ -11,6 +11,7 @@ import pytest
 
 from congrasp.actors.env import episode_fields
 from congrasp.actors.process import actor as process
+from congrasp.actors.process.link import RunInfo
 from congrasp.actors.rollout import Rollout, Trace
 from congrasp.actors.training_set import TrainingSet
 from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
@@ -146,9 +147,21 @@ def heard(monkeypatch):
     return run
 
 
+def started(info: RunInfo) -> None:
+    """Starts the parts of an actor for a learner that gives this information."""
+    link = types.SimpleNamespace(actor="a")
+    process._Actor(CONFIG, info, link, None, "native", 1, lambda values: None, None)
+
+
 def test_an_algorithm_that_needs_what_actors_do_not_record_is_one_line():
     with pytest.raises(CongraspError, match=r"do not record: torque\. Start the actor with the learner's version"):
-        process._Actor(CONFIG, ("reward", "torque"), None, None, "native", 1, lambda values: None, None)
+        started(RunInfo("{}", "e", SPEC.schema, ("reward", "torque")))
+
+
+def test_an_actor_of_another_version_is_one_line_before_anything_is_built(monkeypatch):
+    monkeypatch.setattr(process, "training_set", lambda *_: pytest.fail("its objects were built"))
+    with pytest.raises(CongraspError, match=rf"schema 0; this actor's have {SPEC.schema}\. Start the actor with"):
+        started(RunInfo("{}", "e", "0", ("reward",)))
 
 
 def test_steps_in_which_the_physics_left_contacts_out_are_counted():

@@ -435,4 +435,4 @@ def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free
     taken = [int(settings.get_json(f"transport/unicast/{name}")) for name in ("accept_pending", "max_sessions")]
     assert taken == [files // 4, min(1000, files // 4)]
     assert limits[-1] == (files, hard)
-    assert [record.args for record in caplog.records] == [(files, 16_384)] * warnings
+    assert [record.args for record in caplog.records] == [(files, files // 4, 16_384)] * warnings

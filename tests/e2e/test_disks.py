@@ -5,27 +5,20 @@ import pathlib
 import shutil
 import subprocess
 import threading
-import time
 
 import numpy as np
 import pytest
 
-from congrasp.actors.process.link import ActorLink
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.journal import AUDIT, Journal, read_journal
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
-from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub.hub import LearnerHub
-from congrasp.learner.hub.staleness import StalenessManager
-from congrasp.learner.hub.write_ahead import WriteAheadLog
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import LOGS, create_run
 from congrasp.services.ops.audit import audit
 from congrasp.services.record.reader import read_metrics
 from congrasp.services.record.recorder import Recorder
-from tests.cluster import A, B, D, T, bundle, rollout
 from tests.learner.test_process import CONFIG, MadeUpActor
 from tests.waits import eventually
 
@@ -128,28 +121,3 @@ def test_a_run_that_cannot_leave_its_last_checkpoint_says_so(disk):
         )  # fmt: skip
     assert "\n" not in str(caught.value)
     assert (disk / "run" / "checkpoints" / "latest").resolve().name == "checkpoint_000000002.safetensors"
-
-
-class SlowLog(WriteAheadLog):
-    """Of a disk that takes a second for a rollout."""
-
-    def add(self, *arguments):
-        time.sleep(1.0)
-        return super().add(*arguments)
-
-
-def test_a_rollout_is_accepted_once_though_the_disk_is_slower_than_its_actor_waits(tmp_path):
-    hub = MemoryHub()
-    with MemoryTransport(hub) as learner, MemoryTransport(hub) as actor:
-        form = RolloutForm(T, B, D, A, half=True)
-        made = LearnerHub(
-            learner, run="r", config_json="{}", run_id="e", schema="s", form=form,
-            staleness=StalenessManager(1, 2), log=SlowLog(tmp_path, 1),
-        )  # fmt: skip
-        made.publish_weights(bundle(0, "e"), 0)
-        with ActorLink(actor, "r", "a", request_timeout=0.2) as link:
-            link.config(10)
-            outcomes = [link.upload(rollout(T, i, 0), link.acquire_ticket(20)).result(60) for i in range(2)]
-        counters = made.status()["counters"]
-    assert outcomes == ["duplicate"] * 2
-    assert counters["accepted"] == 2 and counters["missing"] == 0 and len(made.next_batch(2, 1)) == 2

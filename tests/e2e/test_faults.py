@@ -14,7 +14,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.write_ahead import FOLDER
 from congrasp.services.ops.audit import audit
 from tests.benchmarks.second_reading import read_again
-from tests.cluster import KEYS, Proxy, T, rollout
+from tests.cluster import KEYS, A, Proxy, T, rollout
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -178,6 +178,16 @@ def test_a_slow_link_slows_its_actor_alone(cluster, proxy):
     cluster.stop(learner)
 
 
+def test_a_disk_slower_than_an_actor_waits_costs_no_rollout(cluster):
+    """Uploads time out although the rollout has arrived, and are sent again."""
+    learner = cluster.start_learner(disk=0.6)
+    cluster.start_actor(request_timeout=0.3)
+    status = cluster.wait_for_updates(3)
+    assert status["counters"]["duplicate"] > 0
+    final, _ = cluster.stop(learner)
+    assert final["counters"]["missing"] == 0
+
+
 def test_wall_clocks_do_not_matter(cluster):
     """The clocks of learner and actor jump by weeks with every look at them."""
     learner = cluster.start_learner(clock="jumps")
@@ -187,6 +197,23 @@ def test_wall_clocks_do_not_matter(cluster):
     status = cluster.wait(lambda status: min(contributions(status).values(), default=0) > 3)
     assert status["counters"]["expired"] == 0
     cluster.stop(learner)
+
+
+def test_actors_of_another_version_or_hand_end_in_a_line_and_the_run_continues(cluster):
+    """Their rollouts have another schema, or the arrays of a hand with more joints."""
+    learner = cluster.start_learner()
+    cluster.start_actor("a")
+    cluster.wait_for_updates(1)
+    kinds = {"version": {"schema": "t"}, "hand": {"actions": A + 3}}
+    strangers = [cluster.start_actor(name, **kind) for name, kind in kinds.items()]
+    assert [stranger.wait(240) for stranger in strangers] == [1, 1]
+    errors = (cluster.folder / "actor.err").read_text().splitlines()
+    assert sum("CongraspError" in line and "refused" in line for line in errors) == 2, errors
+    for name in kinds:
+        assert {entry["outcome"] for entry in cluster.outcomes(name)} <= {"refused", "unknown"}
+    cluster.wait_for_updates(3)
+    final, _ = cluster.stop(learner)
+    assert final["counters"]["damaged"] > 0 and {actor for actor, *_ in final["history"]} == {"a"}
 
 
 def test_replayed_rollouts_and_tickets_of_others_change_nothing(cluster):
