@@ -70,11 +70,11 @@ def save_grasp(
     (folder / RESULT).unlink(missing_ok=True)
     save_motion(folder / MOTION, found.motion)
     save_recording(folder / RECORDING, found.episode)
-    if found.arm:
-        save_trajectories(folder, found.arm)
+    episode, arm = found.episode, found.motion.arm
+    if arm:
+        save_trajectories(folder, found.motion, arm)
         if pictures:
-            save_picture(folder / ARM_PICTURE, found.arm, found.episode, found.first("hold"))
-    episode = found.episode
+            save_picture(folder / ARM_PICTURE, arm, episode, found.first("hold"))
     steps = _steps_to_draw(*grasp_steps(episode), len(episode.arrays["table"]) - 1)
     last = steps[-1]
     if pictures:
@@ -86,7 +86,7 @@ def save_grasp(
         until = min(found.first("hold") + round(_HELD / float(episode.meta["control_dt"])), last)
         filmed = [*range(found.first("grasp") // 2, until, _FRAMED), until]  # the hand comes into the picture
         aspect = film.size[0] / film.size[1]
-        if arm := found.arm:
+        if arm:
             camera = robot_camera(arm, episode, [*steps[:-1], until], aspect)
             around = functools.partial(robot_shapes, arm, episode)
             save_episode_video(folder / VIDEO, episode, film, camera, until=until, around=around)

@@ -234,7 +234,8 @@ class Grasper:
             progress(f"Moving {arm.name}", number + 1, len(order))
             try:
                 found = make(index)
-                return dataclasses.replace(found, arm=arm.plan(obj, found.motion))
+                planned = arm.plan(obj, found.motion)
+                return dataclasses.replace(found, motion=planned.motion, arm=planned)
             except Infeasible as limit:
                 refused[str(limit)] += 1
             except NoReachError:
