@@ -1,5 +1,6 @@
-"""Files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
+"""Files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, picture and video."""
 
+import functools
 import json
 import pathlib
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from congrasp.services.export.motion_file import GraspMotion, robot_joints
 from congrasp.services.record.moved_arm import MovedArm
 from congrasp.services.viz.episode import episode_shapes
 from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.render import Film, save_episode_video
 from congrasp.services.viz.scene import Camera, Shape
 from congrasp.services.viz.shapes import arm_shapes, fit, shape_points
 from congrasp.services.viz.sheets import save_png
@@ -55,11 +57,32 @@ def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) 
 
 def save_picture(path: pathlib.Path, arm: MovedArm, episode: Message, step: int) -> None:
     """Draws the whole robot with object and table at a control step of its episode, as PNG."""
-    shapes = [*robot_shapes(arm, episode, step), *_grasp_shapes(episode, step)]
-    save_png(path, render_scene(shapes, robot_camera(arm, episode, [step], _SIZE[0] / _SIZE[1]), _SIZE))
+    shapes = [*_robot_shapes(arm, episode, step), *_grasp_shapes(episode, step)]
+    save_png(path, render_scene(shapes, _robot_camera(arm, episode, [step], _SIZE[0] / _SIZE[1]), _SIZE))
 
 
-def robot_camera(arm: MovedArm, episode: Message, steps: Sequence[int], aspect: float) -> Camera:
+def save_robot_video(
+    path: pathlib.Path, arm: MovedArm, episode: Message, film: Film, steps: Sequence[int], until: int | None = None
+) -> None:
+    """Writes an MP4 of an episode with the whole robot, from a camera that shows it in all of some control steps.
+
+    Args:
+      path: the file.
+      arm: the arm of the episode.
+      episode: the episode.
+      film: size, frame rate and overlays.
+      steps: control steps that the camera must show.
+      until: see `save_episode_video`.
+
+    Raises:
+      CongraspError: see `save_episode_video`.
+    """
+    camera = _robot_camera(arm, episode, steps, film.size[0] / film.size[1])
+    around = functools.partial(_robot_shapes, arm, episode)
+    save_episode_video(path, episode, film, camera, until=until, around=around)
+
+
+def _robot_camera(arm: MovedArm, episode: Message, steps: Sequence[int], aspect: float) -> Camera:
     """Returns a camera that shows the whole robot and the object in all of the control steps."""
     shapes = [shape for step in steps for shape in (*arm_shapes(arm, step), *_grasp_shapes(episode, step))]
     points = np.concatenate([shape_points(shape) for shape in shapes])
@@ -67,7 +90,7 @@ def robot_camera(arm: MovedArm, episode: Message, steps: Sequence[int], aspect: 
     return fit(points, base.apply(_AHEAD), aspect)
 
 
-def robot_shapes(arm: MovedArm, episode: Message, step: int) -> list[Shape]:
+def _robot_shapes(arm: MovedArm, episode: Message, step: int) -> list[Shape]:
     """Returns the arm at a control step of its episode and the table on which arm and object stand."""
     ends = arm.link_position[0, 0, :2], episode.arrays["object_position"][0][:2]
     radius = float(np.linalg.norm(ends[0] - ends[1])) / 2 + _EDGE

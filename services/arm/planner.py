@@ -16,6 +16,7 @@ from congrasp.services.arm.options import ArmOptions
 from congrasp.services.arm.robot import Pose, Robot, build_robot, default_mount
 from congrasp.services.export.frames import NOT_LINKS
 from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.record.moved_arm import MovedArm
 
 try:
     from congrasp.services.arm.tracking import Path, Track, follow
@@ -27,27 +28,24 @@ _FAR_BELOW = -10.0  # m, of a table that was removed
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ArmMotion:
-    """A grasp motion on an arm."""
+    """An arm along a grasp motion."""
 
-    motion: GraspMotion
-    """The motion with its arm."""
+    moved: MovedArm
     base: Pose
     """Relative to the object on the table."""
     track: Track
 
     def facts(self) -> dict[str, Any]:
         """Arm, base, errors and shares of the limits, for `result.json`."""
-        arm = self.motion.arm
-        assert arm is not None
         yaw = float(self.base.rotation.as_euler("xyz", degrees=True)[2])
         fastest = int(self.track.speed.argmax())
         return {
-            "arm": arm.name,
+            "arm": self.moved.name,
             "arm_base": [*(round(float(x), 6) for x in self.base.position), round(yaw, 6)],
             "arm_error_mm": 1e3 * self.track.position_error,
             "arm_error_deg": float(np.degrees(self.track.rotation_error)),
             "arm_speed_share": float(self.track.speed[fastest]),
-            "arm_speed_joint": str(arm.joint_names[fastest]),
+            "arm_speed_joint": str(self.moved.joint_names[fastest]),
             "arm_acceleration": float(self.track.acceleration.max()),
         }
 
@@ -108,7 +106,7 @@ class ArmPlanner:
         base = dataclasses.replace(self._base, position=self._base.position + start)
         track = follow(robot, _path(motion, base), np.random.default_rng(self._seed))
         arm = moved_arm(robot, track.q, base, self._mount, {*motion.link_names.tolist(), *NOT_LINKS})
-        return ArmMotion(dataclasses.replace(motion, arm=arm), self._base, track)
+        return ArmMotion(arm, self._base, track)
 
 
 def _path(motion: GraspMotion, base: Pose) -> Path:

@@ -140,6 +140,8 @@ def motion_of_episode(episode: Message) -> GraspMotion:
     arrays, meta = {name: np.asarray(value) for name, value in episode.arrays.items()}, dict(episode.meta)
     hand = known_hand(meta.pop("hand"))
     dt = float(meta.pop("control_dt"))
+    arm = moved_arm.arm_of_episode(episode)
+    meta.pop("arm", None)
     of_hand: dict[str, Any] = hand_arrays(hand)
     return GraspMotion(
         hand=hand.name,
@@ -171,6 +173,7 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         goal={
             name.removeprefix("goal/"): value for name, value in arrays.items() if name.removeprefix("goal/") in _GOALS
         },
+        arm=arm,
     )
 
 

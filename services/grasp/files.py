@@ -1,6 +1,5 @@
 """The files of a grasp: `congrasp grasp` writes them into an object's folder, the result last."""
 
-import functools
 import hashlib
 import json
 import pathlib
@@ -13,7 +12,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.arm.files import PICTURE as ARM_PICTURE
-from congrasp.services.arm.files import robot_camera, robot_shapes, save_picture, save_trajectories
+from congrasp.services.arm.files import save_picture, save_robot_video, save_trajectories
 from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.grasper import Grasp
 from congrasp.services.record.channels import JsonChannels
@@ -87,9 +86,7 @@ def save_grasp(
         filmed = [*range(found.first("grasp") // 2, until, _FRAMED), until]  # the hand comes into the picture
         aspect = film.size[0] / film.size[1]
         if arm:
-            camera = robot_camera(arm, episode, [*steps[:-1], until], aspect)
-            around = functools.partial(robot_shapes, arm, episode)
-            save_episode_video(folder / VIDEO, episode, film, camera, until=until, around=around)
+            save_robot_video(folder / VIDEO, arm, episode, film, [*steps[:-1], until], until)
         else:
             seen_from = camera_of(episode, filmed, aspect, view or views(episode, steps)[0], overlays=film.overlays)
             save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)

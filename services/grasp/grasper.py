@@ -235,7 +235,8 @@ class Grasper:
             try:
                 found = make(index)
                 planned = arm.plan(obj, found.motion)
-                return dataclasses.replace(found, motion=planned.motion, arm=planned)
+                episode = planned.moved.recorded(found.episode)
+                return dataclasses.replace(found, episode=episode, motion=motion_of_episode(episode), arm=planned)
             except Infeasible as limit:
                 refused[str(limit)] += 1
             except NoReachError:

@@ -11,10 +11,13 @@ from typing import Annotated, NamedTuple, get_type_hints
 import numpy as np
 
 from congrasp.common.described import check_arrays
+from congrasp.common.errors import CongraspError
+from congrasp.common.wire.codec import Message
 
 UNLIMITED = 1e3
 """Limit of joints without limits, rad or m."""
 _PREFIX = "arm_"
+_FOLDER, _META = "arm/", "arm"  # of the arrays, and of name and texts, in an episode's message
 
 
 class Mesh(NamedTuple):
@@ -67,6 +70,12 @@ class MovedArm:
         """Returns the arm in other frames (n,) of the motion."""
         return dataclasses.replace(self, **{name: getattr(self, name)[frames] for name in _TIMED})
 
+    def recorded(self, episode: Message) -> Message:
+        """Returns an episode with the arm."""
+        numbers = {f"{_FOLDER}{name}": values for name, values in self.arrays().items() if values.dtype.kind != "U"}
+        texts = {name: values.tolist() for name, values in self.arrays().items() if values.dtype.kind == "U"}
+        return Message({**episode.arrays, **numbers}, {**episode.meta, _META: {"name": self.name, **texts}})
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns the arrays by the names that they have in files."""
         return {name: getattr(self, name.removeprefix(_PREFIX)) for name in MEANINGS}
@@ -108,3 +117,21 @@ def arm_of(name: str, arrays: Mapping[str, np.ndarray], frames: int) -> MovedArm
     if (arm.link_parent >= np.arange(sizes["A"])).any():
         raise ValueError(f"{_PREFIX}link_parent has links before the one that carries them")
     return arm
+
+
+def arm_of_episode(episode: Message) -> MovedArm | None:
+    """Returns the arm of an episode, if there is one.
+
+    Raises:
+      CongraspError: its arrays do not match their meanings.
+    """
+    if _META not in episode.meta:
+        return None
+    try:
+        texts = dict(episode.meta[_META])
+        name = str(texts.pop("name"))
+        arrays = {key.removeprefix(_FOLDER): value for key, value in episode.arrays.items() if key.startswith(_FOLDER)}
+        arrays |= {key: np.array(value, str) for key, value in texts.items()}
+        return arm_of(name, arrays, len(episode.arrays["table"]))
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise CongraspError(f"The episode's arm is not valid ({str(error)[:200]}).") from None

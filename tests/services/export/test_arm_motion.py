@@ -9,12 +9,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import trimesh
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.arm.description import load_arm
 from congrasp.services.arm.links import moved_arm
 from congrasp.services.arm.robot import Pose, build_robot, default_mount
@@ -29,6 +32,8 @@ from congrasp.services.export.motion_file import (
     robot_joints,
     save_motion,
 )
+from congrasp.services.record.channels import JsonChannels
+from congrasp.services.record.scene import check_episode, episode_entries
 from tests.episodes import episode
 
 T = 5
@@ -204,3 +209,27 @@ def test_the_camera_sees_the_arm(motion: GraspMotion) -> None:
     camera = camera_for([alone])
     shown, blank = (next(pictures(one, camera)).astype(int) for one in (motion, alone))
     assert (np.abs(shown - blank).sum(-1) > 60).mean() > 0.02
+
+
+def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: GraspMotion) -> None:
+    arm, alone = motion.arm, episode(T)
+    assert arm is not None
+    whole = decode(encode(arm.recorded(alone)))
+    check_episode(whole)
+    again = motion_of_episode(whole).arm
+    assert again is not None and again.name == "odd" and again.joint_names.tolist() == arm.joint_names.tolist()
+    for name, values in arm.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], values)
+    entries = [*episode_entries("a0", whole, 0, 0, JsonChannels())]
+    (scene,) = [SceneUpdate.FromString(entry.data) for entry in entries if entry.channel.topic == "/episode/a0/scene"]
+    shown = {entity.id: entity for entity in scene.entities if entity.id.startswith("arm/")}
+    assert [entity.frame_id for entity in shown.values()] == [
+        f"a0/arm/{name}" for name in ("odd_base", "sledge", "sledge", "arm_palm")
+    ]
+    assert shown["arm/1"].triangles[0].color.r == pytest.approx(1.0) and len(shown["arm/1"].triangles[0].indices) == 36
+    frame = next(FrameTransforms.FromString(e.data) for e in entries if e.channel.topic == "/episode/a0/tf")
+    sledge = next(t.translation for t in frame.transforms if t.child_frame_id == "a0/arm/sledge")
+    np.testing.assert_allclose([sledge.x, sledge.y, sledge.z], arm.link_position[0, 1], atol=1e-6)
+    short = Message({**whole.arrays, "arm/arm_joint_position": arm.joint_position[:2]}, whole.meta)
+    with pytest.raises(CongraspError, match=r"The episode's arm is not valid \(arm_joint_position has shape"):
+        check_episode(short)
