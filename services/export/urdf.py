@@ -1,5 +1,6 @@
 """Hand and arm as URDF, for formats that carry joint angles, and the kinematics that MuJoCo makes of it."""
 
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -129,7 +130,9 @@ def _joint(
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
-    ET.SubElement(joint, "origin", xyz=_numbers(offset), rpy=_numbers(turn.as_euler("xyz")))
+    with warnings.catch_warnings(action="ignore"):  # of a pitch of 90 degrees, where any roll will do
+        angles = turn.as_euler("xyz")
+    ET.SubElement(joint, "origin", xyz=_numbers(offset), rpy=_numbers(angles))
     return joint
 
 

@@ -130,7 +130,8 @@ def arm_of_episode(episode: Message) -> MovedArm | None:
     try:
         texts = dict(episode.meta[_META])
         name = str(texts.pop("name"))
-        arrays = {key.removeprefix(_FOLDER): value for key, value in episode.arrays.items() if key.startswith(_FOLDER)}
+        own = {key: np.array(value) for key, value in episode.arrays.items() if key.startswith(_FOLDER)}  # writable
+        arrays = {key.removeprefix(_FOLDER): value for key, value in own.items()}
         arrays |= {key: np.array(value, str) for key, value in texts.items()}
         return arm_of(name, arrays, len(episode.arrays["table"]))
     except (ValueError, LookupError, TypeError, AttributeError) as error:

@@ -216,7 +216,9 @@ def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: GraspMotio
     assert arm is not None
     whole = decode(encode(arm.recorded(alone)))
     check_episode(whole)
-    again = motion_of_episode(whole).arm
+    recorded = motion_of_episode(whole)
+    again = recorded.arm
+    assert "rail" in urdf.robot_urdf(recorded)
     assert again is not None and again.name == "odd" and again.joint_names.tolist() == arm.joint_names.tolist()
     for name, values in arm.arrays().items():
         np.testing.assert_array_equal(again.arrays()[name], values)
