@@ -2,7 +2,7 @@
 
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 import congrasp
 
 JOINTS, POSE, FRAMES = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
+CLOUD = "sensor_msgs/msg/PointCloud2"
 INPUTS = {"joint_states": JOINTS, "wrist_pose": POSE, "object_pose": POSE, "tf": FRAMES, "tf_static": FRAMES}
 OUTPUTS = {"joint_command": JOINTS, "wrist_command": POSE}
 _MOST = 64
@@ -39,8 +40,8 @@ class Bus(Protocol):
 class RosBus:
     """Topics of ROS 2 through rclpy."""
 
-    def __init__(self) -> None:
-        """Creates the node.
+    def __init__(self, inputs: Mapping[str, str] = INPUTS) -> None:
+        """Creates the node, which takes inputs: types by topics.
 
         Raises:
           CongraspError: there is no rclpy.
@@ -54,10 +55,10 @@ class RosBus:
         self._rclpy.init()
         self._node = self._rclpy.create_node("congrasp")
         self._received: list[tuple[str, Any]] = []
-        for topic, kind in INPUTS.items():
+        for topic, kind in inputs.items():
             # Takes reliable publishers, too. Static transforms are published once and kept for who comes later.
             lasting = {"durability": qos.DurabilityPolicy.TRANSIENT_LOCAL} if topic == "tf_static" else {}
-            depth = 1 if kind == POSE else _MOST  # several nodes publish joints and frames
+            depth = 1 if kind in (POSE, CLOUD) else _MOST  # several nodes publish joints and frames
             profile = qos.QoSProfile(depth=depth, reliability=qos.ReliabilityPolicy.BEST_EFFORT, **lasting)
             self._node.create_subscription(self._type(kind), topic, self._keep(topic), profile)
         self._publishers = {t: self._node.create_publisher(self._type(k), t, 1) for t, k in OUTPUTS.items()}
@@ -102,8 +103,8 @@ class RosBus:
 class ZenohBus:
     """The same topics over Zenoh, as CDR, which rosbags writes and reads."""
 
-    def __init__(self, endpoint: str):
-        """Connects to a router, a bridge or a robot.
+    def __init__(self, endpoint: str, inputs: Mapping[str, str] = INPUTS):
+        """Connects to a router, a bridge or a robot, and takes inputs: types by topics.
 
         Raises:
           CongraspError: none answers there.
@@ -112,7 +113,7 @@ class ZenohBus:
         from rosbags.typesys import Stores, get_typestore
         from zenoh.handlers import RingChannel
 
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._inputs, self._store = inputs, get_typestore(Stores.ROS2_HUMBLE)
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
         config.insert_json5("connect/endpoints", f'["{endpoint}"]')
@@ -125,8 +126,10 @@ class ZenohBus:
                 "Start the router or the bridge, or correct the endpoint.",
             ) from None
         self._subscribers = {
-            topic: self._session.declare_subscriber(topic, RingChannel(1 if kind == POSE else _MOST))
-            for topic, kind in INPUTS.items()
+            topic: self._session.declare_subscriber(
+                topic.strip("/"), RingChannel(1 if kind in (POSE, CLOUD) else _MOST)
+            )
+            for topic, kind in inputs.items()
         }
 
     def make(self, kind: str, **fields: Any) -> Any:
@@ -142,10 +145,10 @@ class ZenohBus:
                 if (sample := subscriber.try_recv()) is None:
                     break
                 try:
-                    message = self._store.deserialize_cdr(sample.payload.to_bytes(), INPUTS[topic])
+                    message = self._store.deserialize_cdr(sample.payload.to_bytes(), self._inputs[topic])
                     received.append((topic, message))
                 except Exception as error:
-                    print(f"{topic}: not a {INPUTS[topic]} ({type(error).__name__})", file=sys.stderr)
+                    print(f"{topic}: not a {self._inputs[topic]} ({type(error).__name__})", file=sys.stderr)
         return received
 
     def publish(self, topic: str, message: Any) -> None:

@@ -9,6 +9,7 @@
 | in: `joint_states` | sensor_msgs/JointState | the finger joints, by name, any order |
 | in: `wrist_pose` | geometry_msgs/PoseStamped | what carries the hand; its palm without `--mount` |
 | in: `object_pose` | geometry_msgs/PoseStamped | the frame of the object's file |
+| in: `--cloud-topic` | sensor_msgs/PointCloud2 | instead of `object_pose`, for a policy with a camera |
 | in: `tf`, `tf_static` | tf2_msgs/TFMessage | the frames of these poses in `--world`: z up, the table at z = 0 |
 | out: `joint_command` | sensor_msgs/JointState | finger targets (`position`) and torques (`effort`) |
 | out: `wrist_command` | geometry_msgs/PoseStamped | where what carries the hand should be, in `--world` |
@@ -23,15 +24,20 @@ import dataclasses
 import pathlib
 import sys
 import time
-from typing import Annotated, Any
+from collections.abc import Callable
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 import tyro
-from ros2_bus import INPUTS, JOINTS, POSE, Bus, RosBus, ZenohBus
+from ros2_bus import CLOUD, INPUTS, JOINTS, POSE, Bus, RosBus, ZenohBus
+from ros2_cloud import Eye, labelled, seen_object
+from ros2_sensors import Pose, Sensors, read_pose
 from scipy.spatial.transform import Rotation
 
 import congrasp
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.objects.named import find_object
 from congrasp.services.cli.grasp import Constraints
 from congrasp.services.grasp.parse import read_request
@@ -42,39 +48,20 @@ WAITING = 2.0
 LIFT_SPEED = 0.1
 """m/s, the mean."""
 TRACKER_AGE = 0.5
-"""Seconds that a student's object may be old: it learnt with 10 Hz, 100 ms, and samples that are lost."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Pose:
-    """A frame in another one: position (3,), m, and rotation."""
-
-    position: np.ndarray
-    rotation: Rotation
-
-    def __matmul__(self, other: "Pose") -> "Pose":
-        """A pose in this frame, in the other one."""
-        return Pose(self.position + self.rotation.apply(other.position), self.rotation * other.rotation)
-
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position and quaternion (4,), (w, x, y, z)."""
-        return self.position, self.rotation.as_quat(scalar_first=True)
-
-    def inverse(self) -> "Pose":
-        """The other frame in this one."""
-        return Pose(-self.rotation.inv().apply(self.position), self.rotation.inv())
+"""Seconds that a student's object or cloud may be old: it learnt with 10 Hz, 100 ms, and samples that are lost."""
 
 
 @dataclasses.dataclass
 class Arguments:
     """What is grasped, with what, and where the robot is."""
 
-    object: tyro.conf.Positional[str]
-    """A mesh, an object file, or FAMILY:SEED."""
+    object: tyro.conf.Positional[str] = ""
+    """A mesh, an object file, or FAMILY:SEED; none for a policy with a camera."""
     hand: str = "allegro"
     """Name of the hand."""
     constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Constraints)
-    """What the grasp must keep to; the hand comes along the object's -z axis where nothing guides it."""
+    """What the grasp must keep to, for a policy with a camera in `--world`; the hand comes along the -z axis where
+    nothing guides it."""
     connect: str = "tcp/127.0.0.1:7457"
     """The policy server's endpoint."""
     wait: float = 120.0
@@ -87,6 +74,10 @@ class Arguments:
     """HAND=ROBOT pairs: the robot's names of joints that it calls otherwise."""
     world: str = "world"
     """Name of the world frame."""
+    cloud_topic: str = ""
+    """Topic of the camera's point clouds, for a policy with a camera."""
+    box: str = "0 0 0.2 0.5 0.5 0.4"
+    """X Y Z DX DY DZ: middle and sides of the box in `--world` whose points are the object's, m."""
     mount: str = "0 0 0 0 0 0"
     """X Y Z ROLL PITCH YAW of the palm in the frame of `wrist_pose`: metres, degrees."""
     hand_eye: str = "0 0 0 0 0 0"
@@ -106,102 +97,83 @@ class Arguments:
     robot_age: float = 0.1
     """Seconds after which joints and wrist count as not measured, from their arrival and by their stamps."""
     object_age: float = 0.0
-    """The same of the object; 0: that of the robot, or 0.5 for a student (10 Hz, 100 ms, lost samples)."""
+    """The same of object or cloud; 0: that of the robot, or 0.5 for a student (10 Hz, 100 ms, lost samples)."""
 
 
-class Sensors:
-    """What the topics say, in the world frame; None or NaN for what is not there, or too old."""
+Read = Callable[[GraspObject, np.ndarray], congrasp.GraspRequest]
+"""Reads the constraints on an object whose middle (3,) is given."""
 
-    def __init__(self, arguments: Arguments, joints: list[str], origin: np.ndarray, object_age: float):
-        """Args: names and offsets; the hand's joints; (3,) the object frame's origin in its file, m; s."""
-        renamed = joints_of(arguments.joint_map, joints)
-        self.names = [renamed.get(joint, joint) for joint in joints]
-        """The robot's names of the joints, in the hand's order."""
-        self.mount, self._hand_eye = offset_of(arguments.mount), offset_of(arguments.hand_eye)
+
+class Target(Protocol):
+    """The object, as the policy observes it."""
+
+    def fields(self, down: Pose, palm: Pose | None, q: np.ndarray) -> dict[str, np.ndarray]:
+        """What a state says of the object; not finite where it is not measured.
+
+        Args: the world in the frame that rises with the hand; the palm in the world; (F,) rad.
+        """
+        ...
+
+    def request(self, fields: dict[str, np.ndarray]) -> congrasp.GraspRequest:
+        """What is asked for of an object with these fields, without where the hand is."""
+        ...
+
+
+class Tracked:
+    """An object whose pose is measured."""
+
+    def __init__(self, sensors: Sensors, request: congrasp.GraspRequest, origin: np.ndarray):
+        """Args: the request lacks where all is; (3,) the object frame's origin in its file, m."""
+        self._sensors, self._request = sensors, request
         self._centre = Pose(-np.asarray(origin), Rotation.identity())
-        self._world, self._ages = arguments.world, dict.fromkeys(INPUTS, arguments.robot_age)
-        self._ages["object_pose"] = object_age
-        self._joints: dict[str, tuple[float, float, float]] = {}
-        self._poses: dict[str, tuple[Any, float]] = {}
-        self._frames: dict[str, tuple[str, Pose, float]] = {}
 
-    def take(self, received: list[tuple[str, Any]]) -> None:
-        """Takes messages in."""
-        for topic, message in received:
-            if topic == "joint_states":
-                velocity = (
-                    message.velocity if len(message.velocity) == len(message.name) else [np.nan] * len(message.name)
-                )
-                rows = zip(message.name, message.position, velocity, strict=False)
-                self._joints |= {name: (q, v, stamped(message.header)) for name, q, v in rows}
-            elif INPUTS[topic] == POSE:
-                self._poses[topic] = message, stamped(message.header)
-            else:
-                for part in message.transforms:
-                    pose = read_pose(part.transform.translation, part.transform.rotation)
-                    when = np.inf if topic == "tf_static" else stamped(part.header)
-                    if pose is not None:
-                        self._frames[part.child_frame_id] = part.header.frame_id, pose, when
+    def fields(self, down: Pose, palm: Pose | None, q: np.ndarray) -> dict[str, np.ndarray]:
+        """See `Target.fields`."""
+        message, frame = self._sensors.sight()
+        pose = frame and read_pose(message.pose.position, message.pose.orientation)
+        found = (
+            (down @ frame @ pose @ self._centre).arrays()
+            if frame and pose
+            else (np.full(3, np.nan), np.full(4, np.nan))
+        )
+        return dict(zip(("object_position", "object_quaternion"), found, strict=True))
 
-    def joints(self) -> np.ndarray:
-        """(2, F) angles and velocities, rad and rad/s."""
-        earliest = time.monotonic() - self._ages["joint_states"]
-        rows = (self._joints.get(name, (np.nan, np.nan, -np.inf)) for name in self.names)
-        return np.array([(q, v) if when >= earliest else (np.nan, np.nan) for q, v, when in rows]).T
+    def request(self, fields: dict[str, np.ndarray]) -> congrasp.GraspRequest:
+        """See `Target.request`."""
+        return dataclasses.replace(self._request, object_pose=(fields["object_position"], fields["object_quaternion"]))
 
-    def palm(self) -> Pose | None:
-        """The palm in the world."""
-        pose = self._pose("wrist_pose", Pose(np.zeros(3), Rotation.identity()))
-        return pose and pose @ self.mount
 
-    def object(self) -> Pose | None:
-        """The object in the world."""
-        pose = self._pose("object_pose", self._hand_eye)
-        return pose and pose @ self._centre
+class Pictured:
+    """An object of which a camera sees a part."""
 
-    def missing(self) -> str:
-        """What is not there, in words; empty when all is."""
-        lacking = []
-        if absent := [name for name, q in zip(self.names, self.joints()[0], strict=True) if not np.isfinite(q)]:
-            others = ", ".join(sorted(set(self._joints) - set(absent))) or "none"
-            lacking.append(f"the joints {', '.join(absent)} in joint_states (there: {others}; see --joint-map)")
-        for topic, found in (("wrist_pose", self.palm()), ("object_pose", self.object())):
-            message, when = self._poses.get(topic, (None, 0.0))
-            if message is None:
-                lacking.append(topic)
-            elif time.monotonic() - when > self._ages[topic]:
-                lacking.append(f"{topic} (the last one is {time.monotonic() - when:.1f} s old by its stamp)")
-            elif found is None:
-                lacking.append(f"{topic}: a pose, and tf from its frame '{message.header.frame_id}' to '{self._world}'")
-        return "; ".join(lacking)
+    def __init__(self, sensors: Sensors, eye: Eye, read: Read):
+        self._sensors, self._eye, self._read = sensors, eye, read
+        self._first: tuple[np.ndarray, np.ndarray] | None = None
 
-    def _pose(self, topic: str, offset: Pose) -> Pose | None:
-        """A topic's pose in the world, by way of an offset of the frame that it is in."""
-        message, when = self._poses.get(topic, (None, -np.inf))
-        if time.monotonic() - when > self._ages[topic]:
-            return None
-        frame, pose = self._frame(message.header.frame_id), read_pose(message.pose.position, message.pose.orientation)
-        return frame @ offset @ pose if frame and pose else None
+    def fields(self, down: Pose, palm: Pose | None, q: np.ndarray) -> dict[str, np.ndarray]:
+        """See `Target.fields`."""
+        message, frame = self._sensors.sight()
+        if frame and palm and np.isfinite(q).all():
+            self._eye.look(message, down @ frame, down @ palm, q)
+        points = self._eye.points
+        self._sensors.unseen = self._eye.seen if points is None else ""
+        if frame is None or points is None:
+            return {"cloud": np.full((1, 3), np.nan)}
+        return {"cloud": points} | ({"surface_avoid": labelled(points, *self._first)} if self._first else {})
 
-    def _frame(self, name: str) -> Pose | None:
-        """A frame in the world; None if no chain of fresh transforms leads there."""
-        pose = Pose(np.zeros(3), Rotation.identity())
-        for _ in range(len(self._frames) + 1):
-            if name in ("", self._world):
-                return pose
-            name, own, when = self._frames.get(name, (name, pose, -np.inf))
-            if time.monotonic() - when > self._ages["tf"]:
-                return None
-            pose = own @ pose
-        return None
+    def request(self, fields: dict[str, np.ndarray]) -> congrasp.GraspRequest:
+        """See `Target.request`."""
+        points = fields["cloud"]
+        request = self._read(seen_object(points), points.mean(0))
+        self._first = None if request.avoid is None else (points, request.avoid)
+        return dataclasses.replace(request, cloud=points)
 
 
 class PolicyNode:
     """Commands of a guarded policy for what the topics say."""
 
-    def __init__(self, bus: Bus, guard: congrasp.Guard, sensors: Sensors, request: congrasp.GraspRequest, plan: "Plan"):
-        """Args: the request lacks where all is."""
-        self._bus, self._guard, self._sensors, self._request, self._plan = bus, guard, sensors, request, plan
+    def __init__(self, bus: Bus, guard: congrasp.Guard, sensors: Sensors, target: Target, plan: "Plan"):
+        self._bus, self._guard, self._sensors, self._target, self._plan = bus, guard, sensors, target, plan
         self._base: Pose | None = None
         self._followed = 0
 
@@ -209,21 +181,20 @@ class PolicyNode:
         """Reads the topics and commands; None until the episode has begun."""
         sensors = self._sensors
         sensors.take(self._bus.receive())
-        (q, velocity), palm, thing = sensors.joints(), sensors.palm(), sensors.object()
+        (q, velocity), palm = sensors.joints(), sensors.palm()
+        down = Pose(-self._plan.rise(self._followed), Rotation.identity())  # the policy rises with the hand
+        seen = self._target.fields(down, palm, q)
         if self._base is None:
-            if palm is None or thing is None or not np.isfinite(q).all():
+            if palm is None or not all(np.isfinite(x).all() for x in (q, *seen.values())):
                 return None
             self._base = palm
-            self._guard.reset(dataclasses.replace(self._request, q=q, wrist=palm.arrays(), object_pose=thing.arrays()))
-        state = {"q": q, "table": np.asarray(self._followed < self._plan.approach_steps)}
+            self._guard.reset(dataclasses.replace(self._target.request(seen), q=q, wrist=palm.arrays()))
+        state = {"q": q, "table": np.asarray(self._followed < self._plan.approach_steps), **seen}
         if np.isfinite(velocity).all():
             state["q_velocity"] = velocity
-        down = Pose(-self._plan.rise(self._followed), Rotation.identity())  # the policy rises with the hand
         if palm is not None:
-            seen = self._base.inverse() @ down @ palm
-            state["u"] = np.append(seen.position, seen.rotation.as_euler("XYZ"))
-        if thing is not None:
-            state["object_position"], state["object_quaternion"] = (down @ thing).arrays()
+            moved = self._base.inverse() @ down @ palm
+            state["u"] = np.append(moved.position, moved.rotation.as_euler("XYZ"))
         command = self._guard.step(state)
         if not self._plan.dry_run:
             self._publish(command, down)
@@ -270,43 +241,32 @@ class Plan:
         return np.array([0.0, 0.0, self.lift * share**2 * (3.0 - 2.0 * share)])
 
 
-def stamped(header: Any) -> float:
-    """When a message was stamped, by `time.monotonic`; now without a stamp, or with one that is yet to come."""
-    stamp = header.stamp.sec + 1e-9 * header.stamp.nanosec
-    return time.monotonic() - (max(time.time() - stamp, 0.0) if stamp else 0.0)
-
-
-def read_pose(place: Any, turn: Any) -> Pose | None:
-    """The pose of a message's vector and quaternion; None if it is none."""
-    position, quaternion = np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w])
-    if not (np.isfinite(position).all() and 0.5 < np.linalg.norm(quaternion) < 2.0):
-        return None
-    return Pose(position, Rotation.from_quat(quaternion))
-
-
-def offset_of(text: str) -> Pose:
-    """The pose of X Y Z ROLL PITCH YAW, metres and degrees."""
-    try:
-        x, y, z, *angles = map(float, text.split())
-        return Pose(np.array([x, y, z]), Rotation.from_euler("xyz", angles, degrees=True))
-    except ValueError:
-        raise congrasp.CongraspError(f"'{text}' is no offset.", "Write X Y Z ROLL PITCH YAW: 0 0 0.1 0 0 90.") from None
-
-
-def joints_of(pairs: tuple[str, ...], joints: list[str]) -> dict[str, str]:
-    """The robot's names of the hand's joints, from HAND=ROBOT."""
-    renamed = {hand: robot for hand, _, robot in (pair.partition("=") for pair in pairs)}
-    for hand, robot in renamed.items():
-        if hand not in joints or not robot:
-            raise congrasp.CongraspError(
-                f"--joint-map has '{hand}={robot}'.", f"Write HAND=ROBOT; the hand's are {', '.join(joints)}."
-            )
-    return renamed
-
-
 def slowed(limits: congrasp.JointLimits, share: float) -> congrasp.JointLimits:
     """Limits of a hand that does everything at a share of the speed."""
     return dataclasses.replace(limits, speed=limits.speed * share, acceleration=limits.acceleration * share**2)
+
+
+def target_of(arguments: Arguments, sensors: Sensors, hand: Hand, described: dict[str, Any]) -> Target:
+    """The object, as a policy with this metadata observes it."""
+    camera = described["observation"] == "camera"
+    if camera != bool(arguments.cloud_topic) or camera == bool(arguments.object):
+        raise congrasp.CongraspError(
+            f"The server's policy observes {'a point cloud' if camera else 'the pose of an object'}.",
+            "Set --cloud-topic and name no object." if camera else "Name an object and leave out --cloud-topic.",
+        )
+
+    def read(obj: GraspObject, middle: np.ndarray) -> congrasp.GraspRequest:
+        """The constraints on an object; by default the hand comes down to its middle (3,)."""
+        request = read_request(obj, hand, described["trajectory_points"], **dataclasses.asdict(arguments.constraint))
+        default = {"position": middle, "direction": np.array([0.0, 0.0, -1.0])}
+        heading = {**default, **request.constraints["heading"]}
+        return dataclasses.replace(request, constraints={**request.constraints, "heading": heading})
+
+    if camera:
+        return Pictured(sensors, Eye(hand, described["surface_points"], arguments.box), read)
+    obj = find_object(arguments.object)
+    request = dataclasses.replace(read(obj, np.zeros(3)), surface=obj.points)
+    return Tracked(sensors, request, np.asarray(obj.origin))
 
 
 def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described: dict[str, Any]) -> None:
@@ -314,25 +274,17 @@ def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described
     slow = arguments.slow
     if described["limits"] is None:
         raise congrasp.CongraspError(f"Joints of the hand '{arguments.hand}' share motors.", "This node is for others.")
-    if described["observation"] == "camera":
-        raise congrasp.CongraspError(
-            "The server's policy observes a point cloud, this node an object's pose.",
-            "Serve the hand's other policy or a student, or see examples/depth_grasp.py.",
-        )
-    obj, period = find_object(arguments.object), described["period"] / slow
-    hand, waypoints = get_hand(arguments.hand), described["trajectory_points"]
-    request = read_request(obj, hand, waypoints, **dataclasses.asdict(arguments.constraint))
-    heading = {"position": np.zeros(3), "direction": np.array([0.0, 0.0, -1.0]), **request.constraints["heading"]}
-    constraints = {**request.constraints, "heading": heading}
-    request = dataclasses.replace(request, constraints=constraints, surface=obj.points)
-    object_age = arguments.object_age or (TRACKER_AGE if described["observation"] == "tracked" else arguments.robot_age)
-    sensors = Sensors(arguments, described["joints"], np.asarray(obj.origin), object_age)
+    period, hand = described["period"] / slow, get_hand(arguments.hand)
+    student = described["observation"] in ("tracked", "camera")
+    object_age = arguments.object_age or (TRACKER_AGE if student else arguments.robot_age)
+    sensors = Sensors(arguments, described["joints"], object_age)
+    target = target_of(arguments, sensors, hand, described)
     steps = round(arguments.approach / described["period"]) or described["approach_steps"]
     plan = Plan(arguments.world, steps, arguments.lift, LIFT_SPEED * described["period"], arguments.dry_run)
     limits = slowed(congrasp.JointLimits(**described["limits"]), slow)
     times = {"period": period, "wait": 0.6 * period, "stale": arguments.stale / slow, "hold": arguments.hold / slow}
     with congrasp.Guard(client, limits, np.array(described["open_pose"]), fallback="open", **times) as guard:
-        node, ticker, printed = PolicyNode(bus, guard, sensors, request, plan), congrasp.Ticker(1.0 / period), ""
+        node, ticker, printed = PolicyNode(bus, guard, sensors, target, plan), congrasp.Ticker(1.0 / period), ""
         begin = last = ticker.wait()
         try:
             while True:
@@ -363,7 +315,9 @@ def main() -> int:
     if not 0.0 < arguments.slow <= 1.0 or not 0.0 <= arguments.lift <= 0.3:
         raise congrasp.CongraspError("--slow is above 0 and at most 1, --lift from 0 to 0.3 m.")
     with contextlib.ExitStack() as stack:
-        bus: Bus = stack.enter_context(contextlib.closing(ZenohBus(arguments.zenoh) if arguments.zenoh else RosBus()))
+        inputs = {**INPUTS, **({arguments.cloud_topic: CLOUD} if arguments.cloud_topic else {})}
+        made = ZenohBus(arguments.zenoh, inputs) if arguments.zenoh else RosBus(inputs)
+        bus: Bus = stack.enter_context(contextlib.closing(made))
         with announced(f"Waiting for the policy server at {arguments.connect}", first=WAITING):
             client = stack.enter_context(
                 congrasp.PolicyClient(

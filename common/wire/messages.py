@@ -104,6 +104,7 @@ EPISODE = MessageSpec(
         "colour_values": ArraySpec(("uint8",), ("P", 3), optional=True),
         "surface_points": ArraySpec(REAL, ("N", 3)),
         "surface_avoid": ArraySpec(("bool",), ("N",)),
+        "arm/*": ArraySpec((*REAL, *_INDEX, "bool"), None),
     },
     {"hand": str, "object": str, "control_dt": float, "version": int, "actor": str, "success": bool, "metrics": dict},
 )

@@ -1,25 +1,23 @@
-"""Files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, and a picture."""
+"""Files of a motion on an arm: joint trajectories as CSV and as ROS 2's JointTrajectory, picture and video."""
 
+import functools
 import json
 import pathlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
-from congrasp.services.assets.hands.geometry import geom_mesh
+from congrasp.services.export.motion_file import GraspMotion, robot_joints
+from congrasp.services.record.moved_arm import MovedArm
 from congrasp.services.viz.episode import episode_shapes
 from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.render import Film, save_episode_video
 from congrasp.services.viz.scene import Camera, Shape
-from congrasp.services.viz.shapes import fit, object_shape, shape_points
+from congrasp.services.viz.shapes import arm_shapes, fit, shape_points
 from congrasp.services.viz.sheets import save_png
-
-if TYPE_CHECKING:
-    from congrasp.services.arm.planner import ArmMotion
 
 CSV, TRAJECTORY, PICTURE = "arm.csv", "arm_trajectory.json", "arm.png"
 _SIZE = (1280, 960)  # pixels
@@ -28,7 +26,7 @@ _GREY = (0.75, 0.76, 0.78)
 _EDGE, _UNDER = 0.6, 0.001  # table beyond arm and object, and below the grasp's own table, m
 
 
-def save_trajectories(folder: pathlib.Path, motion: "ArmMotion") -> None:
+def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) -> None:
     """Writes the joints of arm and hand at every control step: `arm.csv` and `arm_trajectory.json`.
 
     Angles are in rad, slides in m, times in s. Finger joints are the targets of their servos, which hold the object.
@@ -37,12 +35,13 @@ def save_trajectories(folder: pathlib.Path, motion: "ArmMotion") -> None:
     Raises:
       CongraspError: a file cannot be written.
     """
-    names = [*motion.robot.arm.joints, *motion.hand_joints]
-    joints = np.concatenate([motion.track.q, motion.hand_target], 1)
+    names, joints = robot_joints(motion), motion.joint_target
+    joints = np.clip(joints, motion.joint_limits[:, 0], motion.joint_limits[:, 1])
+    joints = np.concatenate([arm.joint_position, joints], 1)
     lines = [",".join(["time", *names])]
     lines += [",".join(f"{x:.6f}" for x in (time, *row)) for time, row in zip(motion.time, joints, strict=True)]
     write_atomically(folder / CSV, ("\n".join(lines) + "\n").encode())
-    velocities = np.gradient(joints, motion.scene.dt, axis=0)
+    velocities = np.gradient(joints, motion.control_dt, axis=0)
     since = (1e9 * motion.time).round().astype(int).tolist()
     points = [
         {
@@ -52,53 +51,54 @@ def save_trajectories(folder: pathlib.Path, motion: "ArmMotion") -> None:
         }
         for position, velocity, ns in zip(joints, velocities, since, strict=True)
     ]
-    message = {"header": {"frame_id": motion.robot.arm.name}, "joint_names": names, "points": points}
+    message = {"header": {"frame_id": arm.name}, "joint_names": names, "points": points}
     write_atomically(folder / TRAJECTORY, json.dumps(message).encode())
 
 
-def save_picture(path: pathlib.Path, motion: "ArmMotion", episode: Message, step: int) -> None:
+def save_picture(path: pathlib.Path, arm: MovedArm, episode: Message, step: int) -> None:
     """Draws the whole robot with object and table at a control step of its episode, as PNG."""
-    shapes = [*robot_shapes(motion, episode, step), *_grasp_shapes(episode, step)]
-    save_png(path, render_scene(shapes, robot_camera(motion, episode, [step], _SIZE[0] / _SIZE[1]), _SIZE))
+    shapes = [*_robot_shapes(arm, episode, step), *_grasp_shapes(episode, step)]
+    save_png(path, render_scene(shapes, _robot_camera(arm, episode, [step], _SIZE[0] / _SIZE[1]), _SIZE))
 
 
-def robot_camera(motion: "ArmMotion", episode: Message, steps: Sequence[int], aspect: float) -> Camera:
+def save_robot_video(
+    path: pathlib.Path, arm: MovedArm, episode: Message, film: Film, steps: Sequence[int], until: int | None = None
+) -> None:
+    """Writes an MP4 of an episode with the whole robot, from a camera that shows it in all of some control steps.
+
+    Args:
+      path: the file.
+      arm: the arm of the episode.
+      episode: the episode.
+      film: size, frame rate and overlays.
+      steps: control steps that the camera must show.
+      until: see `save_episode_video`.
+
+    Raises:
+      CongraspError: see `save_episode_video`.
+    """
+    camera = _robot_camera(arm, episode, steps, film.size[0] / film.size[1])
+    around = functools.partial(_robot_shapes, arm, episode)
+    save_episode_video(path, episode, film, camera, until=until, around=around)
+
+
+def _robot_camera(arm: MovedArm, episode: Message, steps: Sequence[int], aspect: float) -> Camera:
     """Returns a camera that shows the whole robot and the object in all of the control steps."""
-    shapes = [shape for step in steps for shape in (*_arm_shapes(motion, step), *_grasp_shapes(episode, step))]
+    shapes = [shape for step in steps for shape in (*arm_shapes(arm, step), *_grasp_shapes(episode, step))]
     points = np.concatenate([shape_points(shape) for shape in shapes])
-    return fit(points, motion.world_base.rotation.apply(_AHEAD), aspect)
+    base = Rotation.from_quat(arm.link_quaternion[0, 0], scalar_first=True)
+    return fit(points, base.apply(_AHEAD), aspect)
 
 
-def robot_shapes(motion: "ArmMotion", episode: Message, step: int) -> list[Shape]:
+def _robot_shapes(arm: MovedArm, episode: Message, step: int) -> list[Shape]:
     """Returns the arm at a control step of its episode and the table on which arm and object stand."""
-    ends = motion.world_base.position[:2], episode.arrays["object_position"][0][:2]
+    ends = arm.link_position[0, 0, :2], episode.arrays["object_position"][0][:2]
     radius = float(np.linalg.norm(ends[0] - ends[1])) / 2 + _EDGE
     middle = np.array([*np.mean(ends, axis=0), -_UNDER])
     table = Shape("table", (radius, 0.0), _GREY, middle, shine=0.0, shadow=False)
-    return [*_arm_shapes(motion, step), table]
+    return [*arm_shapes(arm, step), table]
 
 
 def _grasp_shapes(episode: Message, step: int) -> list[Shape]:
     """Returns hand and object without the table of the hand alone."""
     return [shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "table"]
-
-
-def _arm_shapes(motion: "ArmMotion", step: int) -> list[Shape]:
-    """Returns the visual shapes of the arm at a control step, world frame."""
-    robot, scene, base = motion.robot, motion.scene, motion.world_base
-    data = mujoco.MjData(robot.model)
-    q = robot.model.qpos0.copy()
-    q[robot.joints], q[robot.fingers] = motion.track.q[step], scene.q[step]
-    robot.place(data, q, scene.object_position[step], scene.object_quaternion[step], scene.table[step])
-    shapes = []
-    for g in robot.drawn():
-        mesh = geom_mesh(robot.model, g)
-        if mesh is None:
-            continue
-        turn = base.rotation * Rotation.from_matrix(data.geom_xmat[g].reshape(3, 3))
-        material = robot.model.geom_matid[g]
-        red, green, blue, _ = (robot.model.mat_rgba[material] if material >= 0 else robot.model.geom_rgba[g]).tolist()
-        place, quaternion = base.rotation.apply(data.geom_xpos[g]) + base.position, turn.as_quat(scalar_first=True)
-        both = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-        shapes.append(object_shape(both, place, quaternion, colour=(red, green, blue)))
-    return shapes

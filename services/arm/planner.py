@@ -1,4 +1,4 @@
-"""Grasp motions on an arm: the joints of arm and hand, or the limit that forbids a motion."""
+"""Grasp motions on an arm: the arm along the motion, or the limit that forbids it."""
 
 import dataclasses
 import hashlib
@@ -11,9 +11,12 @@ from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.arm.description import arm_file, load_arm
+from congrasp.services.arm.links import moved_arm
 from congrasp.services.arm.options import ArmOptions
 from congrasp.services.arm.robot import Pose, Robot, build_robot, default_mount
+from congrasp.services.export.frames import NOT_LINKS
 from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.record.moved_arm import MovedArm
 
 try:
     from congrasp.services.arm.tracking import Path, Track, follow
@@ -25,32 +28,24 @@ _FAR_BELOW = -10.0  # m, of a table that was removed
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ArmMotion:
-    """A grasp motion of T control steps on an arm of N joints."""
+    """An arm along a grasp motion."""
 
-    robot: Robot
+    moved: MovedArm
     base: Pose
     """Relative to the object on the table."""
-    world_base: Pose
     track: Track
-    time: np.ndarray
-    """(T,) s."""
-    hand_joints: tuple[str, ...]
-    """F names."""
-    hand_target: np.ndarray
-    """(T, F) targets of the finger servos, rad."""
-    scene: Path
 
     def facts(self) -> dict[str, Any]:
         """Arm, base, errors and shares of the limits, for `result.json`."""
         yaw = float(self.base.rotation.as_euler("xyz", degrees=True)[2])
         fastest = int(self.track.speed.argmax())
         return {
-            "arm": self.robot.arm.name,
+            "arm": self.moved.name,
             "arm_base": [*(round(float(x), 6) for x in self.base.position), round(yaw, 6)],
             "arm_error_mm": 1e3 * self.track.position_error,
             "arm_error_deg": float(np.degrees(self.track.rotation_error)),
             "arm_speed_share": float(self.track.speed[fastest]),
-            "arm_speed_joint": self.robot.arm.joints[fastest],
+            "arm_speed_joint": str(self.moved.joint_names[fastest]),
             "arm_acceleration": float(self.track.acceleration.max()),
         }
 
@@ -109,12 +104,9 @@ class ArmPlanner:
         robot = self._robot[1]
         start = motion.object_position[0].astype(float) * [1.0, 1.0, 0.0]
         base = dataclasses.replace(self._base, position=self._base.position + start)
-        path = _path(motion, base)
-        track = follow(robot, path, np.random.default_rng(self._seed))
-        taken = {*self._arm.joints}
-        names = tuple(f"hand_{name}" if name in taken else name for name in motion.joint_names.tolist())
-        target = np.clip(motion.joint_target, motion.joint_limits[:, 0], motion.joint_limits[:, 1])
-        return ArmMotion(robot, self._base, base, track, motion.time, names, target, path)
+        track = follow(robot, _path(motion, base), np.random.default_rng(self._seed))
+        arm = moved_arm(robot, track.q, base, self._mount, {*motion.link_names.tolist(), *NOT_LINKS})
+        return ArmMotion(arm, self._base, track)
 
 
 def _path(motion: GraspMotion, base: Pose) -> Path:

@@ -68,12 +68,11 @@ class Robot:
             return {_TABLE: "the table", _OBJECT: "the object"}[name]
         return "the hand" if name.startswith(_HAND) else "the base" if name == "world" else name
 
-    def drawn(self) -> list[int]:
-        """Geoms of the arm for pictures: visual ones, or collision geoms of a body without any."""
-        own = [self.model.body(i).name for i in self.model.geom_bodyid]
-        geoms = [g for g, name in enumerate(own) if name not in (_TABLE, _OBJECT) and not name.startswith(_HAND)]
-        visual = {self.model.geom_bodyid[g] for g in geoms if not self.model.geom_contype[g]}
-        return [g for g in geoms if not self.model.geom_contype[g] or self.model.geom_bodyid[g] not in visual]
+    @property
+    def links(self) -> list[int]:
+        """Bodies of the arm, the base first."""
+        names = [self.model.body(i).name for i in range(self.model.nbody)]
+        return [i for i, name in enumerate(names) if name not in (_TABLE, _OBJECT) and not name.startswith(_HAND)]
 
 
 def _scene_last(name: str) -> bool:

@@ -182,8 +182,8 @@ class _Solver:
         path, robot = self.path, self.robot
         q = np.zeros((len(path.position), len(start)))
         q[0] = start
-        worst = np.zeros(2)
         self.configuration.update(self.whole(start, 0))
+        worst = np.array(self.errors(path.position[0], path.rotation[0]))
         for t in range(1, len(q)):
             self.aim(t)
             velocity = mink.solve_ik(

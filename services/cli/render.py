@@ -5,6 +5,8 @@ from typing import Annotated
 
 import tyro
 
+_FRAMED = 10  # steps from one that the camera of a robot must hold to the next
+
 
 def hand(hand: str = "human", out: pathlib.Path = pathlib.Path("hand.png")) -> int:
     """Draw a hand open, half closed and closed, from three sides.
@@ -48,6 +50,8 @@ def episode(
       congrasp render episode runs/mine --success
       congrasp render episode runs/mine --index 0 --video grasp.mp4
     """
+    from congrasp.services.arm.files import save_robot_video
+    from congrasp.services.record.moved_arm import arm_of_episode
     from congrasp.services.record.reader import pick_episode
     from congrasp.services.viz.render import Film, episode_sheet, save_episode_video
     from congrasp.services.viz.sheets import save_png
@@ -56,7 +60,11 @@ def episode(
     save_png(out, episode_sheet(chosen, frames=frames))
     print(out)
     if video is not None:
-        save_episode_video(video, chosen, Film(overlays=True))
+        film = Film(overlays=True)
+        if arm := arm_of_episode(chosen):
+            save_robot_video(video, arm, chosen, film, range(0, len(chosen.arrays["table"]), _FRAMED))
+        else:
+            save_episode_video(video, chosen, film)
         print(video)
     return 0
 

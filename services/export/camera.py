@@ -1,4 +1,4 @@
-"""Video of motions from a fixed camera: hand, object and table, without simulation-only elements."""
+"""Video of motions from a fixed camera: hand, arm, object and table, without simulation-only elements."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +14,7 @@ from congrasp.services.export.frames import skin_of_motion
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.scene import Camera, Shape
-from congrasp.services.viz.shapes import fit, object_shape, skin_shape, table_shape
+from congrasp.services.viz.shapes import arm_shapes, fit, object_shape, skin_shape, table_shape
 
 SIZE = (320, 240)
 """Width and height in pixels."""
@@ -61,10 +61,11 @@ def calibration(camera: Camera) -> dict[str, Any]:
 
 
 def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
-    """Shapes of the hand, the object, and the table while it is present."""
+    """Shapes of the hand, the object, the arm, and the table while it is present."""
     hand = skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
     own = motion.colours
     mesh = motion.object_vertices, motion.object_faces
     paint = None if own is None else (own.points, own.values / 255)
     thing = object_shape(mesh, motion.object_position[frame], motion.object_quaternion[frame], paint)
-    return [hand, thing, *([table_shape(motion.object_position[0])] if motion.table[frame] else [])]
+    arm = arm_shapes(motion.arm, frame) if motion.arm else []
+    return [hand, thing, *arm, *([table_shape(motion.object_position[0])] if motion.table[frame] else [])]

@@ -16,11 +16,14 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.painting import painted
 from congrasp.services.export.motion_file import GraspMotion, hand_arrays
 from congrasp.services.record import palette
+from congrasp.services.record.moved_arm import Mesh
 
 OBJECT = "object"
 """Name of the object's frame; the others have the names of the links."""
 SKIN = "skin"
 """Name of the hand's surface."""
+NOT_LINKS = (OBJECT, SKIN, "world")
+"""Names that links of arms must not have."""
 COLOURS = {**palette.MATERIALS, OBJECT: palette.OBJECT}
 """Of the materials of hands, and of the object."""
 TOLERANCE_MM = 0.1
@@ -44,12 +47,12 @@ class Track(NamedTuple):
     """(T,) s, from zero."""
     poses: dict[str, np.ndarray]
     """(T, 4, 4) frame to world of every link and the object; metres, z up."""
-    triangles: np.ndarray | None = None
-    """(E, 3, 3) corners of the object's mesh in its frame, where the format has meshes."""
+    triangles: dict[str, np.ndarray] | None = None
+    """(E, 3, 3) corners of the meshes of object and arm links in their frames, where the format has meshes."""
 
 
 class Body(NamedTuple):
-    """A link, or the object, in its parent's frame."""
+    """A link of hand or arm, or the object, in its parent's frame."""
 
     name: str
     parent: int
@@ -122,11 +125,23 @@ def _same_hand(motion: GraspMotion, hand: Hand) -> bool:
 
 
 def bodies(motion: GraspMotion) -> list[Body]:
-    """Links in their order, each after its parent, and the object last."""
-    turns = [Rotation.from_quat(q, scalar_first=True) for q in motion.link_quaternion.swapaxes(0, 1).astype(float)]
-    places = motion.link_position.swapaxes(0, 1).astype(float)
+    """Links of the hand in their order, each after its parent, the object, and the links of the arm."""
+    found = _nested(motion.link_names, motion.link_parent, motion.link_position, motion.link_quaternion)
+    turn = Rotation.from_quat(motion.object_quaternion, scalar_first=True)
+    found.append(Body(OBJECT, -1, motion.object_position.astype(float), turn))
+    if arm := motion.arm:
+        first = len(found)
+        links = _nested(arm.link_names, arm.link_parent, arm.link_position, arm.link_quaternion)
+        found += [link._replace(parent=link.parent + first if link.parent >= 0 else -1) for link in links]
+    return found
+
+
+def _nested(names: np.ndarray, parents: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> list[Body]:
+    """Links in their parents' frames, from poses (T, L, 3) and (T, L, 4) in the world."""
+    turns = [Rotation.from_quat(q, scalar_first=True) for q in quaternion.swapaxes(0, 1).astype(float)]
+    places = position.swapaxes(0, 1).astype(float)
     found = []
-    for i, (name, parent) in enumerate(zip(motion.link_names, motion.link_parent, strict=True)):
+    for i, (name, parent) in enumerate(zip(names, parents, strict=True)):
         place, turn = places[i], turns[i]
         if parent >= 0:
             inverse = turns[parent].inv()
@@ -134,8 +149,7 @@ def bodies(motion: GraspMotion) -> list[Body]:
             middle = (place.min(0) + place.max(0)) / 2
             place = middle[None] if np.abs(place - middle).max() < _STILL else place
         found.append(Body(str(name), int(parent), place, turn))
-    turn = Rotation.from_quat(motion.object_quaternion, scalar_first=True)
-    return [*found, Body(OBJECT, -1, motion.object_position.astype(float), turn)]
+    return found
 
 
 def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
@@ -148,17 +162,17 @@ def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
 def error_mm(motion: GraspMotion, track: Track) -> float:
     """Largest distance in mm between points of the motion and of the file.
 
-    The points are each frame's origin and three a decimetre away along its axes, at every time, and the object's
-    triangles in its frame.
+    The points are each frame's origin and three a decimetre away along its axes, at every time, and the triangles of
+    object and arm in their frames.
 
     Raises:
       CongraspError: the file has other bodies or times than the motion.
     """
-    turns = Rotation.from_quat(motion.link_quaternion.reshape(-1, 4), scalar_first=True)
-    links = pose_matrices(motion.link_position.reshape(-1, 3), turns).reshape(*motion.link_position.shape[:2], 4, 4)
-    expected = dict(zip(map(str, motion.link_names), links.swapaxes(0, 1), strict=True))
+    expected = _world_poses(motion.link_names, motion.link_position, motion.link_quaternion)
     turns = Rotation.from_quat(motion.object_quaternion, scalar_first=True)
     expected[OBJECT] = pose_matrices(motion.object_position, turns)
+    if arm := motion.arm:
+        expected |= _world_poses(arm.link_names, arm.link_position, arm.link_quaternion)
     if odd := sorted(expected.keys() ^ track.poses.keys()):
         raise CongraspError(f"The file lacks or should not have the frame '{odd[0]}'.")
     if track.time.shape != motion.time.shape or np.abs(track.time - motion.time).max() > _SAME_TIME:
@@ -168,18 +182,48 @@ def error_mm(motion: GraspMotion, track: Track) -> float:
     distances = [np.linalg.norm(((expected[name] - track.poses[name]) @ points)[:, :3], axis=1) for name in expected]
     worst = max(float(distance.max()) for distance in distances)
     if track.triangles is not None:
-        corners = motion.object_vertices[motion.object_faces]
-        if motion.colours and track.triangles.shape != corners.shape:
-            vertices, faces, _ = object_mesh(motion)
-            corners = vertices[faces]
-        if track.triangles.shape != corners.shape:
-            raise CongraspError("The file's mesh has other triangles than the object.")
-        worst = max(worst, float(np.linalg.norm(track.triangles - corners, axis=-1).max()))
+        meshes = _triangles(motion, track.triangles[OBJECT].shape)
+        if {name: mesh.shape for name, mesh in meshes.items()} != {n: m.shape for n, m in track.triangles.items()}:
+            raise CongraspError("The file's meshes have other triangles than the motion's.")
+        apart = (np.linalg.norm(track.triangles[name] - mesh, axis=-1).max() for name, mesh in meshes.items())
+        worst = max(worst, *map(float, apart))
     return 1000 * worst
+
+
+def _world_poses(names: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> dict[str, np.ndarray]:
+    """(T, 4, 4) of each link, from (T, L, 3) and (T, L, 4)."""
+    turns = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
+    poses = pose_matrices(position.reshape(-1, 3), turns).reshape(*position.shape[:2], 4, 4)
+    return dict(zip(map(str, names), poses.swapaxes(0, 1), strict=True))
+
+
+def _triangles(motion: GraspMotion, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """(E, 3, 3) corners of the meshes of object and arm links in their frames.
+
+    The object's mesh is the one cut for its colours, if that has the shape.
+    """
+    corners = motion.object_vertices[motion.object_faces]
+    if motion.colours and corners.shape != shape:
+        vertices, faces, _ = object_mesh(motion)
+        corners = vertices[faces]
+    found = {OBJECT: corners}
+    for name, parts in arm_meshes(motion).items():
+        found[name] = np.concatenate([part.vertices[part.faces] for part in parts])
+    return found
+
+
+def arm_meshes(motion: GraspMotion) -> dict[str, list[Mesh]]:
+    """Meshes of each link of the arm that has any; empty without an arm."""
+    found: dict[str, list[Mesh]] = {}
+    if arm := motion.arm:
+        for mesh in arm.meshes():
+            found.setdefault(str(arm.link_names[mesh.link]), []).append(mesh)
+    return found
 
 
 def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dict[str, Any]:
     """Metadata of every file: origin of the motion, and meaning of its numbers in this format."""
+    arm = motion.arm
     return {
         "generator": "congrasp",
         "hand": motion.hand,
@@ -192,6 +236,11 @@ def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dic
         "quaternion": quaternion,
         "joints": motion.joint_names.tolist(),
         "links": motion.link_names.tolist(),
+        **(
+            {"arm": arm.name, "arm_joints": arm.joint_names.tolist(), "arm_links": arm.link_names.tolist()}
+            if arm
+            else {}
+        ),
     }
 
 

@@ -1,8 +1,8 @@
 """Binary glTF 2.0 with an animation; written by pygltflib, read back as the standard says and, its meshes, by trimesh.
 
-One node a link, nested as the hand is, with translation and rotation (glTF forbids matrices on animated nodes); these
-are the joints of a skin, by which the hand's surface follows them. glTF is y-up: a root node turns the world, so that
-everything below it keeps congrasp's z-up coordinates.
+One node a link, nested as hand and arm are, with translation and rotation (glTF forbids matrices on animated nodes).
+The hand's are the joints of a skin, by which its surface follows them; the arm's have meshes. glTF is y-up: a root node
+turns the world, so that everything below it keeps congrasp's z-up coordinates.
 """
 
 import json
@@ -23,6 +23,7 @@ from congrasp.services.export.frames import (
     SKIN,
     TO_Y_UP,
     Track,
+    arm_meshes,
     bodies,
     facts,
     object_mesh,
@@ -31,6 +32,9 @@ from congrasp.services.export.frames import (
 )
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.export.unwrap import unwrapped
+from congrasp.services.record.moved_arm import Mesh
+from congrasp.services.viz.kernels import GAMMA
+from congrasp.services.viz.triangles import smooth_corners
 
 _KINDS = {1: gltf.SCALAR, 2: gltf.VEC2, 3: gltf.VEC3, 4: gltf.VEC4, 16: gltf.MAT4}
 
@@ -42,7 +46,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     about = facts(motion, frame="this node's frame: z up", unit="m", quaternion="x, y, z, w")
     file.asset.generator = "congrasp"
     file.nodes.append(gltf.Node(name="world", rotation=TO_Y_UP.as_quat().tolist(), extras=about))
-    skin = skin_of_motion(motion)
+    skin, arm = skin_of_motion(motion), arm_meshes(motion)
     for name in (*skin.parts(), OBJECT):
         surface = gltf.PbrMetallicRoughness(baseColorFactor=[*COLOURS[name], 1.0], metallicFactor=0.0)
         file.materials.append(gltf.Material(name=name, pbrMetallicRoughness=surface))
@@ -55,6 +59,9 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         if body.name == OBJECT:
             node.mesh = len(file.meshes)
             file.meshes.append(gltf.Mesh(name=OBJECT, primitives=[_primitive(file, data, *object_mesh(motion))]))
+        elif body.name in arm:
+            node.mesh = len(file.meshes)
+            file.meshes.append(gltf.Mesh(name=body.name, primitives=[_part(file, data, m) for m in arm[body.name]]))
         tracks = {"rotation": continuous(body.rotation.as_quat(scalar_first=False))}
         if len(body.translation) > 1:
             tracks["translation"] = body.translation
@@ -121,6 +128,23 @@ def _primitive(
     return gltf.Primitive(attributes=attributes, indices=indices, material=len(file.materials) - 1)
 
 
+def _part(file: gltf.GLTF2, data: bytearray, mesh: Mesh) -> gltf.Primitive:
+    """A mesh of an arm's link, with sharp edges and a material of its own."""
+    corners, (_, normals) = mesh.faces.ravel(), smooth_corners(mesh.vertices, mesh.faces)
+    normals = normals.reshape(-1, 3)
+    keys = np.column_stack([corners, normals.round(3)])
+    _, first, faces = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    linear = [*(np.array(mesh.colour) ** GAMMA).tolist(), 1.0]
+    surface = gltf.PbrMetallicRoughness(baseColorFactor=linear, metallicFactor=0.0, roughnessFactor=0.5)
+    file.materials.append(gltf.Material(name="arm", pbrMetallicRoughness=surface))
+    attributes = gltf.Attributes(
+        POSITION=_add(file, data, mesh.vertices[corners[first]], gltf.ARRAY_BUFFER, bounds=True),
+        NORMAL=_add(file, data, normals[first], gltf.ARRAY_BUFFER),
+    )
+    indices = _add(file, data, faces.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
+    return gltf.Primitive(attributes=attributes, indices=indices, material=len(file.materials) - 1)
+
+
 def _add_skin(file: gltf.GLTF2, data: bytearray, skin: Skin) -> None:
     """Adds the hand's surface as a node of its own, whose skin has the links' nodes (from 1 on) as joints."""
     flat = unwrapped(skin.points, skin.faces)
@@ -147,7 +171,7 @@ def _add_skin(file: gltf.GLTF2, data: bytearray, skin: Skin) -> None:
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """The first animation at its keyframes, by the standard's layout, and the object's mesh as trimesh loads it."""
+    """The first animation at its keyframes, by the standard's layout, and the meshes as trimesh loads them."""
     content = path.read_bytes()
     size = int.from_bytes(content[12:16], "little")
     document, blob = json.loads(content[20 : 20 + size]), content[28 + size :]
@@ -186,5 +210,5 @@ def read(path: pathlib.Path) -> list[Track]:
         if "skin" not in nodes[root]:
             visit(root, FROM_Y_UP)
     del poses["world"]
-    mesh = trimesh.load_scene(path, process=False).geometry[OBJECT]
-    return [Track(time, poses, np.asarray(mesh.triangles))]
+    meshes = trimesh.load_scene(path, process=False, merge_primitives=True).geometry
+    return [Track(time, poses, {name: np.asarray(mesh.triangles) for name, mesh in meshes.items() if name != SKIN})]

@@ -1,7 +1,8 @@
 """A LeRobot dataset, version 3.0: one episode a motion; written with pyarrow, read back by its own layout.
 
-`observation.state` is the proprioception (finger joints, then the wrist's pose), `observation.environment_state` the
-object's pose, `action` the finger targets and the wrist's pose one step later. The hand is in `meta/hand.urdf`. With a
+`observation.state` is the proprioception (joints of arm and fingers, then the wrist's pose),
+`observation.environment_state` the object's pose, `action` the arm's joints one step later, the finger targets, and the
+wrist's pose one step later. The hand is in `meta/hand.urdf`, with an arm the whole robot in `meta/robot.urdf`. With a
 camera there is `observation.images.front` too: one MP4 for all episodes, a frame for every row.
 """
 
@@ -19,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.services.export.camera import SIZE, calibration, camera_for, pictures
 from congrasp.services.export.frames import OBJECT, Track, facts, pose_matrices
-from congrasp.services.export.motion_file import GraspMotion
-from congrasp.services.export.urdf import forward_kinematics, hand_urdf
+from congrasp.services.export.motion_file import GraspMotion, robot_joints
+from congrasp.services.export.urdf import forward_kinematics, robot_urdf
 from congrasp.services.viz.scene import Camera
 from congrasp.services.viz.sheets import save_video
 
@@ -44,9 +45,9 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
     if abs(fps * first.control_dt - 1) > 1e-6:
         raise CongraspError(f"A control step of {first.control_dt} s makes no whole number of frames a second.")
     for motion in motions:
-        if (motion.hand, motion.control_dt) != (first.hand, first.control_dt):
+        if _robot(motion) != _robot(first):
             raise CongraspError(
-                "A dataset has one hand and one control step, but the motions differ.", "Export each set."
+                "A dataset has one robot and one control step, but the motions differ.", "Export each set."
             )
     tasks = list(dict.fromkeys(_task(motion) for motion in motions))
     episodes = [_columns(motion, i, tasks) for i, motion in enumerate(motions)]
@@ -81,11 +82,12 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
         **facts(first, frame="world: z up, table's top at z = 0", unit="m, rad, s", quaternion="qw, qx, qy, qz"),
         "objects": [motion.object for motion in motions],
         "success": [motion.success for motion in motions],
-        "action": "finger targets of the joints' position servos; the wrist's pose one step later",
+        **({"arm_base": [_base(motion) for motion in motions]} if first.arm else {}),
+        "action": "finger targets of the joints' position servos; arm's joints and wrist's pose one step later",
     }
     del about["object"], about["constraints"]
     meta = path / "meta"
-    (meta / "hand.urdf").write_text(hand_urdf(first))
+    (meta / ("robot.urdf" if first.arm else "hand.urdf")).write_text(robot_urdf(first))
     (meta / "congrasp.json").write_text(json.dumps(about, indent=1))
     stats: dict[str, Any] = {name: _statistics(values) for name, values in every.items()}
     info = _info(first, len(motions), int(starts[-1]), len(tasks), fps)
@@ -153,14 +155,32 @@ def _task(motion: GraspMotion) -> str:
     return f"Grasp the object {motion.object} under {' and '.join(motion.constraints)}."
 
 
+def _robot(motion: GraspMotion) -> tuple[Any, ...]:
+    """Identity of the hand, the arm, and the control step."""
+    arm = motion.arm
+    return (
+        motion.hand,
+        motion.control_dt,
+        arm and (arm.name, *arm.joint_names, *arm.hand_position, *arm.hand_quaternion),
+    )
+
+
+def _base(motion: GraspMotion) -> list[float]:
+    """Position and quaternion (7,) of the arm's base in the world."""
+    assert motion.arm is not None
+    return [*motion.arm.link_position[0, 0].tolist(), *motion.arm.link_quaternion[0, 0].tolist()]
+
+
 def _columns(motion: GraspMotion, episode: int, tasks: Sequence[str]) -> dict[str, np.ndarray]:
     """A motion's columns (T, ...) by name."""
     count = len(motion.time)
+    arm = motion.arm.joint_position if motion.arm else np.zeros((count, 0))
     wrist = np.concatenate([motion.wrist_position, motion.wrist_quaternion], 1)
+    later = np.minimum(np.arange(count) + 1, count - 1)
     return {
-        _STATE: np.concatenate([motion.joint_position, wrist], 1).astype(np.float32),
+        _STATE: np.concatenate([arm, motion.joint_position, wrist], 1).astype(np.float32),
         _OBJECT: np.concatenate([motion.object_position, motion.object_quaternion], 1).astype(np.float32),
-        _ACTION: np.concatenate([motion.joint_target, np.concatenate([wrist[1:], wrist[-1:]])], 1).astype(np.float32),
+        _ACTION: np.concatenate([arm[later], motion.joint_target, wrist[later]], 1).astype(np.float32),
         "timestamp": motion.time.astype(np.float32),
         "frame_index": np.arange(count),
         "episode_index": np.full(count, episode),
@@ -208,12 +228,17 @@ def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
 
 def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int) -> dict[str, Any]:
     """Description of the data set: features with their shapes and names, counts, paths of files."""
-    joints = motion.joint_names.tolist()
+    joints, count = robot_joints(motion), len(motion.joint_names)
+    arm, fingers = joints[:-count], joints[-count:]
     wrist = [f"wrist_{name}" for name in _POSE]
     names = {
         _STATE: [*joints, *wrist],
         _OBJECT: [f"object_{name}" for name in _POSE],
-        _ACTION: [*(f"{name}_target" for name in joints), *(f"{name}_next" for name in wrist)],
+        _ACTION: [
+            *(f"{name}_next" for name in arm),
+            *(f"{name}_target" for name in fingers),
+            *(f"{name}_next" for name in wrist),
+        ],
     }
     features: dict[str, Any] = {
         name: {"dtype": "float32", "shape": [len(parts)], "names": parts} for name, parts in names.items()
@@ -222,7 +247,7 @@ def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int)
         features[name] = {"dtype": dtype, "shape": [1], "names": None}
     return {
         "codebase_version": VERSION,
-        "robot_type": f"congrasp_{motion.hand}",
+        "robot_type": "_".join(["congrasp", *([motion.arm.name] if motion.arm else []), motion.hand]),
         "total_episodes": episodes,
         "total_frames": frames,
         "total_tasks": tasks,
@@ -240,26 +265,27 @@ def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int)
 def read(path: pathlib.Path) -> list[Track]:
     """Every episode as the files describe it: features by name, kinematics by the URDF."""
     info = json.loads((path / "meta" / "info.json").read_text())
-    urdf = (path / "meta" / "hand.urdf").read_text()
+    (urdf,) = (file.read_text() for file in (path / "meta").glob("*.urdf"))
+    about = json.loads((path / "meta" / "congrasp.json").read_text())
+    links = [*about["links"], *about.get("arm_links", ())]
     episodes = pq.read_table(path / "meta" / "episodes").to_pylist()
     tracks = []
+    wrist = [f"wrist_{name}" for name in _POSE]
     for episode in sorted(episodes, key=lambda row: row["episode_index"]):
         place = {name: episode[f"data/{name}"] for name in _PLACE}
         table = pq.read_table(path / info["data_path"].format(**place))
         rows = table.filter(pc.equal(table["episode_index"], episode["episode_index"])).sort_by("index")
         state = _named(info, rows, _STATE)
         environment = _named(info, rows, _OBJECT)
-        angles = {name: state[name] for name in state if not name.startswith("wrist_")}
-        poses = forward_kinematics(urdf, angles, _pose(state, "wrist"))
+        angles = {name: state[name] for name in state if name not in wrist}
+        palm = _pose(state, "wrist")
+        bases = about.get("arm_base")
+        base = _matrices(np.array([bases[episode["episode_index"]]])) if bases else palm
+        poses = forward_kinematics(urdf, angles, palm, links[0], base)
         poses[OBJECT] = _pose(environment, "object")
-        kept = {name: pose for name, pose in poses.items() if name in _links(path) or name == OBJECT}
+        kept = {name: pose for name, pose in poses.items() if name in links or name == OBJECT}
         tracks.append(Track(rows["frame_index"].to_numpy() / info["fps"], kept))
     return tracks
-
-
-def _links(path: pathlib.Path) -> list[str]:
-    """Names of the hand's links."""
-    return json.loads((path / "meta" / "congrasp.json").read_text())["links"]
 
 
 def _named(info: Mapping[str, Any], rows: pa.Table, feature: str) -> dict[str, np.ndarray]:
@@ -270,5 +296,9 @@ def _named(info: Mapping[str, Any], rows: pa.Table, feature: str) -> dict[str, n
 
 def _pose(values: Mapping[str, np.ndarray], prefix: str) -> np.ndarray:
     """(T, 4, 4) of the columns with a prefix."""
-    position, quaternion = np.split(np.stack([values[f"{prefix}_{name}"] for name in _POSE], -1), [3], -1)
-    return pose_matrices(position, Rotation.from_quat(quaternion, scalar_first=True))
+    return _matrices(np.stack([values[f"{prefix}_{name}"] for name in _POSE], -1))
+
+
+def _matrices(poses: np.ndarray) -> np.ndarray:
+    """(T, 4, 4) of positions and quaternions (T, 7)."""
+    return pose_matrices(poses[:, :3], Rotation.from_quat(poses[:, 3:], scalar_first=True))

@@ -24,7 +24,9 @@ from congrasp.common.io.npz import read_npz
 from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.wire.codec import Message
+from congrasp.services.record import moved_arm
 from congrasp.services.record.goals import active_constraints
+from congrasp.services.record.moved_arm import MovedArm
 
 FORMAT = 2
 MAX_BYTES = 256 << 20
@@ -88,6 +90,8 @@ class GraspMotion:
     """The object's own, in its frame."""
     goal: dict[str, np.ndarray]
     """Goal arrays of the constraints that the policy knows, by constraint and field: `heading_direction`, `pose_q`."""
+    arm: MovedArm | None = None
+    """The arm that carries the hand, if there is one. Its wrist is off the hand's by the error of its path."""
 
 
 _GOALS = {
@@ -98,12 +102,14 @@ _GOALS = {
 """Meaning of the goal arrays; it begins with the shape, as that of the others does."""
 _HINTS = get_type_hints(GraspMotion, include_extras=True)
 _ARRAYS = {name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")}
-_FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name not in ("goal", "colours"))
+_FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name not in ("goal", "colours", "arm"))
 _POINTS, _VALUES = "object_colour_points", "object_colour_values"
 _COLOURS = {
     _POINTS: "(P, 3) m, object frame, points of the surface whose colours are known",
     _VALUES: "(P, 3) sRGB from 0 to 255 there",
 }
+_OWN = {**_COLOURS, **moved_arm.MEANINGS}
+"""Arrays of motions whose object has colours, or with an arm."""
 
 
 def at_rate(motion: GraspMotion, fps: float) -> GraspMotion:
@@ -119,7 +125,14 @@ def at_rate(motion: GraspMotion, fps: float) -> GraspMotion:
     nearest = np.minimum(np.round(time * own).astype(int), len(motion.time) - 1)
     timed = [name for name, meaning in _ARRAYS.items() if meaning.startswith(("(T,", "(T)"))]
     arrays = {name: getattr(motion, name)[nearest] for name in timed}
-    return dataclasses.replace(motion, **{**arrays, "time": time.astype(motion.time.dtype)}, control_dt=1 / fps)
+    arrays["time"] = time.astype(motion.time.dtype)
+    return dataclasses.replace(motion, **arrays, control_dt=1 / fps, arm=motion.arm and motion.arm.at(nearest))
+
+
+def robot_joints(motion: GraspMotion) -> list[str]:
+    """Returns the names of the arm's joints, if there is an arm, and of the hand's, all different."""
+    arm = motion.arm.joint_names.tolist() if motion.arm else []
+    return [*arm, *(f"hand_{name}" if name in arm else name for name in motion.joint_names.tolist())]
 
 
 def motion_of_episode(episode: Message) -> GraspMotion:
@@ -127,6 +140,9 @@ def motion_of_episode(episode: Message) -> GraspMotion:
     arrays, meta = {name: np.asarray(value) for name, value in episode.arrays.items()}, dict(episode.meta)
     hand = known_hand(meta.pop("hand"))
     dt = float(meta.pop("control_dt"))
+    arm = moved_arm.arm_of_episode(episode)
+    meta.pop("arm", None)
+    of_hand: dict[str, Any] = hand_arrays(hand)
     return GraspMotion(
         hand=hand.name,
         object=file_name(meta.pop("object"), "the object of a motion"),
@@ -150,13 +166,14 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         object_faces=arrays["visual_faces"],
         object_file_origin=np.asarray(meta.pop("object_file_origin", (0.0, 0.0, 0.0)), np.float64),
         object_file_scale=np.asarray(meta.pop("object_file_scale", 1.0), np.float64),
-        **hand_arrays(hand),
+        **of_hand,
         surface_points=arrays["surface_points"],
         surface_avoid=arrays["surface_avoid"].astype(bool),
         colours=Colours(arrays["colour_points"], arrays["colour_values"]) if "colour_values" in arrays else None,
         goal={
             name.removeprefix("goal/"): value for name, value in arrays.items() if name.removeprefix("goal/") in _GOALS
         },
+        arm=arm,
     )
 
 
@@ -184,13 +201,15 @@ def save_motion(path: str | os.PathLike[str], motion: GraspMotion) -> None:
       CongraspError: the file cannot be written.
     """
     own = dict(zip(_COLOURS, motion.colours, strict=True)) if motion.colours else {}
+    own |= motion.arm.arrays() if motion.arm else {}
     meta = {
         "format": FORMAT,
         **{name: getattr(motion, name) for name in _FACTS},
+        **({"arm": motion.arm.name} if motion.arm else {}),
         "units": "m, rad, s, N",
         "quaternions": "(w, x, y, z)",
         "world": "z up, table's top at z = 0",
-        "arrays": {**_ARRAYS, **{name: _COLOURS[name] for name in own}, **{name: _GOALS[name] for name in motion.goal}},
+        "arrays": {**_ARRAYS, **{name: _OWN[name] for name in own}, **{name: _GOALS[name] for name in motion.goal}},
     }
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {**{name: getattr(motion, name) for name in _ARRAYS}, **own, **motion.goal}
@@ -219,7 +238,8 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
         own = _COLOURS if _COLOURS.keys() & arrays.keys() else {}
         _check_arrays({**arrays, **goal}, {**_ARRAYS, **own, **{name: _GOALS[name] for name in goal}})
         colours = Colours(arrays[_POINTS], arrays[_VALUES].astype(np.uint8)) if own else None
-        return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal)
+        arm = moved_arm.arm_of(str(meta["arm"]), arrays, len(arrays["time"])) if "arm" in meta else None
+        return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal, arm=arm)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise CongraspError(f"{path} is not a grasp motion ({str(error)[:200]}).", remedy) from None
 

@@ -1,11 +1,13 @@
 """A ROS 2 bag (MCAP): written by rosbags, read back by mcap and mcap-ros2-support.
 
-Topics: `/robot_description` (URDF), `/joint_trajectory` (all frames, finger joints), `/wrist_trajectory` (all frames,
-the palm in the world), `/joint_states`, `/tf` (frame by frame) and `/object` (a marker with the mesh).
+Topics: `/robot_description` (URDF), `/joint_trajectory` (all frames, joints of arm and fingers), `/wrist_trajectory`
+(all frames, the palm in the world), `/joint_states`, `/tf` (frame by frame), `/object` (a marker with the mesh), `/arm`
+(markers with the meshes of the arm's links, if there is one).
 """
 
 import json
 import pathlib
+import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.painting import nearest
-from congrasp.services.export.frames import COLOURS, OBJECT, Body, Track, bodies, facts, pose_matrices
-from congrasp.services.export.motion_file import GraspMotion
-from congrasp.services.export.urdf import forward_kinematics, hand_urdf
+from congrasp.services.export.frames import COLOURS, OBJECT, Body, Track, arm_meshes, bodies, facts, pose_matrices
+from congrasp.services.export.motion_file import GraspMotion, robot_joints
+from congrasp.services.export.urdf import forward_kinematics, robot_urdf
 
 _WORLD = "world"
 _START = 10**9  # ns; TF takes a stamp of zero for "whenever"
@@ -48,11 +50,26 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
             for stamp, message in zip(stamps, messages, strict=False):
                 bag.write(channel, stamp, store.serialize_cdr(message, kind))
 
-        send("/robot_description", "std_msgs/msg/String", [make("std_msgs/String", data=hand_urdf(motion))], once=True)
+        send("/robot_description", "std_msgs/msg/String", [make("std_msgs/String", data=robot_urdf(motion))], once=True)
         send("/joint_trajectory", "trajectory_msgs/msg/JointTrajectory", [trajectory], once=True)
         path_of_wrist = _wrist_trajectory(make, wrist, since, found[palm].name)
         send("/wrist_trajectory", "trajectory_msgs/msg/MultiDOFJointTrajectory", [path_of_wrist], once=True)
-        send("/object", "visualization_msgs/msg/Marker", [_marker(make, motion)], once=True)
+        corners = motion.object_vertices[motion.object_faces.ravel()]
+        colours = (nearest(corners, motion.colours) / 255).tolist() if motion.colours else []
+        thing = _marker(make, OBJECT, motion.object, 0, corners, COLOURS[OBJECT], colours)
+        send("/object", "visualization_msgs/msg/Marker", [thing], once=True)
+        if arm := motion.arm:
+            parts = [
+                _marker(make, name, arm.name, number, mesh.vertices[mesh.faces.ravel()], mesh.colour)
+                for name, meshes in arm_meshes(motion).items()
+                for number, mesh in enumerate(meshes)
+            ]
+            send(
+                "/arm",
+                "visualization_msgs/msg/MarkerArray",
+                [make("visualization_msgs/MarkerArray", markers=parts)],
+                once=True,
+            )
         send("/joint_states", "sensor_msgs/msg/JointState", states)
         send("/tf", "tf2_msgs/msg/TFMessage", frames)
 
@@ -95,9 +112,10 @@ class _Messages:
 
 
 def _joint_messages(make: _Messages, motion: GraspMotion, since: Sequence[int], root: str) -> tuple[Any, list[Any]]:
-    """The finger joints as one trajectory, and as a state for each frame; `since`: ns from the start."""
-    names = motion.joint_names.tolist()
-    position = motion.joint_position.astype(float)
+    """The joints of arm and fingers as one trajectory, and as a state for each frame; `since`: ns from the start."""
+    names, position = robot_joints(motion), motion.joint_position.astype(float)
+    if motion.arm:
+        position = np.concatenate([motion.arm.joint_position, position], 1)
     velocity = np.gradient(position, motion.control_dt, axis=0) if len(position) > 1 else 0 * position
     points = [
         make(
@@ -161,22 +179,28 @@ def _transforms(make: _Messages, found: Sequence[Body], t: int, stamp: int) -> A
     return make("tf2_msgs/TFMessage", transforms=transforms)
 
 
-def _marker(make: _Messages, motion: GraspMotion) -> Any:
-    """The object's mesh as a marker."""
-    corners = motion.object_vertices[motion.object_faces.ravel()]
-    colours = (nearest(corners, motion.colours) / 255).tolist() if motion.colours else []
+def _marker(
+    make: _Messages,
+    frame: str,
+    namespace: str,
+    number: int,
+    corners: np.ndarray,
+    colour: tuple[float, float, float],
+    colours: Sequence[Sequence[float]] = (),
+) -> Any:
+    """Triangles with corners (3 E, 3) in a frame as a marker, in one colour or those of the corners."""
     upright = make.quaternion((0, 0, 0, 1))
     image = make("sensor_msgs/CompressedImage", header=make.header(0, ""), format="", data=np.zeros(0, np.uint8))
     return make(
         "visualization_msgs/Marker",
-        header=make.header(0, OBJECT),
-        ns=motion.object,
-        id=0,
+        header=make.header(0, frame),
+        ns=namespace,
+        id=number,
         type=11,  # a list of triangles
         action=0,
         pose=make("geometry_msgs/Pose", position=make.vector(np.zeros(3), "Point"), orientation=upright),
         scale=make.vector(np.ones(3)),
-        color=make("std_msgs/ColorRGBA", **dict(zip("rgba", (*COLOURS[OBJECT], 1.0), strict=True))),
+        color=make("std_msgs/ColorRGBA", **dict(zip("rgba", (*colour, 1.0), strict=True))),
         lifetime=make.duration(0),
         frame_locked=True,
         points=[make.vector(corner, "Point") for corner in corners],
@@ -219,16 +243,20 @@ def read(path: pathlib.Path) -> list[Track]:
     (wrist,) = messages["/wrist_trajectory"]
     positions = np.array([list(point.positions) for point in trajectory.points])
     angles = dict(zip(trajectory.joint_names, positions.T, strict=True))
-    base = _poses([point.transforms[0] for point in wrist.points])
-    described = forward_kinematics(messages["/robot_description"][0].data, angles, base)
+    palm = _poses([point.transforms[0] for point in wrist.points])
+    urdf = messages["/robot_description"][0].data
+    root = ET.fromstring(urdf)[0].attrib["name"]
+    described = forward_kinematics(urdf, angles, palm, wrist.joint_names[0], tf[root])
     poses = {name: described.get(name, tf[name]) for name in tf}
     apart = max(float(np.abs(poses[name] - tf[name]).max()) for name in tf)
     if apart > 1e-4:
         raise CongraspError(f"The joint trajectory and TF contradict each other by {apart:.2g}.")
     time = np.array([p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in trajectory.points])
-    (marker,) = messages["/object"]
-    corners = np.array([[p.x, p.y, p.z] for p in marker.points])
-    return [Track(time, poses, corners.reshape(-1, 3, 3))]
+    triangles: dict[str, list[np.ndarray]] = {}
+    for marker in [*messages["/object"], *(m for array in messages.get("/arm", ()) for m in array.markers)]:
+        corners = np.array([[p.x, p.y, p.z] for p in marker.points]).reshape(-1, 3, 3)
+        triangles.setdefault(marker.header.frame_id, []).append(corners)
+    return [Track(time, poses, {name: np.concatenate(parts) for name, parts in triangles.items()})]
 
 
 def _poses(transforms: Sequence[Any]) -> np.ndarray:

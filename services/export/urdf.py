@@ -1,49 +1,117 @@
-"""The hand as URDF, for formats that carry joint angles, and the kinematics that MuJoCo makes of it."""
+"""Hand and arm as URDF, for formats that carry joint angles, and the kinematics that MuJoCo makes of it."""
 
+import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.services.export.frames import capsules, pose_matrices
-from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.export.motion_file import GraspMotion, robot_joints
+from congrasp.services.record.moved_arm import UNLIMITED, MovedArm
 
 _MASS, _INERTIA = "0.01", "1e-6"
 """Of every link: only the kinematics is meant, but some readers refuse a link without."""
+_SPEED = 20.0
+"""Of the hand's joints, rad/s."""
 
 
-def hand_urdf(motion: GraspMotion) -> str:
-    """The hand as URDF; the palm is the root, and links and joints keep their names and frames.
+class _Joint(NamedTuple):
+    """A joint that moves a link."""
 
-    URDF has one joint between two links: a link that several move hangs on links of its name and a number.
+    name: str
+    kind: str
+    """One of the kinds of URDF."""
+    axis: np.ndarray
+    """(3,) unit, link frame."""
+    anchor: np.ndarray
+    """(3,) m, link frame."""
+    limits: np.ndarray
+    """(2,) rad or m."""
+    speed: float
+    """Largest, rad/s or m/s."""
+
+
+def robot_urdf(motion: GraspMotion) -> str:
+    """The hand as URDF, whose palm is the root; with an arm the whole robot, whose root is the arm's base.
+
+    Links and joints keep their names and frames. URDF has one joint between two links: a link that several move hangs
+    on links of its name and a number. Efforts are not those of the robot.
     """
-    robot = ET.Element("robot", name=motion.hand)
-    origins = np.zeros((len(motion.link_names), 3))  # of the links' frames in the wrist frame, all joints at zero
-    for i, name in enumerate(map(str, motion.link_names)):
-        joints = np.flatnonzero(motion.joint_link == i)
-        parent = int(motion.link_parent[i])
-        if len(joints):
-            origins[i] = motion.joint_anchor[joints[0]]
-        if parent >= 0:
-            carrier, place = str(motion.link_names[parent]), origins[parent]
-            for number, j in enumerate(joints):
-                anchor = motion.joint_anchor[j]
-                ends = number == len(joints) - 1 and np.allclose(anchor, origins[i], atol=1e-9)
-                child = name if ends else f"{name}_{number}"
-                joint = _joint(robot, str(motion.joint_names[j]), "revolute", carrier, child, anchor - place)
-                ET.SubElement(joint, "axis", xyz=_numbers(motion.joint_axis[j]))
-                lower, upper = map(_number, motion.joint_limits[j])
-                ET.SubElement(joint, "limit", lower=lower, upper=upper, effort="10", velocity="20")
-                if not ends:
-                    _link(robot, child)
-                carrier, place = child, anchor
-            if carrier != name:
-                _joint(robot, f"{name}_fixed", "fixed", carrier, name, origins[i] - place)
-        _add_capsules(_link(robot, name), motion, i)
+    arm = motion.arm
+    robot = ET.Element("robot", name=f"{arm.name}_{motion.hand}" if arm else motion.hand)
+    if arm:
+        _add_arm(robot, arm)
+        turn = Rotation.from_quat(arm.hand_quaternion, scalar_first=True)
+        carrier, palm = str(arm.link_names[arm.hand_link]), str(motion.link_names[0])
+        _joint(robot, "mount", "fixed", carrier, palm, arm.hand_position, turn)
+    _add_hand(robot, motion)
     ET.indent(robot)
     return ET.tostring(robot, "unicode")
+
+
+def _add_hand(robot: ET.Element, motion: GraspMotion) -> None:
+    """Adds the hand's links. With all joints at zero they are turned as the palm."""
+    names = robot_joints(motion)[-len(motion.joint_names) :]
+    origins = np.zeros((len(motion.link_names), 3))  # of the links' frames in the wrist frame, all joints at zero
+    for i, (name, parent) in enumerate(zip(map(str, motion.link_names), motion.link_parent, strict=True)):
+        moved = np.flatnonzero(motion.joint_link == i)
+        if len(moved):
+            origins[i] = motion.joint_anchor[moved[0]]
+        joints = [
+            _Joint(names[j], "revolute", motion.joint_axis[j], motion.joint_anchor[j] - origins[i], limits, _SPEED)
+            for j, limits in zip(moved, motion.joint_limits[moved], strict=True)
+        ]
+        if parent >= 0:
+            place = origins[i] - origins[parent]
+            _add_link(robot, name, str(motion.link_names[parent]), place, Rotation.identity(), joints)
+        _add_capsules(_link(robot, name), motion, i)
+
+
+def _add_arm(robot: ET.Element, arm: MovedArm) -> None:
+    """Adds the arm's links, without meshes."""
+    names, places = arm.link_names.tolist(), arm.link_position[0]
+    turns = Rotation.from_quat(arm.link_quaternion[0], scalar_first=True)
+    _link(robot, names[0])
+    for i, parent in enumerate(arm.link_parent.tolist()[1:], 1):
+        joints: list[_Joint] = []
+        back = np.eye(4)  # from the link's frame at the first frame's angles to its frame at zero
+        for j in np.flatnonzero(arm.joint_link == i)[::-1]:
+            slides, axis, anchor = bool(arm.joint_slides[j]), arm.joint_axis[j], arm.joint_anchor[j]
+            limited = np.abs(arm.joint_limits[j]).max() < UNLIMITED
+            kind = "prismatic" if slides else "revolute" if limited else "continuous"
+            joints.insert(
+                0, _Joint(str(arm.joint_names[j]), kind, axis, anchor, arm.joint_limits[j], arm.joint_speed[j])
+            )
+            way = -arm.joint_position[0, j] * axis
+            turn = Rotation.identity() if slides else Rotation.from_rotvec(way)
+            shift = way if slides else anchor - turn.apply(anchor)
+            back = back @ pose_matrices(shift[None], turn)[0]
+        inverse = turns[parent].inv()
+        local = pose_matrices(inverse.apply(places[i] - places[parent])[None], inverse * turns[i])[0] @ back
+        _add_link(robot, names[i], names[parent], local[:3, 3], Rotation.from_matrix(local[:3, :3]), joints)
+        _link(robot, names[i])
+
+
+def _add_link(
+    robot: ET.Element, name: str, carrier: str, place: np.ndarray, turn: Rotation, joints: Sequence[_Joint]
+) -> None:
+    """Adds the joints between a link and its carrier, in whose frame it is so placed with all joints at zero."""
+    for number, (joint, kind, axis, anchor, limits, speed) in enumerate(joints):
+        ends = number == len(joints) - 1 and np.allclose(anchor, 0, atol=1e-9)
+        child = name if ends else f"{name}_{number}"
+        element = _joint(robot, joint, kind, carrier, child, place + turn.apply(anchor), turn)
+        ET.SubElement(element, "axis", xyz=_numbers(axis))
+        lower, upper = map(_number, limits)
+        ET.SubElement(element, "limit", lower=lower, upper=upper, effort="10", velocity=_number(speed))
+        if not ends:
+            _link(robot, child)
+        carrier, place, turn = child, -anchor, Rotation.identity()
+    if carrier != name:
+        _joint(robot, f"{name}_fixed", "fixed", carrier, name, place, turn)
 
 
 def _link(robot: ET.Element, name: str) -> ET.Element:
@@ -55,12 +123,16 @@ def _link(robot: ET.Element, name: str) -> ET.Element:
     return link
 
 
-def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, offset: np.ndarray) -> ET.Element:
-    """Adds a joint at an offset (3,) in its parent's frame."""
+def _joint(
+    robot: ET.Element, name: str, kind: str, parent: str, child: str, offset: np.ndarray, turn: Rotation
+) -> ET.Element:
+    """Adds a joint at an offset (3,) and a rotation in its parent's frame."""
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
-    ET.SubElement(joint, "origin", xyz=_numbers(offset), rpy="0 0 0")
+    with warnings.catch_warnings(action="ignore"):  # of a pitch of 90 degrees, where any roll will do
+        angles = turn.as_euler("xyz")
+    ET.SubElement(joint, "origin", xyz=_numbers(offset), rpy=_numbers(angles))
     return joint
 
 
@@ -91,26 +163,34 @@ def _numbers(values: np.ndarray) -> str:
     return " ".join(map(_number, values))
 
 
-def forward_kinematics(urdf: str, angles: Mapping[str, np.ndarray], wrist: np.ndarray) -> dict[str, np.ndarray]:
+def forward_kinematics(
+    urdf: str, angles: Mapping[str, np.ndarray], wrist: np.ndarray, palm: str, base: np.ndarray
+) -> dict[str, np.ndarray]:
     """Poses (T, 4, 4) of all links, worked out by MuJoCo from the file's text.
 
     Args:
       urdf: the text.
       angles: (T,) of each joint by name, rad.
-      wrist: (T, 4, 4) poses of the root.
+      wrist: (T, 4, 4) poses of the palm, which carries the links below it along.
+      palm: name of the palm.
+      base: (T, 4, 4) or (4, 4) pose of the root.
     """
     robot = ET.fromstring(urdf)
     extension = ET.SubElement(robot, "mujoco")  # else links without joints are merged, and pictures thrown away
     ET.SubElement(extension, "compiler", fusestatic="false")
     model = mujoco.MjModel.from_xml_string(ET.tostring(robot, "unicode"))
     data = mujoco.MjData(model)
-    bodies = [model.body(i) for i in range(1, model.nbody)]
-    poses = {body.name: np.zeros_like(wrist) for body in bodies}
+    matrices = np.zeros((len(wrist), model.nbody, 4, 4))
     for t in range(len(wrist)):
         for name, values in angles.items():
             data.qpos[model.joint(name).qposadr[0]] = values[t]
         mujoco.mj_kinematics(model, data)
-        turns = Rotation.from_matrix(data.xmat[1:].reshape(-1, 3, 3))
-        for body, pose in zip(bodies, pose_matrices(data.xpos[1:], turns), strict=True):
-            poses[body.name][t] = wrist[t] @ pose
+        matrices[t] = pose_matrices(data.xpos, Rotation.from_matrix(data.xmat.reshape(-1, 3, 3)))
+    held = {model.body(palm).id}
+    onto = wrist @ np.linalg.inv(matrices[:, model.body(palm).id])
+    poses = {}
+    for i in range(1, model.nbody):
+        if int(model.body_parentid[i]) in held:
+            held.add(i)
+        poses[model.body(i).name] = (onto if i in held else base) @ matrices[:, i]
     return poses

@@ -1,7 +1,7 @@
 """USD as text (.usda) with time samples; written by Pixar's own library, read back from the text without it.
 
-One Xform a link, nested as the hand is, with USD's own capsules as guides; the object is a mesh. The hand's surface is
-skinned: a skeleton of the links with an animation moves it (UsdSkel).
+One Xform a link, nested as hand and arm are, the hand's with USD's own capsules as guides; object and arm are meshes.
+The hand's surface is skinned: a skeleton of the links with an animation moves it (UsdSkel).
 """
 
 import ast
@@ -23,6 +23,7 @@ from congrasp.services.export.frames import (
     SKIN,
     Body,
     Track,
+    arm_meshes,
     bodies,
     capsules,
     facts,
@@ -52,7 +53,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
     stage.GetRootLayer().customLayerData = {"congrasp": json.dumps(about)}
     root = UsdGeom.Xform.Define(stage, "/grasp")
     stage.SetDefaultPrim(root.GetPrim())
-    found, paths = bodies(motion), [root.GetPath()]
+    found, paths, arm = bodies(motion), [root.GetPath()], arm_meshes(motion)
     for i, (body, name) in enumerate(zip(found, identifiers([SKIN, *(body.name for body in found)])[1:], strict=True)):
         xform = UsdGeom.Xform.Define(stage, paths[body.parent + 1].AppendChild(name))
         paths.append(xform.GetPath())
@@ -66,9 +67,12 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
                 translate.Set(Gf.Vec3d(*body.translation[t]), t)
         if body.name == OBJECT:
             _add_mesh(stage, paths[-1], motion)
-        else:
-            _add_capsules(stage, paths[-1], motion, i)
-    _add_skin(stage, root.GetPath().AppendChild(SKIN), skin_of_motion(motion), found[:-1])
+        _add_capsules(stage, paths[-1], motion, i)
+        for number, part in enumerate(arm.get(body.name, ())):
+            shape = _new_mesh(stage, paths[-1].AppendChild(f"mesh_{number}"), part.vertices, part.faces)
+            shape.CreateDisplayColorAttr([part.colour])
+    links = found[: len(motion.link_names)]
+    _add_skin(stage, root.GetPath().AppendChild(SKIN), skin_of_motion(motion), links)
     stage.Save()
 
 
@@ -90,6 +94,7 @@ def _add_mesh(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion) -> None:
     """The object's mesh in its frame."""
     vertices, faces, colours = object_mesh(motion)
     mesh = _new_mesh(stage, parent.AppendChild("mesh"), vertices, faces)
+    _add_coordinates(mesh, vertices, faces)
     if colours is None:
         mesh.CreateDisplayColorAttr([COLOURS[OBJECT]])
     else:
@@ -125,6 +130,7 @@ def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body
 def _add_surface(stage: Usd.Stage, path: Sdf.Path, skin: Skin, skeleton: UsdSkel.Skeleton) -> None:
     """The hand's surface, bound to a skeleton of its links."""
     mesh = _new_mesh(stage, path, skin.points, skin.faces)
+    _add_coordinates(mesh, skin.points, skin.faces)
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(skin.normals))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     colours = np.array([COLOURS[name] for name in MATERIALS], np.float32)[skin.material]
@@ -139,7 +145,7 @@ def _add_surface(stage: Usd.Stage, path: Sdf.Path, skin: Skin, skeleton: UsdSkel
 
 
 def _new_mesh(stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.ndarray) -> UsdGeom.Mesh:
-    """A mesh of triangles with texture coordinates, not subdivided."""
+    """A mesh of triangles, not subdivided."""
     points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, np.float32))
     mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
@@ -147,12 +153,16 @@ def _new_mesh(stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.
     mesh.CreateFaceVertexCountsAttr([3] * len(faces))
     mesh.CreateFaceVertexIndicesAttr(faces.ravel().tolist())
     mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    return mesh
+
+
+def _add_coordinates(mesh: UsdGeom.Mesh, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Adds texture coordinates to a mesh (V, 3), (F, 3)."""
     flat = unwrapped(vertices, faces)
     primvars, kind = UsdGeom.PrimvarsAPI(mesh), Sdf.ValueTypeNames.TexCoord2fArray
     st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(flat.uv, np.float32)))
     st.SetIndices(Vt.IntArray(flat.faces.ravel().tolist()))
-    return mesh
 
 
 def read(path: pathlib.Path) -> list[Track]:
@@ -161,22 +171,25 @@ def read(path: pathlib.Path) -> list[Track]:
     assert layer["upAxis"] == "Z" and layer["metersPerUnit"] == 1
     codes = np.arange(layer["startTimeCode"], layer["endTimeCode"] + 1)
     poses: dict[str, np.ndarray] = {}
-    corners: list[np.ndarray] = []
+    corners: dict[str, list[np.ndarray]] = {}
 
-    def visit(prim: dict[str, Any], parent: np.ndarray) -> None:
+    def visit(prim: dict[str, Any], parent: np.ndarray, body: str = "") -> None:
         """World poses of a prim and those below it, and the triangles of meshes."""
+        body = prim.get(_NAME, body)
         if _NAME in prim:
             assert prim["xformOpOrder"] == ["xformOp:translate", "xformOp:orient"]
             place, turn = (_samples(prim, name, len(codes)) for name in prim["xformOpOrder"])
-            parent = poses[prim[_NAME]] = parent @ pose_matrices(place, Rotation.from_quat(turn, scalar_first=True))
+            parent = poses[body] = parent @ pose_matrices(place, Rotation.from_quat(turn, scalar_first=True))
         elif "faceVertexIndices" in prim and "skel:skeleton" not in prim:
-            corners.append(np.array(prim["points"])[prim["faceVertexIndices"]].reshape(-1, 3, 3))
+            triangles = np.array(prim["points"])[prim["faceVertexIndices"]].reshape(-1, 3, 3)
+            corners.setdefault(body, []).append(triangles)
         for name, child in prim.items():
             if name.startswith("/"):
-                visit(child, parent)
+                visit(child, parent, body)
 
     visit(layer, np.eye(4))
-    return [Track(codes / layer["timeCodesPerSecond"], poses, np.concatenate(corners))]
+    meshes = {body: np.concatenate(triangles) for body, triangles in corners.items()}
+    return [Track(codes / layer["timeCodesPerSecond"], poses, meshes)]
 
 
 def _samples(prim: dict[str, Any], name: str, count: int) -> np.ndarray:

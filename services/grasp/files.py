@@ -1,6 +1,5 @@
 """The files of a grasp: `congrasp grasp` writes them into an object's folder, the result last."""
 
-import functools
 import hashlib
 import json
 import pathlib
@@ -13,7 +12,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.arm.files import PICTURE as ARM_PICTURE
-from congrasp.services.arm.files import robot_camera, robot_shapes, save_picture, save_trajectories
+from congrasp.services.arm.files import save_picture, save_robot_video, save_trajectories
 from congrasp.services.export.motion_file import save_motion
 from congrasp.services.grasp.grasper import Grasp
 from congrasp.services.record.channels import JsonChannels
@@ -70,11 +69,11 @@ def save_grasp(
     (folder / RESULT).unlink(missing_ok=True)
     save_motion(folder / MOTION, found.motion)
     save_recording(folder / RECORDING, found.episode)
-    if found.arm:
-        save_trajectories(folder, found.arm)
+    episode, arm = found.episode, found.motion.arm
+    if arm:
+        save_trajectories(folder, found.motion, arm)
         if pictures:
-            save_picture(folder / ARM_PICTURE, found.arm, found.episode, found.first("hold"))
-    episode = found.episode
+            save_picture(folder / ARM_PICTURE, arm, episode, found.first("hold"))
     steps = _steps_to_draw(*grasp_steps(episode), len(episode.arrays["table"]) - 1)
     last = steps[-1]
     if pictures:
@@ -86,10 +85,8 @@ def save_grasp(
         until = min(found.first("hold") + round(_HELD / float(episode.meta["control_dt"])), last)
         filmed = [*range(found.first("grasp") // 2, until, _FRAMED), until]  # the hand comes into the picture
         aspect = film.size[0] / film.size[1]
-        if arm := found.arm:
-            camera = robot_camera(arm, episode, [*steps[:-1], until], aspect)
-            around = functools.partial(robot_shapes, arm, episode)
-            save_episode_video(folder / VIDEO, episode, film, camera, until=until, around=around)
+        if arm:
+            save_robot_video(folder / VIDEO, arm, episode, film, [*steps[:-1], until], until)
         else:
             seen_from = camera_of(episode, filmed, aspect, view or views(episode, steps)[0], overlays=film.overlays)
             save_episode_video(folder / VIDEO, episode, film, seen_from, until=until)

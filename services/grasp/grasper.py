@@ -234,7 +234,9 @@ class Grasper:
             progress(f"Moving {arm.name}", number + 1, len(order))
             try:
                 found = make(index)
-                return dataclasses.replace(found, arm=arm.plan(obj, found.motion))
+                planned = arm.plan(obj, found.motion)
+                episode = planned.moved.recorded(found.episode)
+                return dataclasses.replace(found, episode=episode, motion=motion_of_episode(episode), arm=planned)
             except Infeasible as limit:
                 refused[str(limit)] += 1
             except NoReachError:

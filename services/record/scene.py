@@ -31,6 +31,7 @@ from congrasp.common.wire.messages import EPISODE, validate
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
 from congrasp.services.record.goals import markers
+from congrasp.services.record.moved_arm import MovedArm, arm_of_episode
 from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE, HEADING, OBJECT, TABLE, WAYPOINT
 from congrasp.services.record.surface import surface_parts, surface_points
 
@@ -73,6 +74,7 @@ def check_episode(episode: Message) -> None:
             raise CongraspError(f"The episode's {name} are more than {LARGEST:g} m from the object's centre.")
     if any(array.size > _GOAL for name, array in episode.arrays.items() if name.startswith("goal/")):
         raise CongraspError(f"The episode has a goal array of more than {_GOAL} values.")
+    arm_of_episode(episode)
     if sum(name.startswith(_OPEN) for name in episode.arrays) > _ARRAYS:
         raise CongraspError(f"The episode has more than {_ARRAYS} rewards, errors and goal arrays.")
 
@@ -92,10 +94,10 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
     """
     topic = f"/episode/{actor}"
     arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
-    hand = known_hand(episode.meta["hand"])
+    hand, arm = known_hand(episode.meta["hand"]), arm_of_episode(episode)
     step = round(1e9 * episode.meta["control_dt"])
     yield Entry(opaque_channel(f"{topic}/raw", EPISODE_SCHEMA), start, encode(episode))
-    yield _protobuf(f"{topic}/scene", start, _static_scene(hand, actor, arrays, episode.meta, start), latched=True)
+    yield _protobuf(f"{topic}/scene", start, _static_scene(hand, arm, actor, arrays, episode.meta, start), latched=True)
     yield _protobuf(f"{topic}/surface", start, _surface(actor, arrays, start), latched=True)
     for link, (points, colours) in zip(hand.links, surface_points(hand), strict=True):
         # Rerun draws point clouds but no scenes; a topic holds one frame's cloud.
@@ -103,7 +105,7 @@ def episode_entries(actor: str, episode: Message, start: int, slot: int, channel
         yield _protobuf(f"{topic}/hand/{link.name}", start, cloud, latched=True)
     for i in range(len(arrays["object_position"])):
         now = start + i * step
-        yield _protobuf(f"{topic}/tf", now, _transforms(hand, actor, arrays, i, slot, now))
+        yield _protobuf(f"{topic}/tf", now, _transforms(hand, arm, actor, arrays, i, slot, now))
         yield _protobuf(f"{topic}/contacts", now, _contacts(actor, arrays, i, now, step))
         yield channels.entry(f"{topic}/signals", now, _signals(hand, arrays, i, episode.meta["control_dt"]))
 
@@ -120,7 +122,7 @@ def _protobuf(topic: str, time: int, message: Any, *, latched: bool = False) -> 
 
 
 def _transforms(
-    hand: Hand, actor: str, arrays: Mapping[str, np.ndarray], i: int, slot: int, now: int
+    hand: Hand, arm: MovedArm | None, actor: str, arrays: Mapping[str, np.ndarray], i: int, slot: int, now: int
 ) -> FrameTransforms:
     """Frames of the actor, its links and its object at step i."""
     message = FrameTransforms()
@@ -128,6 +130,9 @@ def _transforms(
     for k, link in enumerate(hand.links):
         poses.append((actor, f"{actor}/{link.name}", arrays["link_position"][i, k], arrays["link_quaternion"][i, k]))
     poses.append((actor, f"{actor}/object", arrays["object_position"][i], arrays["object_quaternion"][i]))
+    if arm:
+        links = zip(arm.link_names, arm.link_position[i], arm.link_quaternion[i], strict=True)
+        poses += [(actor, f"{actor}/arm/{name}", position, quaternion) for name, position, quaternion in links]
     for parent, child, position, quaternion in poses:
         transform = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
         transform.timestamp.FromNanoseconds(now)
@@ -137,9 +142,9 @@ def _transforms(
 
 
 def _static_scene(
-    hand: Hand, actor: str, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], now: int
+    hand: Hand, arm: MovedArm | None, actor: str, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], now: int
 ) -> SceneUpdate:
-    """Hand, object and constraints; first removes those of the previous episode."""
+    """Hand, arm, object and constraints; first removes those of the previous episode."""
     update = SceneUpdate()
     update.deletions.add(type=SceneEntityDeletion.ALL).timestamp.FromNanoseconds(now)
     for link, parts in zip(hand.links, surface_parts(hand), strict=True):
@@ -148,6 +153,10 @@ def _static_scene(
             _add_triangles(entity, part.points, part.faces, (*part.colour, 1.0))
         if any(part.colour == FLESH for part in parts):
             _add_capsules(entity, link, (*FLESH, 1.0))
+    if arm:
+        for m, mesh in enumerate(arm.meshes()):
+            entity = _entity(update, f"arm/{m}", f"{actor}/arm/{arm.link_names[mesh.link]}", now)
+            _add_triangles(entity, mesh.vertices, mesh.faces, (*mesh.colour, 1.0))
     frame = f"{actor}/object"
     entity = _entity(update, "object", frame, now)
     body = _add_triangles(entity, arrays["visual_vertices"], arrays["visual_faces"], _OBJECT)

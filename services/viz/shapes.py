@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import Hand, capsule_ends
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.record.moved_arm import MovedArm
 from congrasp.services.record.palette import MATERIALS as MATERIAL_COLOURS
 from congrasp.services.record.palette import OBJECT, SKIN, TABLE, Colour
 from congrasp.services.viz.scene import Camera, Shape, between
@@ -119,6 +120,19 @@ def object_shape(
         paint_points=points,
         paint_colours=colours,
     )
+
+
+def arm_shapes(arm: MovedArm, frame: int) -> list[Shape]:
+    """Returns the links of an arm in a frame of its motion."""
+    return [
+        object_shape(
+            (mesh.vertices, mesh.faces),
+            arm.link_position[frame, mesh.link],
+            arm.link_quaternion[frame, mesh.link],
+            colour=mesh.colour,
+        )
+        for mesh in arm.meshes()
+    ]
 
 
 def table_shape(below: np.ndarray) -> Shape:

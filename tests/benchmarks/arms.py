@@ -13,7 +13,7 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.services.arm.options import ArmOptions
-from congrasp.services.arm.planner import ArmPlanner
+from congrasp.services.arm.planner import ArmMotion, ArmPlanner
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.assets.objects.named import objects_at
 from congrasp.services.assets.objects.options import ImportOptions
@@ -44,17 +44,19 @@ class AllArms:
         self.done: dict[str, dict[str, Any]] = {}
         self.refused = {name: collections.Counter[str]() for name in self._planners}
 
-    def plan(self, obj: GraspObject, motion: GraspMotion) -> None:
+    def plan(self, obj: GraspObject, motion: GraspMotion) -> ArmMotion:
         """Tries it with the arms that have done none; raises `Infeasible` while there are any."""
         for name, planner in self._planners.items():
             if name in self.done:
                 continue
             try:
-                self.done[name] = planner.plan(obj, motion).facts()
+                planned = planner.plan(obj, motion)
+                self.done[name] = planned.facts()
             except Infeasible as limit:
                 self.refused[name][str(limit)] += 1
         if len(self.done) < len(self._planners):
             raise Infeasible("an arm")
+        return planned
 
 
 def bench_arms(

@@ -24,6 +24,8 @@ from congrasp.services.arm.tracking import ANGLE, POSITION, Path, follow
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
+from congrasp.services.export.motion_file import load_motion, robot_joints
+from congrasp.services.export.motion_formats import pick_motion
 
 LINKS = [("0 0 1", 0.3, 170), ("0 1 0", 0.0, 120), ("0 0 1", 0.4, 170), ("0 1 0", 0.0, 140), ("0 0 1", 0.4, 170),
          ("0 1 0", 0.0, 120), ("0 0 1", 0.1, 170)]  # fmt: skip
@@ -230,6 +232,21 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
         rows = [*csv.reader(file)]
     names = [f"j{i}" for i in range(1, 8)] + [joint.name for joint in get_hand("allegro").joints]
     assert rows[0] == ["time", *names]
+    motion = load_motion(tmp_path / "block" / "grasp.npz")
+    assert motion.arm is not None and robot_joints(motion) == names
+    table = np.array(rows[1:], float)
+    np.testing.assert_allclose(motion.arm.joint_position, table[:, 1:8], atol=1e-6)
+    np.testing.assert_allclose(motion.time, table[:, 0], atol=1e-6)
+    flange = motion.arm.link_names.tolist().index("link7")
+    turn = Rotation.from_quat(motion.arm.link_quaternion[:, flange], scalar_first=True)
+    carried = motion.arm.link_position[:, flange] + turn.apply(motion.arm.hand_position)
+    off = 1e3 * np.linalg.norm(carried - motion.wrist_position, axis=-1)
+    assert off.max() == pytest.approx(facts["arm_error_mm"], rel=1e-3, abs=1e-3)
+    recorded = pick_motion(tmp_path / "block" / "grasp.mcap").arm
+    assert recorded is not None
+    np.testing.assert_array_equal(recorded.link_position, motion.arm.link_position)
+    assert recorded.link_names.tolist() == motion.arm.link_names.tolist()
+    assert [m.colour for m in recorded.meshes()] == [m.colour for m in motion.arm.meshes()]
     message = json.loads((tmp_path / "block" / TRAJECTORY).read_text())
     assert message["joint_names"] == names and len(message["points"]) == len(rows) - 1
     last = message["points"][-1]

@@ -433,12 +433,12 @@ def test_lerobots_own_reader_gives_the_frame_of_each_row(human: GraspMotion, tmp
 
 
 def test_a_described_hand_says_what_it_is(odd_hand: GraspMotion) -> None:
-    text = urdf.hand_urdf(odd_hand)
+    text = urdf.robot_urdf(odd_hand)
     angles = dict(zip(odd_hand.joint_names, odd_hand.joint_position.T, strict=True))
     wrist = frames.pose_matrices(
         odd_hand.wrist_position, Rotation.from_quat(odd_hand.wrist_quaternion, scalar_first=True)
     )
-    poses = urdf.forward_kinematics(text, angles, wrist)
+    poses = urdf.forward_kinematics(text, angles, wrist, "palm", wrist)
     for i, name in enumerate(odd_hand.link_names):
         np.testing.assert_allclose(poses[str(name)][:, :3, 3], odd_hand.link_position[:, i], atol=1e-8)
 

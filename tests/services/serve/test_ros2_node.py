@@ -1,9 +1,11 @@
 """The example's node: its CDR over Zenoh is an independent implementation's, and with rclpy it is the same node."""
 
+import array
 import contextlib
 import importlib.util
 import json
 import pathlib
+import re
 import sys
 import time
 import types
@@ -11,6 +13,7 @@ from types import SimpleNamespace as Fields
 
 import numpy as np
 import pytest
+import trimesh
 import zenoh
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from rosbags.typesys import Stores, get_typestore
@@ -20,6 +23,7 @@ import congrasp
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.transport.ports import free_port
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.client.policy import Answer
 
 EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "ros2_node.py"
@@ -53,7 +57,7 @@ class SteadyPolicy:
 
     def act(self, state):
         self.state = state
-        if not all(np.isfinite(state[name]).all() for name in ("q", "u", "object_position")):
+        if not all(np.isfinite(state[name]).all() for name in ("q", "u", "object_position", "cloud") if name in state):
             raise congrasp.RefusedError("not finite")
         return Answer(*self.wanted, np.zeros(22), 1, (), 0.0, 0.0)
 
@@ -127,11 +131,11 @@ def node_of(example, bus, lift=0.0, **given):
     limits = congrasp.JointLimits.of_hand(HAND)
     arguments = example.Arguments("capsule:7", robot_age=3.0, **given)  # on a machine with other work
     plan = example.Plan("world", 3, lift, 0.02, arguments.dry_run)
-    request = congrasp.GraspRequest(surface=obj.points)
     with congrasp.Guard(policy, limits, HAND.q_open, period=0.05, wait=0.04, stale=0.2, hold=0.6) as guard:
-        sensors = example.Sensors(arguments, NAMES, obj.origin, 0.4)
+        sensors = example.Sensors(arguments, NAMES, 0.4)
+        target = example.Tracked(sensors, congrasp.GraspRequest(surface=obj.points), obj.origin)
         try:
-            yield example.PolicyNode(bus, guard, sensors, request, plan), policy, obj
+            yield example.PolicyNode(bus, guard, sensors, target, plan), policy, obj
         finally:
             bus.close()
 
@@ -279,12 +283,6 @@ def test_without_a_router_it_is_one_line(example, monkeypatch):
     assert "\n" not in str(caught.value) and "cargo" not in str(caught.value)
 
 
-def test_a_policy_with_a_camera_is_refused(example):
-    described = {"limits": {}, "observation": "camera"}
-    with pytest.raises(congrasp.CongraspError, match=r"observes a point cloud.*depth_grasp\.py"):
-        example.run(example.Arguments("mug:7"), Wire(), None, described)
-
-
 def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
     """A robot that calls the first joint `motor_1`, says nothing of its wrist, and sees the object in a lost frame."""
     bus = Wire()
@@ -306,7 +304,7 @@ def test_it_names_what_it_waits_for_and_the_map_renames_joints(example):
         bus.said = [("wrist_pose", old)]
         assert node.step() is None and "wrist_pose (the last one is 9." in node._sensors.missing()
     with pytest.raises(congrasp.CongraspError, match="--joint-map has 'elbow=motor_1'"):
-        example.joints_of(("elbow=motor_1",), NAMES)
+        sys.modules["ros2_sensors"].joints_of(("elbow=motor_1",), NAMES)
 
 
 def test_poses_come_through_frames_and_offsets_and_go_back_the_same_way(example):
@@ -371,3 +369,177 @@ def test_a_slow_hand_has_a_share_of_the_speed(example):
     slow = example.slowed(limits, 0.25)
     np.testing.assert_allclose(slow.speed, limits.speed / 4)
     np.testing.assert_allclose(slow.acceleration, limits.acceleration / 16)
+
+
+TOPIC = "/camera/points"
+DESCRIBED = {"observation": "camera", "surface_points": 64, "trajectory_points": 5}
+CAMERA, CAMERA_TURN = np.array([1.0, 0.5, 0.6]), Rotation.from_euler("xyz", [-2.0, 0.3, 1.1])
+PALM, PALM_TURN = np.array([0.5, 0.1, 0.32]), Rotation.from_euler("x", 180, degrees=True)
+
+
+@contextlib.contextmanager
+def camera_node(example, bus, lift=0.0, age=3.0, **given):
+    """A node of a policy with a camera, in a box around (0.5, 0.1)."""
+    policy = SteadyPolicy()
+    box = "0.5 0.1 0.2 0.3 0.3 0.4"
+    arguments = example.Arguments(cloud_topic=TOPIC, robot_age=3.0, box=box, **given)
+    plan = example.Plan("world", 3, lift, 0.02, arguments.dry_run)
+    limits = congrasp.JointLimits.of_hand(HAND)
+    with congrasp.Guard(policy, limits, HAND.q_open, period=0.05, wait=0.04, stale=0.2, hold=0.6) as guard:
+        sensors = example.Sensors(arguments, NAMES, age)
+        yield (
+            example.PolicyNode(bus, guard, sensors, example.target_of(arguments, sensors, HAND, DESCRIBED), plan),
+            policy,
+        )
+
+
+def cloud_of(points, rows=1, **stamp):
+    """A PointCloud2 of points (N, 3) in the world, as a camera has it: rows with gaps, of points with other fields."""
+    kind = np.dtype({"names": ["rgb", "x", "y", "z"], "formats": ["<u4", "<f4", "<f4", "<f4"], "offsets": [0, 4, 8, 16],
+                     "itemsize": 24})  # fmt: skip
+    local = CAMERA_TURN.inv().apply(points - CAMERA)
+    packed = np.zeros(len(points), kind)
+    packed["x"], packed["y"], packed["z"] = local.T
+    lines = [row.tobytes() + b"\xff" * 5 for row in packed.reshape(rows, -1)]
+    fields = [Fields(name=name, offset=at, datatype=7, count=1) for name, at in (("x", 4), ("y", 8), ("z", 16))]
+    return Fields(
+        header=header("camera", **stamp), height=rows, width=len(points) // rows, fields=fields, is_bigendian=False,
+        point_step=24, row_step=24 * (len(points) // rows) + 5, data=array.array("B", b"".join(lines)), is_dense=False,
+    )  # fmt: skip
+
+
+def block(shift=(0.0, 0.0, 0.0)):
+    """(300, 3) points of an object on the table."""
+    return np.random.default_rng(1).uniform([0.47, 0.07, 0.006], [0.53, 0.13, 0.1], (300, 3)) + shift
+
+
+def surroundings():
+    """(100, 3) points that are none of the object: table, wall, no measurement, and the hand itself."""
+    rng = np.random.default_rng(2)
+    table = np.concatenate([rng.uniform(0.4, 0.6, (30, 2)) - [0, 0.4], rng.normal(0, 0.001, (30, 1))], 1)
+    wall = rng.uniform([0.7, -1, 0], [0.9, 1, 1], (30, 3))
+    hand = PALM + PALM_TURN.apply(mujoco_link_poses(HAND, HAND.q_open)[0])
+    return np.concatenate([table, wall, np.full((24, 3), np.nan), hand[:16]])
+
+
+def camera_says(cloud, wrist=(PALM, PALM_TURN)):
+    """Messages of a robot whose camera stands still."""
+    fixed = Fields(transforms=[frame("camera", "world", CAMERA, CAMERA_TURN)])
+    joints = Fields(header=header(""), name=NAMES, position=HAND.q_open.tolist(), velocity=[], effort=[])
+    return [("tf_static", fixed), ("joint_states", joints), ("wrist_pose", posed(*wrist)), (TOPIC, cloud)]
+
+
+def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
+    """In the order of the cloud, 64 of 300; the same from a cloud in rows, and where the camera is off as stated."""
+    bus, points = Wire(), block()
+    expected = points[np.arange(64) * 300 // 64]
+    around = surroundings()
+    mixed = np.concatenate([around[:50], points, around[50:]])
+    with camera_node(example, bus) as (node, policy):
+        bus.said = camera_says(cloud_of(mixed, rows=4))
+        until(lambda: (node.step() or Fields(mode="")).mode == "follow")
+        np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
+        np.testing.assert_allclose(policy.state["cloud"], expected, atol=1e-6)
+        assert policy.request.surface is None and policy.request.object_pose is None
+        heading = policy.request.constraints["heading"]
+        np.testing.assert_allclose(heading["position"], expected.mean(0), atol=1e-6)
+        np.testing.assert_allclose(heading["direction"], [0, 0, -1])
+    off = CAMERA_TURN.apply([0.01, 0.0, 0.0])
+    with camera_node(example, bus, hand_eye="0.01 0 0 0 0 0") as (node, policy):
+        bus.said = camera_says(cloud_of(points - off))
+        until(lambda: (node.step() or Fields(mode="")).mode == "follow")
+        np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
+
+
+def test_a_cloud_is_read_as_it_comes_over_either_bus(example):
+    """rosbags decodes what mcap-ros2-support encodes; rclpy has an array of bytes."""
+    message = cloud_of(block(), rows=3)
+    read = sys.modules["ros2_cloud"].read_points
+    seen = CAMERA_TURN.apply(read(message)) + CAMERA
+    np.testing.assert_allclose(seen, block(), atol=1e-6)
+    kind = example.CLOUD
+    plain = Fields(**{**vars(message), "data": message.data.tobytes()})
+    payload = serialize_dynamic(*schema(kind))[schema(kind)[0]](plain)
+    np.testing.assert_array_equal(read(STORE.deserialize_cdr(payload, kind)), read(message))
+    for wrong in ({"fields": message.fields[:2]}, {"width": 5000}, {"point_step": 2}):
+        assert read(Fields(**{**vars(message), **wrong})).shape == (0, 3)
+
+
+def test_a_hidden_object_stays_where_it_was_and_a_silent_camera_stops_the_hand(example):
+    bus = Wire()
+    with camera_node(example, bus, age=0.5) as (node, policy):
+        bus.said = camera_says(cloud_of(surroundings()))
+        assert node.step() is None
+        assert f"{TOPIC}: 0 of 76 points in --box" in example.report(None, node._guard, node._sensors)
+        bus.said = camera_says(cloud_of(block(), age=9.0))
+        assert node.step() is None and f"{TOPIC} (the last one is 9." in node._sensors.missing()
+
+        def seen(points, beyond):
+            bus.said = camera_says(cloud_of(points))
+            command = node.step()
+            at = policy.state and policy.state["cloud"][:, 0].mean()
+            return command is not None and command.mode == "follow" and abs(at - beyond) < 0.005
+
+        until(lambda: seen(block(), 0.5))
+        until(lambda: seen(block((0.04, 0.0, 0.0)), 0.54))
+        until(lambda: seen(surroundings(), 0.54))  # the hand is before it
+        bus.said = camera_says(cloud_of(block()))[:-1]
+        assert until(lambda: (node.step(), node._guard._latched)[1]) == "freeze"
+
+
+def test_the_cloud_rises_with_the_hand(example):
+    """The policy sees the lifted object where it was, and no table below it."""
+    bus = Wire()
+    with camera_node(example, bus, lift=0.1) as (node, policy):
+        wrist = PALM, PALM_TURN
+
+        def risen():
+            nonlocal wrist
+            height = -float(node._plan.rise(node._followed)[2])
+            bus.said = camera_says(cloud_of(np.concatenate([block((0, 0, -height)), surroundings()[:30]])), wrist)
+            command = node.step()
+            if bus.sent:
+                place = bus.sent["wrist_command"].pose.position
+                wrist = np.array([place.x, place.y, place.z]), PALM_TURN
+            return command is not None and wrist[0][2] - PALM[2] == pytest.approx(0.1, abs=0.01)
+
+        bus.said = camera_says(cloud_of(block()))
+        until(risen)
+        assert policy.state["cloud"][:, 2].mean() == pytest.approx(block()[:, 2].mean(), abs=0.01)
+        assert not policy.state["table"]
+
+
+def test_a_camera_needs_a_topic_and_a_tracker_an_object(example):
+    for arguments, observation, words in (
+        (example.Arguments(), "camera", "a point cloud. Set --cloud-topic and name no object"),
+        (example.Arguments("mug:7", cloud_topic=TOPIC), "camera", "name no object"),
+        (example.Arguments("mug:7", cloud_topic=TOPIC), "full", "Name an object and leave out --cloud-topic"),
+        (example.Arguments(), "tracked", "Name an object"),
+        (example.Arguments(cloud_topic=TOPIC, box="1 2 3"), "camera", "--box is '1 2 3'"),
+    ):
+        with pytest.raises(congrasp.CongraspError, match=re.escape(words)) as caught:
+            example.target_of(arguments, None, HAND, {**DESCRIBED, "observation": observation})
+        assert "\n" not in str(caught.value)
+
+
+def test_constraints_of_a_cloud_are_in_the_world_frame(example, tmp_path):
+    """An affordance painted on its upper half stays there in newer clouds."""
+    trimesh.PointCloud(block()[block()[:, 2] > 0.05]).export(tmp_path / "upper.ply")
+    constraint = example.Constraints(heading="0 1 -1", at="0.5 0.1 0.08", affordance=str(tmp_path / "upper.ply"))
+    bus = Wire()
+    with camera_node(example, bus, constraint=constraint) as (node, policy):
+
+        def seen():
+            bus.said = camera_says(cloud_of(block((0.002, 0.0, 0.0))[::-1]))
+            command = node.step()
+            return command is not None and "surface_avoid" in (policy.state or ())
+
+        bus.said = camera_says(cloud_of(block()))
+        node.step()
+        until(seen)
+        np.testing.assert_allclose(policy.request.constraints["heading"]["position"], [0.5, 0.1, 0.08])
+        for points, avoid in (
+            (policy.request.cloud, policy.request.avoid),
+            (policy.state["cloud"], policy.state["surface_avoid"]),
+        ):
+            assert avoid[points[:, 2] < 0.03].all() and not avoid[points[:, 2] > 0.07].any() and len(avoid) == 64

@@ -1,0 +1,159 @@
+"""What the inputs of `ros2_node.py` say: joints, and poses in the world frame."""
+
+import dataclasses
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from ros2_bus import FRAMES, INPUTS
+from scipy.spatial.transform import Rotation
+
+import congrasp
+
+if TYPE_CHECKING:
+    from ros2_node import Arguments
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """A frame in another one: position (3,), m, and rotation."""
+
+    position: np.ndarray
+    rotation: Rotation
+
+    def __matmul__(self, other: "Pose") -> "Pose":
+        """A pose in this frame, in the other one."""
+        return Pose(self.position + self.rotation.apply(other.position), self.rotation * other.rotation)
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position and quaternion (4,), (w, x, y, z)."""
+        return self.position, self.rotation.as_quat(scalar_first=True)
+
+    def inverse(self) -> "Pose":
+        """The other frame in this one."""
+        return Pose(-self.rotation.inv().apply(self.position), self.rotation.inv())
+
+
+class Sensors:
+    """What the topics say, in the world frame; None or NaN for what is not there, or too old."""
+
+    def __init__(self, arguments: "Arguments", joints: list[str], object_age: float):
+        """Args: names and offsets; the hand's joints; s."""
+        renamed = joints_of(arguments.joint_map, joints)
+        self.names = [renamed.get(joint, joint) for joint in joints]
+        """The robot's names of the joints, in the hand's order."""
+        self.mount, self._hand_eye = offset_of(arguments.mount), offset_of(arguments.hand_eye)
+        self.eyes = arguments.cloud_topic or "object_pose"
+        """The topic that shows the object."""
+        self.unseen = ""
+        """Why no object was found in what it shows."""
+        self._world, self._ages = arguments.world, dict.fromkeys(INPUTS, arguments.robot_age)
+        self._ages[self.eyes] = object_age
+        self._joints: dict[str, tuple[float, float, float]] = {}
+        self._newest: dict[str, tuple[Any, float]] = {}
+        self._frames: dict[str, tuple[str, Pose, float]] = {}
+
+    def take(self, received: list[tuple[str, Any]]) -> None:
+        """Takes messages in."""
+        for topic, message in received:
+            if topic == "joint_states":
+                velocity = (
+                    message.velocity if len(message.velocity) == len(message.name) else [np.nan] * len(message.name)
+                )
+                rows = zip(message.name, message.position, velocity, strict=False)
+                self._joints |= {name: (q, v, stamped(message.header)) for name, q, v in rows}
+            elif INPUTS.get(topic) != FRAMES:
+                self._newest[topic] = message, stamped(message.header)
+            else:
+                for part in message.transforms:
+                    pose = read_pose(part.transform.translation, part.transform.rotation)
+                    when = np.inf if topic == "tf_static" else stamped(part.header)
+                    if pose is not None:
+                        self._frames[part.child_frame_id] = part.header.frame_id, pose, when
+
+    def joints(self) -> np.ndarray:
+        """(2, F) angles and velocities, rad and rad/s."""
+        earliest = time.monotonic() - self._ages["joint_states"]
+        rows = (self._joints.get(name, (np.nan, np.nan, -np.inf)) for name in self.names)
+        return np.array([(q, v) if when >= earliest else (np.nan, np.nan) for q, v, when in rows]).T
+
+    def palm(self) -> Pose | None:
+        """The palm in the world."""
+        message, frame = self._framed("wrist_pose")
+        pose = frame and read_pose(message.pose.position, message.pose.orientation)
+        return frame @ pose @ self.mount if frame and pose else None
+
+    def sight(self) -> tuple[Any, Pose | None]:
+        """What shows the object, and the camera's frame in the world; no frame where there is none, or too old."""
+        message, frame = self._framed(self.eyes)
+        return message, frame and frame @ self._hand_eye
+
+    def missing(self) -> str:
+        """What is not there, in words; empty when all is."""
+        lacking = []
+        if absent := [name for name, q in zip(self.names, self.joints()[0], strict=True) if not np.isfinite(q)]:
+            others = ", ".join(sorted(set(self._joints) - set(absent))) or "none"
+            lacking.append(f"the joints {', '.join(absent)} in joint_states (there: {others}; see --joint-map)")
+        for topic, found in (("wrist_pose", self.palm()), (self.eyes, self.sight()[1])):
+            message, when = self._newest.get(topic, (None, 0.0))
+            if message is None:
+                lacking.append(topic)
+            elif time.monotonic() - when > self._ages[topic]:
+                lacking.append(f"{topic} (the last one is {time.monotonic() - when:.1f} s old by its stamp)")
+            elif found is None:
+                lacking.append(f"{topic}: a pose, and tf from its frame '{message.header.frame_id}' to '{self._world}'")
+            elif topic == self.eyes and self.unseen:
+                lacking.append(f"{topic}: {self.unseen}")
+        return "; ".join(lacking)
+
+    def _framed(self, topic: str) -> tuple[Any, Pose | None]:
+        """A topic's newest message, and the frame that it is in in the world; none if it is too old."""
+        message, when = self._newest.get(topic, (None, -np.inf))
+        fresh = time.monotonic() - when <= self._ages[topic]
+        return message, self._frame(message.header.frame_id) if fresh else None
+
+    def _frame(self, name: str) -> Pose | None:
+        """A frame in the world; None if no chain of fresh transforms leads there."""
+        pose = Pose(np.zeros(3), Rotation.identity())
+        for _ in range(len(self._frames) + 1):
+            if name in ("", self._world):
+                return pose
+            name, own, when = self._frames.get(name, (name, pose, -np.inf))
+            if time.monotonic() - when > self._ages["tf"]:
+                return None
+            pose = own @ pose
+        return None
+
+
+def stamped(header: Any) -> float:
+    """When a message was stamped, by `time.monotonic`; now without a stamp, or with one that is yet to come."""
+    stamp = header.stamp.sec + 1e-9 * header.stamp.nanosec
+    return time.monotonic() - (max(time.time() - stamp, 0.0) if stamp else 0.0)
+
+
+def read_pose(place: Any, turn: Any) -> Pose | None:
+    """The pose of a message's vector and quaternion; None if it is none."""
+    position, quaternion = np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w])
+    if not (np.isfinite(position).all() and 0.5 < np.linalg.norm(quaternion) < 2.0):
+        return None
+    return Pose(position, Rotation.from_quat(quaternion))
+
+
+def offset_of(text: str) -> Pose:
+    """The pose of X Y Z ROLL PITCH YAW, metres and degrees."""
+    try:
+        x, y, z, *angles = map(float, text.split())
+        return Pose(np.array([x, y, z]), Rotation.from_euler("xyz", angles, degrees=True))
+    except ValueError:
+        raise congrasp.CongraspError(f"'{text}' is no offset.", "Write X Y Z ROLL PITCH YAW: 0 0 0.1 0 0 90.") from None
+
+
+def joints_of(pairs: tuple[str, ...], joints: list[str]) -> dict[str, str]:
+    """The robot's names of the hand's joints, from HAND=ROBOT."""
+    renamed = {hand: robot for hand, _, robot in (pair.partition("=") for pair in pairs)}
+    for hand, robot in renamed.items():
+        if hand not in joints or not robot:
+            raise congrasp.CongraspError(
+                f"--joint-map has '{hand}={robot}'.", f"Write HAND=ROBOT; the hand's are {', '.join(joints)}."
+            )
+    return renamed

@@ -1,0 +1,237 @@
+"""A motion whose hand is on an arm: every file has the arm where MuJoCo has it, with its meshes, colours and joints."""
+
+import dataclasses
+import json
+import pathlib
+
+import mujoco
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import trimesh
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from pxr import Usd, UsdGeom
+from scipy.spatial.transform import Rotation
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.objects import procedural
+from congrasp.common.wire.codec import Message, decode, encode
+from congrasp.services.arm.description import load_arm
+from congrasp.services.arm.links import moved_arm
+from congrasp.services.arm.robot import Pose, build_robot, default_mount
+from congrasp.services.export import frames, lerobot, motion_formats, urdf
+from congrasp.services.export.camera import camera_for, pictures
+from congrasp.services.export.motion_file import (
+    GraspMotion,
+    at_rate,
+    hand_arrays,
+    load_motion,
+    motion_of_episode,
+    robot_joints,
+    save_motion,
+)
+from congrasp.services.record.channels import JsonChannels
+from congrasp.services.record.scene import check_episode, episode_entries
+from tests.episodes import episode
+
+T = 5
+ORANGE, BLUE = (1.0, 0.4, 0.0), (0.1, 0.2, 0.8)
+ARM = """<mujoco><compiler angle="radian"/><asset><material name="orange" rgba="1 .4 0 1"/></asset><worldbody>
+<geom type="box" size=".1 .1 .05" rgba=".1 .2 .8 1"/>
+<body name="sledge" pos="0 0 .1" quat=".9 .1 .3 .2"><joint name="rail" type="slide" axis="0 1 0" range="-.3 .3"/>
+  <geom type="box" size=".05 .05 .05" material="orange" contype="0" conaffinity="0"/>
+  <geom type="box" size=".02 .02 .3" rgba=".1 .2 .8 1" contype="0" conaffinity="0"/>
+  <geom type="capsule" size=".04 .2"/>
+  <body name="palm" pos=".1 0 .3">
+    <joint name="turn" axis="0 0 1" pos=".02 .01 0"/><joint name="bend" axis="0 1 0" pos="0 0 .05" range="-1 2"/>
+    <geom type="sphere" size=".05"/>
+    <body pos="0 0 .2" quat=".8 0 .6 0"><joint name="JOINT" axis="1 0 0" range="-1 1"/>
+      <inertial mass="1" pos="0 0 0" diaginertia=".1 .1 .1"/>
+      <site name="attachment_site" pos="0 .01 .05" quat=".7 .7 .1 0"/>
+</body></body></body></worldbody></mujoco>"""
+"""A slide, a link of two joints off its frame's origin, a link without name or shape, and names that the hand has."""
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory: pytest.TempPathFactory) -> GraspMotion:
+    """Any joints of arm and hand, on a base that stands askew; the wrist is where the arm takes it."""
+    hand, rng = get_hand("allegro"), np.random.default_rng(0)
+    file = tmp_path_factory.mktemp("arm") / "odd.xml"
+    file.write_text(ARM.replace("JOINT", hand.joints[0].name))
+    arm, mount = load_arm(file), default_mount(hand)
+    robot = build_robot(arm, hand, mount, procedural.generate(3))
+    q = rng.uniform([-0.3, -3, -1, -1], [0.3, 3, 2, 1], (T, 4))
+    fingers = rng.uniform(hand.lower, hand.upper, (T, len(hand.joints)))
+    base = Pose(np.array([0.4, -0.2, 0.1]), Rotation.from_euler("z", 0.7))
+    data, position, turns = mujoco.MjData(robot.model), [], []
+    bodies = [robot.model.body(f"hand/{link.name}").id for link in hand.links]
+    for t in range(T):
+        data.qpos[robot.joints], data.qpos[robot.fingers] = q[t], fingers[t]
+        mujoco.mj_kinematics(robot.model, data)
+        position.append(base.rotation.apply(data.xpos[bodies]) + base.position)
+        turn = base.rotation * Rotation.from_quat(data.xquat[bodies], scalar_first=True)
+        turns.append(turn.as_quat(scalar_first=True))
+    alone = dataclasses.replace(
+        motion_of_episode(episode(T)),
+        hand=hand.name,
+        **hand_arrays(hand),
+        joint_position=fingers,
+        joint_target=fingers + 0.01,
+        link_force=np.zeros((T, len(hand.links), 3)),
+        goal={},
+        link_position=np.array(position),
+        link_quaternion=np.array(turns),
+        wrist_position=np.array(position)[:, 0],
+        wrist_quaternion=np.array(turns)[:, 0],
+    )
+    taken = [*alone.link_names.tolist(), *frames.NOT_LINKS]
+    return dataclasses.replace(alone, arm=moved_arm(robot, q, base, mount, taken))
+
+
+def test_links_have_the_names_parents_and_colours_of_the_file(motion: GraspMotion) -> None:
+    arm = motion.arm
+    assert arm is not None and arm.name == "odd"
+    assert arm.link_names.tolist() == ["odd_base", "sledge", "arm_palm", "body_3"]
+    assert arm.link_parent.tolist() == [-1, 0, 1, 2] and arm.joint_link.tolist() == [1, 2, 2, 3]
+    assert arm.joint_limits[1].tolist() == [-1000, 1000] and arm.joint_slides.tolist() == [True, False, False, False]
+    assert [(m.link, m.colour) for m in arm.meshes()] == [
+        (0, pytest.approx(BLUE, abs=1e-6)),
+        (1, pytest.approx(ORANGE, abs=1e-6)),
+        (1, pytest.approx(BLUE, abs=1e-6)),
+        (2, pytest.approx((0.5, 0.5, 0.5), abs=1e-6)),
+    ]
+    np.testing.assert_allclose([np.ptp(m.vertices, axis=0) for m in arm.meshes()][1], [0.1] * 3, atol=1e-6)
+    first = get_hand("allegro").joints[0].name
+    assert robot_joints(motion)[:5] == ["rail", "turn", "bend", first, f"hand_{first}"]
+
+
+@pytest.mark.parametrize("kind", [*motion_formats.FORMATS])
+def test_every_reader_finds_the_arm_where_it_was(motion: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
+    path = tmp_path / f"motion{motion_formats.FORMATS[kind]}"
+    assert motion_formats.export_motions([motion], kind, path) < 0.01
+    assert motion.arm is not None
+    wrong = dataclasses.replace(motion.arm, link_position=motion.arm.link_position + 2e-4 / np.sqrt(3))
+    (track,) = motion_formats.importlib.import_module(f"congrasp.services.export.{kind}").read(path)
+    assert frames.error_mm(dataclasses.replace(motion, arm=wrong), track) == pytest.approx(0.2, rel=0.05)
+    with pytest.raises(CongraspError, match="should not have the frame 'arm_palm'"):
+        frames.error_mm(dataclasses.replace(motion, arm=None), track)
+
+
+def test_the_described_robot_is_mujocos(motion: GraspMotion) -> None:
+    """Joints alone take every link, the palm too, to where the motion has it."""
+    arm = motion.arm
+    assert arm is not None
+    q = np.concatenate([arm.joint_position, motion.joint_position], 1)
+    turn = Rotation.from_quat(arm.link_quaternion[:, 0], scalar_first=True)
+    base = frames.pose_matrices(arm.link_position[:, 0], turn)
+    angles = dict(zip(robot_joints(motion), q.T, strict=True))
+    poses = urdf.forward_kinematics(urdf.robot_urdf(motion), angles, base, "odd_base", base)
+    np.testing.assert_allclose(poses["palm"][:, :3, 3], motion.wrist_position, atol=1e-7)
+    turn = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)
+    np.testing.assert_allclose(poses["palm"][:, :3, :3], turn.as_matrix(), atol=1e-7)
+    np.testing.assert_allclose(poses["body_3"][:, :3, 3], arm.link_position[:, 3], atol=1e-7)
+
+
+def test_a_motions_file_keeps_its_arm(motion: GraspMotion, tmp_path: pathlib.Path) -> None:
+    save_motion(tmp_path / "motion.npz", motion)
+    again = load_motion(tmp_path / "motion.npz").arm
+    assert again is not None and motion.arm is not None and again.name == "odd"
+    for name, values in motion.arm.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], values)
+    slower = at_rate(motion, 50.0)
+    assert slower.arm is not None and len(slower.arm.joint_position) == len(slower.time) == 3
+    np.testing.assert_array_equal(slower.arm.joint_position, motion.arm.joint_position[::2])
+    for name, values, words in (
+        ("mesh_faces", motion.arm.mesh_faces + 9999, "arm_mesh_faces has indices"),
+        ("link_parent", np.array([-1, 3, 1, 2]), "arm_link_parent has links before"),
+        ("joint_position", motion.arm.joint_position[:3], "arm_joint_position has shape"),
+    ):
+        save_motion(
+            tmp_path / "bad.npz", dataclasses.replace(motion, arm=dataclasses.replace(motion.arm, **{name: values}))
+        )
+        with pytest.raises(CongraspError, match=words):
+            load_motion(tmp_path / "bad.npz")
+
+
+def test_a_dataset_has_the_arms_joints_before_the_hands(motion: GraspMotion, tmp_path: pathlib.Path) -> None:
+    arm = motion.arm
+    assert arm is not None
+    farther = dataclasses.replace(arm, link_position=arm.link_position + 0.1)
+    other = dataclasses.replace(motion, arm=farther, **{  # the whole robot elsewhere
+        name: getattr(motion, name) + 0.1 for name in ("link_position", "wrist_position")
+    })  # fmt: skip
+    path = tmp_path / "data"
+    assert motion_formats.export_motions([motion, other], "lerobot", path) < 0.01
+    info = json.loads((path / "meta" / "info.json").read_text())
+    first = get_hand("allegro").joints[0].name
+    state, action = (info["features"][name]["names"] for name in ("observation.state", "action"))
+    assert state[:5] == ["rail", "turn", "bend", first, f"hand_{first}"] and state[-7:-4] == [
+        "wrist_x",
+        "wrist_y",
+        "wrist_z",
+    ]
+    assert action[:5] == ["rail_next", "turn_next", "bend_next", f"{first}_next", f"hand_{first}_target"]
+    assert info["robot_type"] == "congrasp_odd_allegro"
+    rows = pq.read_table(path / "data").slice(0, T)
+    np.testing.assert_allclose(np.array(rows["observation.state"].to_pylist())[:, :4], arm.joint_position, atol=1e-6)
+    following = np.concatenate([arm.joint_position[1:], arm.joint_position[-1:]])
+    np.testing.assert_allclose(np.array(rows["action"].to_pylist())[:, :4], following, atol=1e-6)
+    assert [file.name for file in (path / "meta").glob("*.urdf")] == ["robot.urdf"]
+    assert len(lerobot.read(path)) == 2
+    with pytest.raises(CongraspError, match="one robot"):
+        motion_formats.export_motions([motion, dataclasses.replace(motion, arm=None)], "lerobot", tmp_path / "mixed")
+
+
+def test_other_readers_find_meshes_and_colours(motion: GraspMotion, tmp_path: pathlib.Path) -> None:
+    arm = motion.arm
+    assert arm is not None
+    for kind in ("glb", "usd"):
+        motion_formats.export_motions([motion], kind, tmp_path / f"motion{motion_formats.FORMATS[kind]}")
+    scene = trimesh.load_scene(tmp_path / "motion.glb")
+    seen = {name: scene.graph.get(name)[0] for name in ("odd_base", "sledge", "arm_palm")}
+    for i, pose in enumerate(seen.values()):
+        np.testing.assert_allclose((frames.FROM_Y_UP @ pose)[:3, 3], arm.link_position[0, i], atol=1e-6)
+    colours = [mesh.visual.material.baseColorFactor[:3] for name, mesh in scene.geometry.items() if "sledge" in name]
+    linear = [255 * np.array(colour) ** 2.2 for colour in (ORANGE, BLUE)]
+    np.testing.assert_allclose(colours, linear, atol=1)
+    stage = Usd.Stage.Open(str(tmp_path / "motion.usda"))
+    sledge = stage.GetPrimAtPath("/grasp/odd_base/sledge")
+    pose = np.array(UsdGeom.XformCache(3.0).GetLocalToWorldTransform(sledge)).T
+    np.testing.assert_allclose(pose[:3, 3], arm.link_position[3, 1], atol=1e-6)
+    shown = [UsdGeom.Mesh(sledge.GetChild(f"mesh_{i}")).GetDisplayColorAttr().Get()[0] for i in (0, 1)]
+    np.testing.assert_allclose(shown, [ORANGE, BLUE], atol=1e-6)
+
+
+def test_the_camera_sees_the_arm(motion: GraspMotion) -> None:
+    alone = dataclasses.replace(motion, arm=None)
+    camera = camera_for([alone])
+    shown, blank = (next(pictures(one, camera)).astype(int) for one in (motion, alone))
+    assert (np.abs(shown - blank).sum(-1) > 60).mean() > 0.02
+
+
+def test_a_recording_has_the_arm_and_a_damaged_one_is_refused(motion: GraspMotion) -> None:
+    arm, alone = motion.arm, episode(T)
+    assert arm is not None
+    whole = decode(encode(arm.recorded(alone)))
+    check_episode(whole)
+    recorded = motion_of_episode(whole)
+    again = recorded.arm
+    assert "rail" in urdf.robot_urdf(recorded)
+    assert again is not None and again.name == "odd" and again.joint_names.tolist() == arm.joint_names.tolist()
+    for name, values in arm.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], values)
+    entries = [*episode_entries("a0", whole, 0, 0, JsonChannels())]
+    (scene,) = [SceneUpdate.FromString(entry.data) for entry in entries if entry.channel.topic == "/episode/a0/scene"]
+    shown = {entity.id: entity for entity in scene.entities if entity.id.startswith("arm/")}
+    assert [entity.frame_id for entity in shown.values()] == [
+        f"a0/arm/{name}" for name in ("odd_base", "sledge", "sledge", "arm_palm")
+    ]
+    assert shown["arm/1"].triangles[0].color.r == pytest.approx(1.0) and len(shown["arm/1"].triangles[0].indices) == 36
+    frame = next(FrameTransforms.FromString(e.data) for e in entries if e.channel.topic == "/episode/a0/tf")
+    sledge = next(t.translation for t in frame.transforms if t.child_frame_id == "a0/arm/sledge")
+    np.testing.assert_allclose([sledge.x, sledge.y, sledge.z], arm.link_position[0, 1], atol=1e-6)
+    short = Message({**whole.arrays, "arm/arm_joint_position": arm.joint_position[:2]}, whole.meta)
+    with pytest.raises(CongraspError, match=r"The episode's arm is not valid \(arm_joint_position has shape"):
+        check_episode(short)
