@@ -15,7 +15,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
 from congrasp.services.client.floor import Floor
-from congrasp.services.client.limits import JointLimits, Limiter, as_numbers
+from congrasp.services.client.limits import JointLimits, Limiter, Speeds, as_numbers
 from congrasp.services.client.policy import Answer, Policy, State
 
 Fallback = Literal["freeze", "open"]
@@ -150,6 +150,7 @@ class Guard:
         self._table = np.array(table, float)
         self._needed: dict[str, int] = {}
         self._limiter: Limiter | None = None
+        self._speeds = Speeds(limits.speed, stale)
         self._wanted, self._fresh = np.zeros(fingers + 6), clock()
         self._answer: Answer | None = None
         self._latched: Fallback | None = None
@@ -173,6 +174,7 @@ class Guard:
             start[: self._fingers] = self._limiter.target[: self._fingers]
         floor = Floor(self._table, request.wrist, self._limits.palm) if request.wrist is not None else None
         self._limiter = Limiter(self._limits, start, period=self._period, floor=floor)
+        self._speeds = Speeds(self._limits.speed, self._stale)
         self._wanted, self._fresh = self._limiter.target, self._clock()
         self._answer, self._latched, self._held = None, None, False
         self._height = as_numbers(request.object_pose and request.object_pose[0], 3)[2]
@@ -187,7 +189,8 @@ class Guard:
         """The next command; returns after `wait` seconds at most, and raises nothing for what is wrong with a state.
 
         Args:
-          state: see `Policy.act`; what it lacks counts as not measured, but for velocities, which are then taken as 0.
+          state: see `Policy.act`; what it lacks counts as not measured. Joint velocities that it lacks are estimated from
+            successive positions, for the limits and for the policy.
 
         Raises:
           RefusedError: there is no episode yet.
@@ -197,13 +200,15 @@ class Guard:
         now = self._clock()
         targets = dict(zip(("q_target", "u_target"), np.split(self._limiter.target, [self._fingers]), strict=True))
         lacking = {name: np.full(size, np.nan) for name, size in self._needed.items() if name not in state}
-        self._take(self._asker.exchange({**state, **lacking, **targets}, now, self._wait))
-        mode = self._mode(state)
+        position, velocity = self._measured(state, now)
+        speeds = dict(zip(("q_velocity", "u_velocity"), np.split(velocity, [self._fingers]), strict=True))
+        self._take(self._asker.exchange({**speeds, **state, **lacking, **targets}, now, self._wait))
+        mode = self._mode(state, np.append(position, velocity))
         if mode == "open":
             self._wanted = np.append(self._open, self._limiter.target[self._fingers :])
         elif mode != "follow":
             self._wanted = self._limiter.target
-        limited = self._limiter.limit(self._wanted, *self._measured(state), now)
+        limited = self._limiter.limit(self._wanted, position, velocity, now)
         for name in ("steps", mode if mode in ("follow", "hold") else "fallback", *limited.by):
             setattr(self.counters, name, getattr(self.counters, name) + 1)
         (q_target, u_target), (q_torque, u_torque) = (np.split(x, [self._fingers]) for x in limited[:2])
@@ -240,25 +245,26 @@ class Guard:
             self._wanted, self._answer, self._fresh, self.trouble = wanted, answer, asked, ""
             self.counters.answers += 1
 
-    def _mode(self, state: State) -> Mode:
-        """Returns the mode of the next command."""
+    def _mode(self, state: State, measured: np.ndarray) -> Mode:
+        """Returns the mode of the next command; `measured` are positions and velocities."""
         height = as_numbers(state.get("object_position"), 3)[2]
         self._held |= not np.all(state.get("table", True)) or bool(height > self._height + _LIFTED)
         age = self._clock() - self._fresh
         if self._latched is None and not 0.0 <= age <= self._hold:
             heights = (self._height, height) if "object_position" in self._needed else ()
-            measured = np.isfinite(np.append(heights, self._measured(state))).all()
-            self._latched = self._fallback if measured and not self._held else "freeze"
+            complete = np.isfinite(np.append(heights, measured)).all()
+            self._latched = self._fallback if complete and not self._held else "freeze"
         if self._latched is not None:
             return self._latched
         return "follow" if self._answer is not None and age <= self._stale else "hold"
 
-    def _measured(self, state: State) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities (F + 6,) of a state; velocities that it lacks are zero."""
+    def _measured(self, state: State, now: float) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities (F + 6,) of a state; velocities that it lacks are estimated."""
         sizes = {"q": self._fingers, "u": 6}
-        position = [as_numbers(state.get(name), size) for name, size in sizes.items()]
-        velocity = [as_numbers(state.get(f"{name}_velocity", np.zeros(size)), size) for name, size in sizes.items()]
-        return np.concatenate(position), np.concatenate(velocity)
+        position = np.concatenate([as_numbers(state.get(name), size) for name, size in sizes.items()])
+        estimated = dict(zip(sizes, np.split(self._speeds.of(position, now), [self._fingers]), strict=True))
+        velocity = [as_numbers(state.get(f"{name}_velocity", estimated[name]), size) for name, size in sizes.items()]
+        return position, np.concatenate(velocity)
 
 
 def _described(

@@ -146,6 +146,40 @@ class Limited(NamedTuple):
     """Limits that were applied to a target: of `not_finite`, `torque`, `acceleration`, `speed`, `position`, `table`."""
 
 
+class Speeds:
+    """Velocities of J joints, from successive measured positions."""
+
+    def __init__(self, most: np.ndarray, lasting: float):
+        """Starts without a measurement.
+
+        Args:
+          most: (J,) largest speed that is believed, rad/s or m/s.
+          lasting: seconds after a change of the position for which its speed counts; measurements may arrive at a lower
+            rate than steps.
+        """
+        self._most, self._lasting = most, lasting
+        self._position, self._when = np.full(len(most), np.nan), -math.inf
+        self._speed = np.zeros(len(most))
+
+    def of(self, position: np.ndarray, now: float) -> np.ndarray:
+        """The speeds (J,) at a measurement: the way since the last different one over its time; zero before there are two.
+
+        Args:
+          position: (J,) measured; the last three are angles of which only the rest by full turns matters.
+          now: s.
+        """
+        elapsed = now - self._when
+        if np.array_equal(position, self._position):
+            return self._speed if elapsed <= self._lasting else np.zeros_like(self._speed)
+        way = position - self._position
+        way[-3:] = np.remainder(way[-3:] + np.pi, 2 * np.pi) - np.pi
+        known = np.isfinite(way) & (0.0 < elapsed)
+        speed = np.where(known, way / max(elapsed, 1e-6), 0.0)
+        self._speed = _bounded(speed, self._most)
+        self._position, self._when = position, now
+        return self._speed
+
+
 class Limiter:
     """Targets within limits.
 

@@ -88,6 +88,27 @@ def test_answers_are_followed_from_the_targets_that_were_commanded():
     assert guard.counters.follow == guard.counters.answers == 2 and guard.counters.position == 2
 
 
+def test_velocities_that_are_not_measured_are_estimated_from_positions():
+    """A wrist at 0.4 m/s: its servo is that far ahead that friction of 0.1 N s/m leaves 1 N, 2 N/m being its gain."""
+    clock, policy = Clock(), ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0])))
+    limits = dataclasses.replace(LIMITS, upper=np.full(8, 9.0), lower=np.full(8, -9.0), speed=np.full(8, 50.0))
+    with Guard(policy, limits, OPEN, period=0.5, wait=0.4, clock=clock, stale=0.6, hold=2.0) as guard:
+        guard.reset(REQUEST)
+        turned = np.array([3.1, 3.2 - 2 * np.pi, 3.2 - 2 * np.pi, 3.3 - 2 * np.pi])
+        way = np.array([0.0, 0.2, 0.2, 0.4])
+        moving = [{**STATE, "u": np.array([x, 0, 0, 0, 0, angle])} for x, angle in zip(way, turned, strict=True)]
+        reached = []
+        for state in moving:
+            reached.append(guard.step(state).u_target[0])
+            clock.now += 0.5
+    np.testing.assert_allclose(reached[0], 0.5)  # at rest: 1 N over 2 N/m
+    np.testing.assert_allclose(reached[1:], [0.2 + 0.02 + 0.5, 0.2 + 0.02 + 0.5, 0.4 + 0.01 + 0.5])
+    # The third measurement says nothing new; the last is 0.2 m in a second. Angles beyond a half turn are near.
+    seen = [state["u_velocity"] for state in policy.states]
+    np.testing.assert_allclose([x[0] for x in seen], [0.0, 0.4, 0.4, 0.2])
+    np.testing.assert_allclose([x[5] for x in seen], [0.0, 0.2, 0.2, 0.1])
+
+
 @pytest.mark.parametrize("fallback", ["freeze", "open"])
 def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episode(fallback):
     clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
@@ -151,7 +172,7 @@ def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
             policy.outcome = TransportError("Nobody is there.")
             clock.now += 2.5
             assert guard.step({**state, "table": table}).mode == mode
-        assert policy.states[0].keys() == {"q", "u", "table", "q_target", "u_target"}
+        assert policy.states[0].keys() == {"q", "u", "q_velocity", "u_velocity", "table", "q_target", "u_target"}
 
 
 def test_a_lasting_nan_holds_and_then_freezes_with_the_torque_of_the_last_measurement():
