@@ -24,7 +24,6 @@ from congrasp.services.serve.requests import PACKED, STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)
 """Batches are padded to one of these sizes, so that nothing compiles after the warm-up."""
-_WARM = 5  # runs of each size that are timed
 
 
 class Inference(NamedTuple):
@@ -54,12 +53,10 @@ class PolicyFunction:
         seconds = {}
         for size in sizes:
             batch = np.zeros((size, self.layout.size), np.float32)
-            spent = []
-            for _ in range(1 + _WARM):
+            for _ in range(2):
                 began = time.perf_counter()
                 jax.block_until_ready(self._compiled(weights, batch))
-                spent.append(time.perf_counter() - began)
-            seconds[size] = min(spent)
+                seconds[size] = time.perf_counter() - began
         return seconds
 
     def __call__(self, weights: InferenceParameters, queries: Sequence[Query]) -> list[Inference | Exception]:

@@ -64,8 +64,6 @@ class Query(NamedTuple):
     """(n, S) float32, laid out by `Layout`; its values are checked by `Layout.complete`."""
     asked: tuple[str, ...]
     """Names of the requested constraints."""
-    first: int | None = None
-    """Index of the first state in the query of which this is a part; None for a whole query."""
 
 
 class Layout:
@@ -232,7 +230,7 @@ class Layout:
         if not wrong.any():
             return None
         state = int(wrong.any(1).argmax())
-        which = "" if len(checks) == 1 and query.first is None else f" of state {state + (query.first or 0)}"
+        which = f" of state {state}" if len(checks) > 1 else ""
         finite, rest = not wrong[state, 0], ~wrong[state, 1:]
         fitting, lengths = rest[: len(self.known)].tolist(), rest[len(self.known) :].tolist()
         if not finite:

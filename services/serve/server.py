@@ -19,7 +19,7 @@ from congrasp.common.transport.keys import Keys, account, below
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.ops.logs import log
 from congrasp.services.serve.batching import Batcher, Parts
-from congrasp.services.serve.inference import Inference, PolicyFunction
+from congrasp.services.serve.inference import BATCH_SIZES, Inference, PolicyFunction
 from congrasp.services.serve.requests import Query
 
 Source = Callable[[int], PolicyBundle | None]
@@ -30,9 +30,10 @@ DEPTH = 64
 """Limit of queued queries; further ones are refused at once."""
 SHARE = 16
 """Limit of queued queries of one peer."""
+SHARED = BATCH_SIZES[1]
+"""Limit of a batch's states while several peers share it: small enough for their control loops."""
 _TIMEOUT, _MAX_TIMEOUT = 1.0, 60.0  # deadline of a query by default and at most, s
 _FOLLOW_SECONDS = 0.5
-_NEWEST = 0.02  # share of the newest batch in the server's estimate of its speed
 
 
 class _Held(NamedTuple):
@@ -80,17 +81,17 @@ class PolicyServer:
         self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
         self._held = _hold(first)
         self._seconds = self._function.warm_up(self._held.inference_parameters)
-        self._slowness = 1.0
         self._answered = 0
         self._trouble = ""
         self._closed = threading.Event()
         self._batcher: Batcher[Query, _Answered] = Batcher(
             self._infer,
-            seconds=self._seconds,
+            weigh=lambda query: len(query.vectors),
+            size=BATCH_SIZES[-1],
             window=WINDOW,
             depth=DEPTH,
             share=SHARE,
-            parts=Parts(_weigh, _cut, self._join),
+            parts=Parts(SHARED, _cut, self._join),
         )
         transport.serve(keys.health, self._describe)
         transport.serve(
@@ -102,8 +103,8 @@ class PolicyServer:
     def health(self) -> dict[str, Any]:
         """Readiness, version, hand, queue, and why a newer policy was refused, as JSON.
 
-        At most `queue_limit` queries are queued, `peer_limit` of one peer. `states_per_second` is the most that the
-        server can answer, by the times of its latest batches.
+        The server takes no more than `queue_limit` queries that wait, `peer_limit` of one peer, and answers no more
+        than `states_per_second`, as measured at its start.
         """
         held = self._held
         return {
@@ -116,7 +117,7 @@ class PolicyServer:
             "queue": len(self._batcher),
             "queue_limit": DEPTH,
             "peer_limit": SHARE,
-            "states_per_second": round(max(size / seconds for size, seconds in self._seconds.items()) / self._slowness),
+            "states_per_second": round(max(size / seconds for size, seconds in self._seconds.items())),
             "answered": self._answered,
             "trouble": self._trouble,
         }
@@ -188,12 +189,10 @@ class PolicyServer:
 
     def _infer(self, queries: Sequence[Query], queued: Sequence[float]) -> list[_Answered | Exception]:
         """Answers a batch."""
-        held, began, states = self._held, time.monotonic(), sum(map(_weigh, queries))
-        self._on_batch(states)
+        held, began = self._held, time.monotonic()
+        self._on_batch(sum(len(query.vectors) for query in queries))
         answers = self._function(held.inference_parameters, queries)
         spent = time.monotonic() - began
-        expected = next(seconds for size, seconds in self._seconds.items() if size >= states)
-        self._slowness += _NEWEST * (spent / expected - self._slowness)
         return [
             answer if isinstance(answer, Exception) else (answer, held, waited, spent)
             for answer, waited in zip(answers, queued, strict=True)
@@ -232,14 +231,9 @@ class PolicyServer:
         self._trouble = ""
 
 
-def _weigh(query: Query) -> int:
-    """Returns the number of states of a query."""
-    return len(query.vectors)
-
-
 def _cut(query: Query, first: int, end: int) -> Query:
     """Returns some states of a query."""
-    return query._replace(vectors=query.vectors[first:end], first=first)
+    return query._replace(vectors=query.vectors[first:end])
 
 
 def _hold(bundle: PolicyBundle) -> _Held:

@@ -179,9 +179,9 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
 
 @pytest.mark.parametrize("beside_others", [False, True])
 def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(served, beside_others, monkeypatch):
-    """Beside other clients the eleven are inferred in parts."""
+    """Beside other clients the eleven are inferred in two parts."""
     _, endpoint, episode = served
-    monkeypatch.setattr("congrasp.services.serve.batching._RECENT", 1e6 if beside_others else 0.0)
+    monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6 if beside_others else 0.0)
     if beside_others:
         with PolicyClient(endpoint, timeout=5.0) as other:
             other.reset(episode.request)
