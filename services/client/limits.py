@@ -173,7 +173,7 @@ class Speeds:
             return self._speed if elapsed <= self._lasting else np.zeros_like(self._speed)
         way = position - self._position
         way[-3:] = np.remainder(way[-3:] + np.pi, 2 * np.pi) - np.pi
-        known = np.isfinite(way) & (0.0 < elapsed)
+        known = np.isfinite(way) & (elapsed > 0.0)
         speed = np.where(known, way / max(elapsed, 1e-6), 0.0)
         self._speed = _bounded(speed, self._most)
         self._position, self._when = position, now
