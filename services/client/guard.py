@@ -189,8 +189,8 @@ class Guard:
         """The next command; returns after `wait` seconds at most, and raises nothing for what is wrong with a state.
 
         Args:
-          state: see `Policy.act`; what it lacks counts as not measured. Joint velocities that it lacks are estimated from
-            successive positions, for the limits and for the policy.
+          state: see `Policy.act`; what it lacks counts as not measured. Joint velocities that it lacks are
+            estimated from successive positions, for the limits and for the policy.
 
         Raises:
           RefusedError: there is no episode yet.

@@ -162,7 +162,7 @@ class Speeds:
         self._speed = np.zeros(len(most))
 
     def of(self, position: np.ndarray, now: float) -> np.ndarray:
-        """The speeds (J,) at a measurement: the way since the last different one over its time; zero before there are two.
+        """Speeds (J,) at a measurement: the way since the last different one over its time; zero before there are two.
 
         Args:
           position: (J,) measured; the last three are angles of which only the rest by full turns matters.
