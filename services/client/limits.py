@@ -158,25 +158,25 @@ class Speeds:
             rate than steps.
         """
         self._most, self._lasting = most, lasting
-        self._position, self._when = np.full(len(most), np.nan), -math.inf
+        self._position, self._when = np.full(len(most), np.nan), np.full(len(most), -math.inf)
         self._speed = np.zeros(len(most))
 
     def of(self, position: np.ndarray, now: float) -> np.ndarray:
-        """Speeds (J,) at a measurement: the way since the last different one over its time; zero before there are two.
+        """Speeds (J,) at a measurement: each joint's way since its last change over the time; zero before two.
 
         Args:
           position: (J,) measured; the last three are angles of which only the rest by full turns matters.
           now: s.
         """
-        elapsed = now - self._when
-        if np.array_equal(position, self._position):
-            return self._speed if elapsed <= self._lasting else np.zeros_like(self._speed)
-        way = position - self._position
+        elapsed, way = now - self._when, position - self._position
         way[-3:] = np.remainder(way[-3:] + np.pi, 2 * np.pi) - np.pi
         known = np.isfinite(way) & (elapsed > 0.0)
-        speed = np.where(known, way / max(elapsed, 1e-6), 0.0)
-        self._speed = _bounded(speed, self._most)
-        self._position, self._when = position, now
+        changed = position != self._position  # also where it is not finite
+        speed = np.where(known, way / np.maximum(elapsed, 1e-6), 0.0)
+        self._speed = _bounded(
+            np.where(changed, speed, np.where(elapsed <= self._lasting, self._speed, 0.0)), self._most
+        )
+        self._position, self._when = position, np.where(changed, now, self._when)
         return self._speed
 
 

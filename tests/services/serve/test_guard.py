@@ -96,7 +96,11 @@ def test_velocities_that_are_not_measured_are_estimated_from_positions():
         guard.reset(REQUEST)
         turned = np.array([3.1, 3.2 - 2 * np.pi, 3.2 - 2 * np.pi, 3.3 - 2 * np.pi])
         way = np.array([0.0, 0.2, 0.2, 0.4])
-        moving = [{**STATE, "u": np.array([x, 0, 0, 0, 0, angle])} for x, angle in zip(way, turned, strict=True)]
+        fingers = np.linspace(0.0, 0.15, 4)  # measured at every step, unlike the wrist
+        moving = [
+            {**STATE, "q": np.full(FINGERS, q), "u": np.array([x, 0, 0, 0, 0, angle])}
+            for q, x, angle in zip(fingers, way, turned, strict=True)
+        ]
         reached = []
         for state in moving:
             reached.append(guard.step(state).u_target[0])
@@ -107,6 +111,7 @@ def test_velocities_that_are_not_measured_are_estimated_from_positions():
     seen = [state["u_velocity"] for state in policy.states]
     np.testing.assert_allclose([x[0] for x in seen], [0.0, 0.4, 0.4, 0.2])
     np.testing.assert_allclose([x[5] for x in seen], [0.0, 0.2, 0.2, 0.1])
+    np.testing.assert_allclose([state["q_velocity"] for state in policy.states], [[0.0] * 2, *[[0.1] * 2] * 3])
 
 
 @pytest.mark.parametrize("fallback", ["freeze", "open"])
