@@ -216,7 +216,7 @@ def arm_meshes(motion: GraspMotion) -> dict[str, list[Mesh]]:
     """Meshes of each link of the arm that has any; empty without an arm."""
     found: dict[str, list[Mesh]] = {}
     if arm := motion.arm:
-        for mesh in arm.meshes():
+        for mesh in arm.meshes:
             found.setdefault(str(arm.link_names[mesh.link]), []).append(mesh)
     return found
 

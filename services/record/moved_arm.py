@@ -5,7 +5,8 @@ V vertices, E triangles.
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+import functools
+from collections.abc import Mapping
 from typing import Annotated, NamedTuple, get_type_hints
 
 import numpy as np
@@ -59,12 +60,15 @@ class MovedArm:
     mesh_faces: Annotated[np.ndarray, "(E, 3) indices of arm_mesh_vertices"]
     face_mesh: Annotated[np.ndarray, "(E,) mesh of each triangle"]
 
-    def meshes(self) -> Iterator[Mesh]:
-        """Yields the meshes in their order."""
+    @functools.cached_property
+    def meshes(self) -> tuple[Mesh, ...]:
+        """Meshes with triangles, in their order."""
+        found = []
         for m, (link, colour) in enumerate(zip(self.mesh_link.tolist(), self.mesh_colour.tolist(), strict=True)):
             used, faces = np.unique(self.mesh_faces[self.face_mesh == m], return_inverse=True)
             if len(used):
-                yield Mesh(link, tuple(colour), self.mesh_vertices[used], faces.reshape(-1, 3))
+                found.append(Mesh(link, tuple(colour), self.mesh_vertices[used], faces.reshape(-1, 3)))
+        return tuple(found)
 
     def at(self, frames: np.ndarray) -> "MovedArm":
         """Returns the arm in other frames (n,) of the motion."""

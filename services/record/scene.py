@@ -154,7 +154,7 @@ def _static_scene(
         if any(part.colour == FLESH for part in parts):
             _add_capsules(entity, link, (*FLESH, 1.0))
     if arm:
-        for m, mesh in enumerate(arm.meshes()):
+        for m, mesh in enumerate(arm.meshes):
             entity = _entity(update, f"arm/{m}", f"{actor}/arm/{arm.link_names[mesh.link]}", now)
             _add_triangles(entity, mesh.vertices, mesh.faces, (*mesh.colour, 1.0))
     frame = f"{actor}/object"

@@ -131,7 +131,7 @@ def arm_shapes(arm: MovedArm, frame: int) -> list[Shape]:
             arm.link_quaternion[frame, mesh.link],
             colour=mesh.colour,
         )
-        for mesh in arm.meshes()
+        for mesh in arm.meshes
     ]
 
 

@@ -246,7 +246,7 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
     assert recorded is not None
     np.testing.assert_array_equal(recorded.link_position, motion.arm.link_position)
     assert recorded.link_names.tolist() == motion.arm.link_names.tolist()
-    assert [m.colour for m in recorded.meshes()] == [m.colour for m in motion.arm.meshes()]
+    assert [m.colour for m in recorded.meshes] == [m.colour for m in motion.arm.meshes]
     message = json.loads((tmp_path / "block" / TRAJECTORY).read_text())
     assert message["joint_names"] == names and len(message["points"]) == len(rows) - 1
     last = message["points"][-1]

@@ -96,13 +96,13 @@ def test_links_have_the_names_parents_and_colours_of_the_file(motion: GraspMotio
     assert arm.link_names.tolist() == ["odd_base", "sledge", "arm_palm", "body_3"]
     assert arm.link_parent.tolist() == [-1, 0, 1, 2] and arm.joint_link.tolist() == [1, 2, 2, 3]
     assert arm.joint_limits[1].tolist() == [-1000, 1000] and arm.joint_slides.tolist() == [True, False, False, False]
-    assert [(m.link, m.colour) for m in arm.meshes()] == [
+    assert [(m.link, m.colour) for m in arm.meshes] == [
         (0, pytest.approx(BLUE, abs=1e-6)),
         (1, pytest.approx(ORANGE, abs=1e-6)),
         (1, pytest.approx(BLUE, abs=1e-6)),
         (2, pytest.approx((0.5, 0.5, 0.5), abs=1e-6)),
     ]
-    np.testing.assert_allclose([np.ptp(m.vertices, axis=0) for m in arm.meshes()][1], [0.1] * 3, atol=1e-6)
+    np.testing.assert_allclose([np.ptp(m.vertices, axis=0) for m in arm.meshes][1], [0.1] * 3, atol=1e-6)
     first = get_hand("allegro").joints[0].name
     assert robot_joints(motion)[:5] == ["rail", "turn", "bend", first, f"hand_{first}"]
 
