@@ -106,7 +106,7 @@ def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int 
     return 0
 
 
-def robot(seconds: float = 600.0, kill_every: float = 30.0, out: pathlib.Path = pathlib.Path("robot")) -> int:
+def robot(seconds: float = 600.0, kill_every: float = 30.0, out: pathlib.Path = pathlib.Path("runs/robot")) -> int:
     """The ROS 2 node over Zenoh against a simulated hand that lifts an object, while the policy server is killed.
 
     Args:
