@@ -124,6 +124,23 @@ def robot(seconds: float = 600.0, kill_every: float = 30.0, out: pathlib.Path = 
     return int(not bench_robot(seconds, kill_every, out))
 
 
+def sensors(policies: tuple[str, ...] = ("allegro", "allegro-student"), episodes: int = 24) -> int:
+    """Grasps with all measurements, without contact forces, and without velocities either, in simulated time.
+
+    Args:
+      policies: Policy files, or names of pretrained policies.
+      episodes: Number of procedural objects, one episode each.
+
+    Examples:
+      python -m tests.benchmarks sensors
+      python -m tests.benchmarks sensors --policies allegro-student --episodes 4
+    """
+    from tests.benchmarks.sensors import bench_sensors
+
+    bench_sensors(policies, episodes)
+    return 0
+
+
 def shutdown(repeats: int = 100, within: float = 45.0, seed: int = 0) -> int:
     """Whether a run with a learner and two actors ends within 5 s of a signal, and leaves no process behind.
 
@@ -305,6 +322,7 @@ COMMANDS = {
     "speeds": speeds,
     "measures": measures,
     "robot": robot,
+    "sensors": sensors,
     "shutdown": shutdown,
     "security": security,
     "transport": transport,

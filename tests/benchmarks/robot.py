@@ -22,7 +22,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural, store
 from congrasp.common.objects.pool import scale_objects
 from congrasp.common.policy import bundle as bundles
-from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.ports import free_port
 
@@ -168,12 +168,14 @@ class Rig:
 def bench_robot(seconds: float, kill_every: float, folder: pathlib.Path) -> bool:
     """Lifts an object again and again while the server is killed; prints the outcome and returns whether it is good.
 
+    The policy is the student with a tracker, because the topics have neither contact forces nor velocities.
+
     Args:
       seconds: duration.
       kill_every: seconds from one kill to the next; half of them come while the object is held.
       folder: takes the node's output.
     """
-    loop, policy = example("robot_loop"), policy_file(None, "allegro")
+    loop, policy = example("robot_loop"), named_policy("allegro-student")
     hand, task = get_hand("allegro"), bundles.load(policy).task
     robot = loop.MujocoRobot(hand, task, SEED, congrasp.JointLimits.of_hand(hand, task.control))
     with contextlib.closing(Rig(folder, robot, task)) as rig:
