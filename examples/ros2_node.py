@@ -1,6 +1,6 @@
 """A ROS 2 node between a policy server and a robot; without ROS 2 the same messages go over Zenoh.
 
-    congrasp serve --hand allegro
+    congrasp serve --policy allegro-student
     python examples/ros2_node.py mug:7 --hand allegro --dry-run                       # where there is rclpy
     python examples/ros2_node.py mug:7 --hand allegro --zenoh tcp/127.0.0.1:7447      # zenoh-bridge-ros2dds, or a robot
 
