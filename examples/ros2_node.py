@@ -47,6 +47,10 @@ WAITING = 2.0
 """Seconds after which the node says what it waits for."""
 LIFT_SPEED = 0.1
 """m/s, the mean."""
+_POLL, _TOGETHER = 0.0005, 0.001
+"""Seconds between two looks at the topics, and in which measurements of one moment arrive."""
+SETTLING_STEPS = 50
+"""Control steps after the rise until the targets freeze."""
 TRACKER_AGE = 0.5
 """Seconds that a student's object or cloud may be old: it learnt with 10 Hz, 100 ms, and samples that are lost."""
 
@@ -83,9 +87,10 @@ class Arguments:
     hand_eye: str = "0 0 0 0 0 0"
     """X Y Z ROLL PITCH YAW by which the camera is off, in its own frame: metres, degrees."""
     approach: float = 0.0
-    """Seconds of fresh answers, at full speed, until the object may leave the table; 0: as in training."""
+    """Seconds of fresh answers, at full speed, until the object may leave the table; 0: twice as long as in training,
+    since the hand is slower by what the robot is late."""
     lift: float = 0.0
-    """Metres by which the hand then rises."""
+    """Metres by which the hand then rises; half a second later its targets freeze."""
     slow: float = 1.0
     """Share of the speed: of the policy's steps and of the limits; 0.25 to begin with."""
     dry_run: bool = False
@@ -175,7 +180,24 @@ class PolicyNode:
     def __init__(self, bus: Bus, guard: congrasp.Guard, sensors: Sensors, target: Target, plan: "Plan"):
         self._bus, self._guard, self._sensors, self._target, self._plan = bus, guard, sensors, target, plan
         self._base: Pose | None = None
-        self._followed = 0
+        self._followed, self._last = 0, time.monotonic()
+
+    def wait(self, period: float) -> float:
+        """Waits for the joints of the coming control step, at most half a period longer; returns the time then.
+
+        Steps that are not in time with the measurements see some of them twice and others never, and are late by up to
+        a period: with both, a policy loses its grasp.
+        """
+        due = self._last + period
+        while (now := time.monotonic()) < due + 0.5 * period:
+            received = self._bus.receive()
+            self._sensors.take(received)
+            if now >= due - 0.5 * period and any(topic == "joint_states" for topic, _ in received):
+                time.sleep(_TOGETHER)
+                break
+            time.sleep(_POLL)
+        self._last = time.monotonic()
+        return self._last
 
     def step(self) -> congrasp.Command | None:
         """Reads the topics and commands; None until the episode has begun."""
@@ -189,6 +211,8 @@ class PolicyNode:
                 return None
             self._base = palm
             self._guard.reset(dataclasses.replace(self._target.request(seen), q=q, wrist=palm.arrays()))
+        if self._plan.lifted(self._followed):
+            self._guard.freeze()
         state = {"q": q, "table": np.asarray(self._followed < self._plan.approach_steps), **seen}
         if np.isfinite(velocity).all():
             state["q_velocity"] = velocity
@@ -240,6 +264,11 @@ class Plan:
         share = np.clip((followed - self.approach_steps) * self.step / self.lift, 0.0, 1.0) if self.lift else 0.0
         return np.array([0.0, 0.0, self.lift * share**2 * (3.0 - 2.0 * share)])
 
+    def lifted(self, followed: int) -> bool:
+        """True half a second after the end of the rise: no policy was trained to hold longer than two seconds."""
+        steps = self.approach_steps + self.lift / self.step + SETTLING_STEPS
+        return self.lift > 0.0 and followed >= steps
+
 
 def slowed(limits: congrasp.JointLimits, share: float) -> congrasp.JointLimits:
     """Limits of a hand that does everything at a share of the speed."""
@@ -279,23 +308,23 @@ def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described
     object_age = arguments.object_age or (TRACKER_AGE if student else arguments.robot_age)
     sensors = Sensors(arguments, described["joints"], object_age)
     target = target_of(arguments, sensors, hand, described)
-    steps = round(arguments.approach / described["period"]) or described["approach_steps"]
+    steps = round(arguments.approach / described["period"]) or 2 * described["approach_steps"]
     plan = Plan(arguments.world, steps, arguments.lift, LIFT_SPEED * described["period"], arguments.dry_run)
     limits = slowed(congrasp.JointLimits(**described["limits"]), slow)
     times = {"period": period, "wait": 0.6 * period, "stale": arguments.stale / slow, "hold": arguments.hold / slow}
     with congrasp.Guard(client, limits, np.array(described["open_pose"]), fallback="open", **times) as guard:
-        node, ticker, printed = PolicyNode(bus, guard, sensors, target, plan), congrasp.Ticker(1.0 / period), ""
-        begin = last = ticker.wait()
+        node, printed = PolicyNode(bus, guard, sensors, target, plan), ""
+        begin = last = time.monotonic()
         try:
             while True:
-                now, command = ticker.wait(), node.step()
+                now, command = node.wait(period), node.step()
                 waiting = "wait" if now > begin + WAITING else ""
                 mode = waiting if command is None else command.mode
                 if mode != printed or (mode in ("wait", "follow") and arguments.dry_run and now > last + 1.0):
                     print(report(command, guard, sensors), flush=True)
                     printed, last = mode, now
         except KeyboardInterrupt:
-            print(f"{guard.counters}, {ticker.missed} deadlines missed")
+            print(guard.counters)
 
 
 def report(command: congrasp.Command | None, guard: congrasp.Guard, sensors: Sensors) -> str:

@@ -185,6 +185,10 @@ class Guard:
         """Opens the fingers from the next step on, until `reset`, whatever they hold."""
         self._latched = "open"
 
+    def freeze(self) -> None:
+        """Keeps the targets and their torques from the next step on, until `reset` or `open`."""
+        self._latched = "freeze"
+
     def step(self, state: State) -> Command:
         """The next command; returns after `wait` seconds at most, and raises nothing for what is wrong with a state.
 

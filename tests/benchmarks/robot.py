@@ -77,7 +77,7 @@ class Rig:
         self._heard = {topic: self._session.declare_subscriber(topic, RingChannel(1)) for topic in topics}
         self._node: subprocess.Popen[bytes] | None = None
         self._ticker, self.commands, self._highest = congrasp.Ticker(100.0), 0, -np.inf
-        self._target = np.array(self.robot.request.q), np.zeros(6)
+        self._target, self._begun = (np.array(self.robot.request.q), np.zeros(6)), 0  # ns, of the episode's begin
 
     @property
     def lines(self) -> list[str]:
@@ -88,6 +88,7 @@ class Rig:
         self.end()
         self.robot.reset()
         self._target, self._highest = (np.array(self.robot.request.q), np.zeros(6)), -np.inf
+        self._begun = time.time_ns()
         heading = " ".join(f"{x:.6f}" for x in self.robot.request.constraints["heading"]["direction"])
         command = [sys.executable, str(EXAMPLES / "ros2_node.py"), str(self._object), "--zenoh", self._endpoint]
         command += ["--connect", server, "--heading", heading, "--hand", self._hand, *options]
@@ -132,14 +133,13 @@ class Rig:
         self._send_joints(state["q"])
         self._send_pose("wrist_pose", self._base[0] + self._base[1].apply(state["u"][:3]), turn)
         self._send_pose("object_pose", state["object_position"] + thing.apply(self._origin), thing)
-        joints, wrist = (subscriber.try_recv() for subscriber in self._heard.values())
+        joints, wrist = self._newest("joint_command", JOINTS), self._newest("wrist_command", POSE)
         q_target, u_target = self._target
         if joints is not None:
             self.commands += 1
-            q_target = np.array(STORE.deserialize_cdr(joints.payload.to_bytes(), JOINTS).position)
+            q_target = np.array(joints.position)
         if wrist is not None:
-            pose = STORE.deserialize_cdr(wrist.payload.to_bytes(), POSE).pose
-            place, around = pose.position, pose.orientation
+            place, around = wrist.pose.position, wrist.pose.orientation
             back = self._base[1].inv()
             turn = back * Rotation.from_quat([around.x, around.y, around.z, around.w])
             moved = back.apply(np.array([place.x, place.y, place.z]) - self._base[0])
@@ -147,6 +147,14 @@ class Rig:
         self._target = q_target, u_target
         self.robot.move(congrasp.Command(q_target, u_target, q_target, u_target, "follow", None))
         self._highest = max(self._highest, self.lifted)
+
+    def _newest(self, topic: str, kind: str) -> Any:
+        """The newest command since the last call; None if there is none, or it is of the node before."""
+        sample = self._heard[topic].try_recv()
+        message = sample and STORE.deserialize_cdr(sample.payload.to_bytes(), kind)
+        if message is None or message.header.stamp.sec * 10**9 + message.header.stamp.nanosec < self._begun:
+            return None
+        return message
 
     def _header(self) -> Any:
         types, stamp = STORE.types, time.time_ns()

@@ -166,6 +166,21 @@ def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
         assert guard.step(STATE).mode == "hold"
 
 
+def test_a_frozen_hand_keeps_its_targets_while_the_policy_answers():
+    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    with guarded(policy, clock, fallback="open") as guard:
+        kept = guard.step(STATE)
+        guard.freeze()
+        policy.outcome = answer(np.array([0.9, 0.9]))
+        clock.now += 0.5
+        frozen = guard.step(STATE)
+        assert (kept.mode, frozen.mode) == ("follow", "freeze")
+        np.testing.assert_allclose(frozen.q_target, kept.q_target)
+        guard.open()
+        clock.now += 0.5
+        assert guard.step(STATE).mode == "open"
+
+
 def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
     """Its hand opens after a silence, unless the table's absence says that something may be held."""
     state = {name: STATE[name] for name in ("q", "u")}

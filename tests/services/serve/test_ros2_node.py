@@ -356,12 +356,30 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
         rise = [0.1 * s**2 * (3 - 2 * s) for s in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)]
         assert tables[0] and not tables[-1]
         assert [float(node._plan.rise(3 + n)[2]) for n in range(6)] == pytest.approx(rise)
+        # 3 steps of approach, 5 of the rise, half a second: from then on the targets are kept.
+        assert [node._plan.lifted(n) for n in (8, 57, 58)] == [False, False, True]
+        node._followed = 58
+        bus.said = robot_says(obj)
+        assert [node.step().mode for _ in range(2)] == ["freeze", "freeze"]
     bus.sent = {}
     with node_of(example, bus, dry_run=True) as (node, _, obj):
         bus.said = robot_says(obj)
         command = node.step()
         line = example.report(command, node._guard, node._sensors)
         assert command is not None and bus.sent == {} and line.startswith(command.mode)
+
+
+def test_a_step_waits_for_the_measurement_of_its_time(example):
+    """Not for one that came more than half a period early, and for none more than half a period late."""
+    bus, began = Wire(), time.monotonic()
+    with node_of(example, bus) as (node, _, obj):
+        node._last = began
+        bus.receive = lambda: robot_says(obj) if time.monotonic() > began + 0.07 else []
+        assert 0.07 <= node.wait(0.1) - began < 0.1
+        node._last, bus.receive = (again := time.monotonic()), lambda: robot_says(obj)
+        assert 0.05 <= node.wait(0.1) - again < 0.1
+        node._last, bus.receive = (silent := time.monotonic()), lambda: []
+        assert node.wait(0.1) - silent >= 0.15
 
 
 def test_a_slow_hand_has_a_share_of_the_speed(example):
