@@ -203,13 +203,14 @@ class GraspEnv:
     def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, tuple[Array, ...]]:
         """Returns the joint targets of an action, and the inputs of the engine's step (`Physics.step`)."""
         target, table = decode(self.seen(state), settings.control, action), self.table_present(state)
-        motors = motor_positions(self.hand, target.q_target)
+        followed = self._followed(state, target)
+        motors = motor_positions(self.hand, followed.q_target)
         if settings.protocol is None:
-            return target, (jnp.concatenate([target.u_target, motors], -1), table)
+            return target, (jnp.concatenate([followed.u_target, motors], -1), table)
         start, time = state.reset_state, state.time
         frame = protocols.frame(settings.protocol, self.task, time + 0.5)
         table = table | settings.protocol.table
-        u_target = protocols.carried_targets(target.u_target, self.hand, start.base_quaternion, frame)
+        u_target = protocols.carried_targets(followed.u_target, self.hand, start.base_quaternion, frame)
         force = protocols.push(settings.protocol, self.task, time, start.object_index, start.mass_scale)
         return target, (jnp.concatenate([u_target, motors], -1), table, force)
 
@@ -233,7 +234,8 @@ class GraspEnv:
         if settings.protocol is not None:
             state = state._replace(frame=protocols.frame(settings.protocol, task, state.time))
         seen = protocols.carried(physics_state, state.reset_state.base_quaternion, state.frame)
-        momentum = track_load(self.hand, task, state.momentum, seen.u, seen.u_velocity, state.u_target)
+        followed = self._followed(state, Action(state.q_target, state.u_target))
+        momentum = track_load(self.hand, task, state.momentum, seen.u, seen.u_velocity, followed.u_target)
         state = state._replace(momentum=jnp.where(physics_state.diverged[:, None], 0.0, momentum))
         state = self.with_scene(self._sense(state, physics_state), physics_state)
         scene = self.scene_of(state)
@@ -279,13 +281,14 @@ class GraspEnv:
         """Returns the environments with the engine's scene, expressed in the carried frame."""
         reset_state = state.reset_state
         physics_state = protocols.carried(physics_state, reset_state.base_quaternion, state.frame)
+        followed = self._followed(state)
         scene = SceneState(
             q=physics_state.q,
             u=physics_state.u,
             q_velocity=physics_state.q_velocity,
             u_velocity=physics_state.u_velocity,
-            q_target=state.q_target,
-            u_target=state.u_target,
+            q_target=followed.q_target,
+            u_target=followed.u_target,
             object_position=physics_state.object_position,
             object_quaternion=physics_state.object_quaternion,
             object_velocity=physics_state.object_velocity,
@@ -379,6 +382,18 @@ class GraspEnv:
         pose = shown.object_position, shown.object_quaternion
         newest = Readings(shown.q, shown.u, state.q_target, state.u_target, *pose)
         return state._replace(tracker=tracker, camera=camera, readings=sensing.push(state.readings, newest))
+
+    def _followed(self, state: EnvState, newest: Action | None = None) -> Action:
+        """Returns the targets that the servos follow in a step with its `newest` targets, or followed in the last."""
+        if state.readings is None or not self.task.sensing.latency[1]:
+            return newest or Action(state.q_target, state.u_target)
+        sensor = state.camera or state.tracker
+        assert sensor is not None, "readings are of a sensor"
+        past = Action(state.readings.q_target, state.readings.u_target)
+        if newest is not None:
+            past = Action(*(jnp.concatenate([new[:, None], old], 1) for new, old in zip(newest, past, strict=True)))
+        steps = sensor.sensors.latency[:, None, None]
+        return Action(*(jnp.take_along_axis(targets, steps, 1)[:, 0] for targets in past))
 
     def table_present(self, state: EnvState) -> Array:
         """(B,) bool: the table is present in the coming control step."""

@@ -8,8 +8,10 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from congrasp.common.config import RunConfig
+from congrasp.common.hands import get_hand
 from congrasp.common.policy.bundle import PolicySpec, full_layout
-from congrasp.common.task.teaching import EXTRA
+from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.teaching import extra
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import TAUGHT, WORLDS, RolloutForm, Schema
 from congrasp.learner.distributed.collectives import AXIS
@@ -23,10 +25,15 @@ def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> Rollout
         observation=sum(size for _, size in spec.layout),
         action=spec.action_size,
         half=config.half_observations,
-        teacher=0 if TAUGHT.keys().isdisjoint(schema) else sum(size for _, size in full_layout(config.task)) + EXTRA,
+        teacher=0 if TAUGHT.keys().isdisjoint(schema) else _teacher_inputs(config.task),
         privileged=spec.privileged_size,
         arrays=schema,
     )
+
+
+def _teacher_inputs(task: TaskConfig) -> int:
+    """Size of `common.task.teaching.observe_for_teacher`'s rows."""
+    return sum(size for _, size in full_layout(task)) + extra(get_hand(task.hand))
 
 
 def collate(rollouts: Sequence[Mapping[str, Array]], schema: Schema) -> dict[str, Array]:

@@ -114,6 +114,8 @@ class SensingConfig:
     """Elevation of the camera above the object, rad; at most 1.5."""
     camera_azimuth: tuple[float, float] = (-3.15, 3.15)
     """Direction from the object to the camera about the vertical, from the world's x axis, rad."""
+    latency: tuple[float, float] = (0.0, 0.0)
+    """Seconds until the servos follow a target, rounded to control steps, of which there are fewer than `history`."""
 
 
 @dataclasses.dataclass(frozen=True)

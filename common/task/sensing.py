@@ -42,6 +42,8 @@ class Sensors(NamedTuple):
     """(B, 3) m, constant error of the samples, world frame."""
     rotation_bias: Array
     """(B, 3) rad, rotation vector of a constant error of the samples, world frame."""
+    latency: Array
+    """(B,) int control steps until the servos follow a target."""
     eye: Array
     """(B, 3) m, from the object's resting position to the camera, world frame."""
 
@@ -91,6 +93,10 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
     def drawn(number: int, limits: tuple[float, float]) -> Array:
         return jax.random.uniform(keys[number], (batch,), minval=limits[0], maxval=limits[1])
 
+    def uniform(number: int, limits: tuple[float, float]) -> Array:
+        own = jax.random.fold_in(key, number)
+        return jax.random.uniform(own, (batch,), minval=limits[0], maxval=limits[1])
+
     def bias(number: int, limits: tuple[float, float]) -> Array:
         size, direction = jax.random.split(jax.random.fold_in(key, number))
         deviation = jax.random.uniform(size, (batch, 1), minval=limits[0], maxval=limits[1])
@@ -114,6 +120,7 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
         dropout=drawn(6, config.dropout),
         position_bias=bias(7, config.position_bias),
         rotation_bias=bias(8, config.rotation_bias),
+        latency=jnp.round(uniform(11, config.latency) / control_dt).astype(jnp.int32),
         eye=placed(9),
     )
 
@@ -197,7 +204,7 @@ def push(readings: Readings, newest: Readings) -> Readings:
 
 
 def seen_by(task: TaskConfig, state: SceneState, readings: Readings) -> SceneState:
-    """Returns a control step as observed by the policy, with the pose that the tracker shows.
+    """Returns a control step as observed by the policy: the tracker's pose and the newest targets.
 
     In a tracked observation, forces and velocities are unknown except the wrist's velocity, on which its targets depend
     (`common.task.control`): it is the wrist's displacement in the last control step over its duration.
@@ -207,9 +214,8 @@ def seen_by(task: TaskConfig, state: SceneState, readings: Readings) -> SceneSta
       state: the true state, except for the object's initial pose, which must be the first shown by the tracker.
       readings: the last control steps.
     """
-    state = state._replace(
-        object_position=readings.object_position[:, 0], object_quaternion=readings.object_quaternion[:, 0]
-    )
+    newest = ("q_target", "u_target", "object_position", "object_quaternion")
+    state = state._replace(**{name: getattr(readings, name)[:, 0] for name in newest})
     if task.observation == "full":
         return state
     blind = ("q_velocity", "object_velocity", "object_angular_velocity", "contact_force", "contact_position")

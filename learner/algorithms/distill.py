@@ -28,7 +28,7 @@ from congrasp.common.policy.network import Layout, Params
 from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task.config import ControlConfig, TaskConfig
-from congrasp.common.task.teaching import EXTRA, student_action
+from congrasp.common.task.teaching import extra, student_action
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import RECORDABLE, Schema
 from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
@@ -221,7 +221,7 @@ def _program(
     actor, optimizer, key = learnt
     transform = _transform(config.max_grad_norm)
     rows = batch["teacher_observation"]
-    labels = bundles.mean_action(layouts[1], given.teacher, rows[..., :-EXTRA])
+    labels = bundles.mean_action(layouts[1], given.teacher, rows[..., : -extra(body[0])])
     labels = student_action(*body, rows, labels)
     labels = labels.reshape(-1, labels.shape[-1])
     observation = batch["observation"].reshape(len(labels), -1)

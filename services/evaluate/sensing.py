@@ -36,6 +36,8 @@ class Level:
     """Sliding friction between hand and object; None: that of the evaluation."""
     gains: float = 1.0
     """Factor on the finger servos' gains."""
+    latency: float = 0.0
+    """Seconds until the servos follow a target."""
 
 
 LEVELS = (
@@ -51,14 +53,16 @@ LEVELS = (
     Level("friction 0.5", friction=0.5),
     Level("gains -20 %", gains=0.8),
     Level("gains +20 %", gains=1.2),
+    Level("targets 20 ms late", latency=0.02),
+    Level("targets 40 ms late", latency=0.04),
 )
 """Rows of the table; each but the first differs from the second in one setting."""
 
 
 def sensing_task(task: TaskConfig) -> TaskConfig:
     """Returns the task in which a policy observes trackers, with room for the longest delay."""
-    delay = 0.0, max(level.delay for level in LEVELS)
-    return dataclasses.replace(task, sensing=SensingConfig(delay=delay, settle=task.sensing.settle))
+    delay, latency = ((0.0, max(getattr(level, name) for level in LEVELS)) for name in ("delay", "latency"))
+    return dataclasses.replace(task, sensing=SensingConfig(delay=delay, latency=latency, settle=task.sensing.settle))
 
 
 def at_level(conditions: InitialConditions, level: Level, control_dt: float) -> InitialConditions:
@@ -78,6 +82,7 @@ def at_level(conditions: InitialConditions, level: Level, control_dt: float) -> 
             position_noise=jnp.full_like(sensors.position_noise, level.position_noise),
             rotation_noise=jnp.full_like(sensors.rotation_noise, level.rotation_noise),
             dropout=jnp.full_like(sensors.dropout, level.dropout),
+            latency=jnp.full_like(sensors.latency, round(level.latency / control_dt)),
         ),
         reset_state=start._replace(friction=friction, gain_scale=jnp.full_like(start.gain_scale, level.gains)),
     )

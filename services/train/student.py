@@ -14,6 +14,7 @@ TRACKERS = SensingConfig(
     delay=(0.0, 0.1),
     position_noise=(0.0, 0.01),
     rotation_noise=(0.0, 0.105),
+    latency=(0.0, 0.04),
     dropout=(0.0, 0.3),
     position_bias=(0.0, 0.005),
     rotation_bias=(0.0, 0.035),
@@ -21,13 +22,15 @@ TRACKERS = SensingConfig(
 )
 """From a perfect tracker to one with 10 Hz, 0.1 s latency, errors of 1 cm and 6°, and 30 % lost samples.
 
-All samples of an episode share a further error of up to 5 mm and 2° (standard deviations, like the others)."""
+All samples of an episode share a further error of up to 5 mm and 2° (standard deviations, like the others). Servos
+follow targets up to 40 ms late."""
 
 
 CAMERAS = SensingConfig(
     period=(0.1, 0.1),
     delay=(0.0, 0.1),
     position_noise=(0.0, 0.004),
+    latency=(0.0, 0.04),
     dropout=(0.0, 0.5),
     position_bias=(0.0, 0.005),
     rotation_bias=(0.0, 0.035),

@@ -15,7 +15,7 @@ from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import observation, privileged
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.sampling.build import build_bank
-from congrasp.common.task.teaching import EXTRA
+from congrasp.common.task.teaching import extra
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(0, "cylinder")]
@@ -73,7 +73,7 @@ def test_a_teacher_sees_all_beside_a_student(late):
     _, rollout = late
     task = dataclasses.replace(TASK, observation="tracked")
     sizes = [sum(size for _, size in layout) for layout in (observation.layout(HAND, task), full_layout(task))]
-    assert [rollout.observation.shape[-1], rollout.teacher_observation.shape[-1] - EXTRA] == sizes
+    assert [rollout.observation.shape[-1], rollout.teacher_observation.shape[-1] - extra(HAND)] == sizes
     start = 0
     for field in observation.fields(HAND, TASK)["state"]:
         part = rollout.teacher_observation[1:, :, start : start + field.size]
@@ -97,7 +97,9 @@ def test_the_critic_sees_the_trackers_and_the_true_state(late):
     np.testing.assert_allclose(numbers["mass"], OBJECTS[0].mass, rtol=1e-6)
     # 16 steps of approach, then the hold's four run down.
     np.testing.assert_allclose(numbers["hold_remaining"][:, 0], [1.0] * 17 + [0.75])
-    np.testing.assert_array_equal(rollout.privileged[..., len(names) - 1 :], rollout.teacher_observation[..., :-EXTRA])
+    np.testing.assert_array_equal(
+        rollout.privileged[..., len(names) - 1 :], rollout.teacher_observation[..., : -extra(HAND)]
+    )
     scene = running.env.privileged(running.state)
     np.testing.assert_allclose(rollout.last_privileged[:, len(names) - 1 :], observation.observe(scene), atol=1e-6)
 

@@ -21,7 +21,7 @@ from congrasp.common.task import camera
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import known
 from congrasp.common.task.sensing import draw_sensors
-from congrasp.common.task.teaching import EXTRA
+from congrasp.common.task.teaching import extra
 from congrasp.common.task.types import Goal, Surface
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.learner.algorithms.protocol import random_policy
@@ -196,7 +196,7 @@ def test_a_student_learns_what_only_its_cloud_shows(tmp_path):
     def batch(seed):
         rng = np.random.default_rng(seed)
         middle = rng.normal(size=(4, 32, 3))
-        taught = np.zeros((4, 32, size + EXTRA), np.float32)
+        taught = np.zeros((4, 32, size + extra(get_hand(TASK.hand))), np.float32)
         taught[..., :3] = middle
         seen = np.zeros((4, 32, sum(width for _, width in student._spec.layout)), np.float16)
         points = 0.1 * rng.normal(size=(4, 32, POINTS, 4)) + np.append(np.zeros(3), 1.0)

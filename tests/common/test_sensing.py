@@ -25,8 +25,16 @@ STEPS = 40
 def sensors(position_bias=(0.0, 0.0, 0.0), rotation_bias=(0.0, 0.0, 0.0), **given):
     """One tracker that shows each pose at once, without errors, but for what is given."""
     bias = {"position_bias": position_bias, "rotation_bias": rotation_bias}
-    fields = {"period": 1.0, "phase": 0.0, "delay": 0, "position_noise": 0.0, "rotation_noise": 0.0, "dropout": 0.0}
-    types = {"delay": np.int32}
+    fields = {
+        "period": 1.0,
+        "phase": 0.0,
+        "delay": 0,
+        "position_noise": 0.0,
+        "rotation_noise": 0.0,
+        "dropout": 0.0,
+        "latency": 0,
+    }
+    types = {"delay": np.int32, "latency": np.int32}
     arrays = {name: np.full(1, value, types.get(name, np.float32)) for name, value in {**fields, **given}.items()}
     biases = {name: np.array([bias[name]], np.float32) for name in ("position_bias", "rotation_bias")}
     return Sensors(key=np.array([[3, 7]], np.uint32), **arrays, **biases, eye=np.ones((1, 3), np.float32))
@@ -141,12 +149,13 @@ def test_where_an_object_rests_is_the_mean_of_its_readings_until_it_moves():
 
 def test_trackers_are_drawn_from_their_ranges():
     """60 ms are 6 control steps of 10 ms; a tracker that is faster than control samples once a step."""
-    config = SensingConfig((0.0, 0.1), (0.06, 0.1), (0.0, 0.01), (0.02, 0.1), (0.1, 0.3))
+    config = SensingConfig((0.0, 0.1), (0.06, 0.1), (0.0, 0.01), (0.02, 0.1), (0.1, 0.3), latency=(0.0, 0.03))
     drawn = jax.device_get(sensing.draw_sensors(config, 0.01, jax.random.key(0), 500))
     assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10} and sensing.longest(config, 0.01) == 11
     assert drawn.period.min() == 1.0 and 9.9 < drawn.period.max() <= 10.0
     assert 0.1 <= drawn.dropout.min() < 0.11 and 0.29 < drawn.dropout.max() <= 0.3
     assert drawn.position_noise.max() <= 0.01 and drawn.rotation_noise.min() >= 0.02
+    assert set(np.unique(drawn.latency)) == {0, 1, 2, 3}
     assert len(np.unique(drawn.key, axis=0)) == 500
     perfect = jax.device_get(sensing.draw_sensors(SensingConfig(), 0.01, jax.random.key(0), 3))
     assert not any(np.any(field) for field in perfect[3:-1]) and (perfect.period == 1.0).all()

@@ -12,7 +12,7 @@ from congrasp.common.task.config import ControlConfig, TaskConfig
 from congrasp.common.task.control import decode, guided
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.observation import observe
-from congrasp.common.task.teaching import EXTRA, observe_for_teacher, student_action
+from congrasp.common.task.teaching import extra, observe_for_teacher, student_action
 from tests.scenes import HAND, N, scene
 
 ALLEGRO = get_hand("allegro")
@@ -24,11 +24,12 @@ def label(teacher, ahead, limit, velocity, table, own):
     def along(x):
         return [x, 0, 0, 0, 0, 0]
 
-    rows = np.array([*along(ahead), limit, *along(velocity), table, *along(own)], np.float32)
-    assert len(rows) == EXTRA
+    lag = np.append(-0.05, np.zeros(15))  # the first finger joint's servo follows a target of before
+    rows = np.array([*along(ahead), limit, *along(velocity), table, *along(own), *lag], np.float32)
+    assert len(rows) == extra(ALLEGRO)
     action = np.append(np.full(16, 0.3), along(teacher)).astype(np.float32)
     found = np.asarray(student_action(ALLEGRO, ControlConfig(), jnp.asarray(rows), jnp.asarray(action)))
-    np.testing.assert_array_equal(found[:16], action[:16])
+    np.testing.assert_allclose(found[:16], action[:16] + lag / 0.1, atol=1e-6)  # alpha_f = 0.1 rad
     np.testing.assert_allclose(found[17:], 0.0, atol=1e-6)
     return found[16]
 
@@ -68,7 +69,7 @@ def test_with_its_label_a_student_gives_the_wrist_the_teacher_s_target():
         return rows, observe(true), one, two, copied
 
     rows, whole, teacher, student, copied = targets(action)
-    np.testing.assert_array_equal(rows[:, :-EXTRA], whole)
+    np.testing.assert_array_equal(rows[:, : -extra(HAND)], whole)
     np.testing.assert_allclose(student.u_target, teacher.u_target, atol=1e-5)
     np.testing.assert_array_equal(student.q_target, teacher.q_target)
     assert np.abs(copied.u_target - teacher.u_target).max() > 1e-3  # what the teacher's residual would have given

@@ -17,7 +17,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, PolicySpec, mean_action, policy_spec
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.teaching import EXTRA, student_action
+from congrasp.common.task.teaching import extra, student_action
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate, random_policy
 from congrasp.services.train.student import TRACKERS
@@ -57,8 +57,10 @@ def batch(run, seed, worlds=WORLDS):
         for task in (run.task, dataclasses.replace(run.task, observation="full"))
     )
     seen = rng.normal(size=(STEPS, worlds, max(own, whole))).astype(np.float32)
-    given = np.random.default_rng(1).normal(0.0, 0.01, EXTRA).astype(np.float32)  # one for all: it can be learnt
-    given = np.broadcast_to(given, (STEPS, worlds, EXTRA))
+    given = (
+        np.random.default_rng(1).normal(0.0, 0.01, extra(get_hand("allegro"))).astype(np.float32)
+    )  # one for all: it can be learnt
+    given = np.broadcast_to(given, (STEPS, worlds, len(given)))
     taught = np.concatenate([seen[..., :whole], given], -1)
     return {"observation": seen[..., :own].astype(np.float16), "teacher_observation": taught}
 
@@ -76,7 +78,9 @@ def test_the_loss_is_the_squared_difference_in_the_teacher_s_deviations(teacher)
         jnp.zeros_like, state.params["actor"]["network"]["output"]
     )
     bundle = bundles.load(teacher)
-    wanted = mean_action(bundle.spec.layout, bundle.inference_parameters, rows["teacher_observation"][..., :-EXTRA])
+    wanted = mean_action(
+        bundle.spec.layout, bundle.inference_parameters, rows["teacher_observation"][..., : -extra(get_hand("allegro"))]
+    )
     labels = np.asarray(student_action(get_hand("allegro"), TASK.control, rows["teacher_observation"], wanted))
     deviation = np.where(np.arange(labels.shape[-1]) == 0, 0.5, 0.1)
     after, metrics = student.update(state, rows)
