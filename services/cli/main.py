@@ -11,6 +11,7 @@ import pathlib
 import re
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, TextIO
@@ -18,7 +19,7 @@ from typing import Any, TextIO
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.files import cache_folder
 from congrasp.services.ops.logs import announced, log_error
-from congrasp.services.ops.shutdown import follow_parent, on_signal
+from congrasp.services.ops.shutdown import SIGNALS, follow_parent, on_signal
 
 COMMANDS = {
     "train": "train a policy: a learner and its actors on this machine",
@@ -72,6 +73,7 @@ _PATH = (
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `congrasp` script; ends the process with the command's exit code."""
+    alone = arguments is None  # no other code uses this process
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     follow_parent()
     debug = "--debug" in arguments
@@ -93,7 +95,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
-    if code in SIGNALLED:  # skips the interpreter's shutdown
+    if code in SIGNALLED or (
+        alone and _late_threads()
+    ):  # native code of a daemon thread aborts in the interpreter's shutdown
+        _last_words(sys.stderr)
         os._exit(code)
     sys.exit(code)
 
@@ -138,6 +143,11 @@ def run(arguments: list[str]) -> int:
             result = None
             stop.wait(1.0)  # the thread that records the signal may be slightly late
         return stop.exit_code or (result if isinstance(result, int) else 0)
+
+
+def _late_threads() -> bool:
+    """True if a daemon thread, such as one that closes a Zenoh session, has missed its deadline and still runs."""
+    return any(thread.daemon and thread.name != SIGNALS for thread in threading.enumerate())
 
 
 def _check_files(arguments: Sequence[str]) -> None:

@@ -16,6 +16,8 @@ GRACE = 3.5
 """Longest time between a signal and the end of the process, s."""
 PARENT_VARIABLE = "CONGRASP_PARENT"
 """Environment variable with which a process makes its children end with it."""
+SIGNALS = "signals"
+"""Name of the thread that acts on signals; it runs no native code."""
 _REAP = 0.5  # deadline for the end of all children, s
 _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 
@@ -73,7 +75,7 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
 
     previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-    threading.Thread(target=watch, daemon=True, name="signals").start()
+    threading.Thread(target=watch, daemon=True, name=SIGNALS).start()
     try:
         yield stop
     finally:

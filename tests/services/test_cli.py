@@ -160,6 +160,22 @@ def test_a_reader_that_is_gone_is_no_error():
     assert not lines and done.returncode in (0, 128 + signal.SIGPIPE)
 
 
+@pytest.mark.parametrize("late", [True, False])
+def test_a_late_thread_ends_with_the_process_without_the_interpreter_s_shutdown(late):
+    """Its native code would abort there, and the run's supervisor would start the process again."""
+    code = f"""
+import atexit, sys, threading
+from congrasp.services.cli.main import main
+atexit.register(print, "shut down")
+threading.Thread(target=threading.Event().wait, args=(60 if {late} else 0,), daemon=True, name="zenoh-close").start()
+sys.argv[1:] = ["hands", "list"]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0 and "allegro" in done.stdout, done.stderr
+    assert done.stdout.endswith("shut down\n") is not late
+
+
 def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path):
     port = free_port()
     with socket.socket() as busy:
