@@ -410,7 +410,7 @@ def _next_steps(run_dir: pathlib.Path) -> None:
     congrasp = _command()
     pictures = (
         (EPISODE, "an episode of the trained policy"),
-        (PRETRAINED, "a grasp under each of the four constraints, by the pretrained policy"),
+        (PRETRAINED, "a grasp under each constraint, by the pretrained policy"),
     )
     rows = [(str(run_dir / name), why) for name, why in pictures if (run_dir / name).exists()]
     rows += [
