@@ -38,6 +38,7 @@ import congrasp
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.sampling.headings import INWARD
 from congrasp.services.assets.objects.named import find_object
 from congrasp.services.cli.grasp import Constraints
 from congrasp.services.grasp.parse import read_request
@@ -49,6 +50,7 @@ LIFT_SPEED = 0.1
 """m/s, the mean."""
 _POLL, _TOGETHER = 0.0005, 0.001
 """Seconds between two looks at the topics, and in which measurements of one moment arrive."""
+_MET = 0.01  # m around the line of approach within which the surface is met
 SETTLING_STEPS = 50
 """Control steps after the rise until the targets freeze."""
 TRACKER_AGE = 0.5
@@ -213,7 +215,8 @@ class PolicyNode:
             self._guard.reset(dataclasses.replace(self._target.request(seen), q=q, wrist=palm.arrays()))
         if self._plan.lifted(self._followed):
             self._guard.freeze()
-        state = {"q": q, "table": np.asarray(self._followed < self._plan.approach_steps), **seen}
+        table = np.asarray(self._followed < self._plan.approach_steps)
+        state = {"q": q, "time": np.asarray(self._plan.time(self._followed)), "table": table, **seen}
         if np.isfinite(velocity).all():
             state["q_velocity"] = velocity
         if palm is not None:
@@ -253,6 +256,8 @@ class Plan:
     """Frame of the commands."""
     approach_steps: int
     """Control steps with fresh answers until the object may leave the table."""
+    trained_steps: int
+    """The same in the policy's training."""
     lift: float
     """m by which the hand then rises."""
     step: float
@@ -263,6 +268,11 @@ class Plan:
         """(3,) m by which the hand has risen after so many control steps: a smooth step."""
         share = np.clip((followed - self.approach_steps) * self.step / self.lift, 0.0, 1.0) if self.lift else 0.0
         return np.array([0.0, 0.0, self.lift * share**2 * (3.0 - 2.0 * share)])
+
+    def time(self, followed: int) -> float:
+        """Control steps on the policy's clock, which runs slower or faster until the object may leave the table."""
+        over = followed - self.approach_steps
+        return self.trained_steps + (over if over > 0 else over * self.trained_steps / self.approach_steps)
 
     def lifted(self, followed: int) -> bool:
         """True half a second after the end of the rise: no policy was trained to hold longer than two seconds."""
@@ -275,6 +285,18 @@ def slowed(limits: congrasp.JointLimits, share: float) -> congrasp.JointLimits:
     return dataclasses.replace(limits, speed=limits.speed * share, acceleration=limits.acceleration * share**2)
 
 
+def below_surface(points: np.ndarray, middle: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(3,) m, where a hand's centre that moves along `direction` towards the middle should stop.
+
+    As in training this is `INWARD` below the surface (N, 3) that it meets: the fingers do not reach the middle of a
+    thick object. A thin one is grasped at its middle.
+    """
+    ahead = (points - middle) @ direction
+    off = np.linalg.norm(points - middle - ahead[:, None] * direction, axis=1)
+    met = ahead[off <= max(_MET, 1.5 * off.min())].min()
+    return np.asarray(middle + min(met + INWARD, 0.0) * direction)
+
+
 def target_of(arguments: Arguments, sensors: Sensors, hand: Hand, described: dict[str, Any]) -> Target:
     """The object, as a policy with this metadata observes it."""
     camera = described["observation"] == "camera"
@@ -285,10 +307,10 @@ def target_of(arguments: Arguments, sensors: Sensors, hand: Hand, described: dic
         )
 
     def read(obj: GraspObject, middle: np.ndarray) -> congrasp.GraspRequest:
-        """The constraints on an object; by default the hand comes down to its middle (3,)."""
+        """The constraints on an object; by default the hand comes down towards its middle (3,)."""
         request = read_request(obj, hand, described["trajectory_points"], **dataclasses.asdict(arguments.constraint))
-        default = {"position": middle, "direction": np.array([0.0, 0.0, -1.0])}
-        heading = {**default, **request.constraints["heading"]}
+        heading = {"direction": np.array([0.0, 0.0, -1.0]), **request.constraints["heading"]}
+        heading = {"position": below_surface(obj.points, middle, heading["direction"]), **heading}
         return dataclasses.replace(request, constraints={**request.constraints, "heading": heading})
 
     if camera:
@@ -308,8 +330,9 @@ def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described
     object_age = arguments.object_age or (TRACKER_AGE if student else arguments.robot_age)
     sensors = Sensors(arguments, described["joints"], object_age)
     target = target_of(arguments, sensors, hand, described)
-    steps = round(arguments.approach / described["period"]) or 2 * described["approach_steps"]
-    plan = Plan(arguments.world, steps, arguments.lift, LIFT_SPEED * described["period"], arguments.dry_run)
+    trained = described["approach_steps"]
+    steps = round(arguments.approach / described["period"]) or 2 * trained
+    plan = Plan(arguments.world, steps, trained, arguments.lift, LIFT_SPEED * described["period"], arguments.dry_run)
     limits = slowed(congrasp.JointLimits(**described["limits"]), slow)
     times = {"period": period, "wait": 0.6 * period, "stale": arguments.stale / slow, "hold": arguments.hold / slow}
     with congrasp.Guard(client, limits, np.array(described["open_pose"]), fallback="open", **times) as guard:

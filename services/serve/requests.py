@@ -26,7 +26,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from congrasp.common import rotations
 from congrasp.common.errors import CongraspError, LayoutError
+from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import LONGEST_NAME
 from congrasp.common.task.camera import world
@@ -198,12 +200,14 @@ class Layout:
             default = self._neutral.get(name, np.array((1, 0, 0, 0), np.float32))
             fields[name], length = _unit(fields[name], wanted, default)
             lengths.append(length)
-        fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"])
         frame, still = world(len(vectors)), jnp.zeros((len(vectors), 3))
         for name in (name for name in SceneState._fields if name not in self._state):  # the object frame is the world's
             fields[name] = frame[:, 3:] if "quaternion" in name else still
             if name in Readings._fields:
                 fields[f"past_{name}"] = jnp.repeat(fields[name][:, None], self.task.history - 1, 1)
+        start = rotations.conjugate(fields["object_quaternion_initial"]), fields["base_quaternion"]
+        held = rotations.rotate(rotations.multiply(*start), jnp.array(grasp_frame(self.hand).cross))
+        fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"], held)
         surface, goal = self.surface(fields), self.goal(fields)
         fitting = [~asked[:, i] | c.valid(surface, goal[c.name]) for i, c in enumerate(self.known)]
         return fields, jnp.stack([finite, *fitting, *lengths], 1)
@@ -284,8 +288,12 @@ def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[j
     return jnp.where(usable, vectors / jnp.where(usable, lengths, 1.0), default), jnp.where(wanted, worst, 1.0)
 
 
-def _orthogonal(cross: jax.Array, direction: jax.Array) -> jax.Array:
-    """Unit cross-finger directions (B, 3) orthogonal to the heading; arbitrary if absent or parallel to it."""
+def _orthogonal(cross: jax.Array, direction: jax.Array, held: jax.Array) -> jax.Array:
+    """Unit cross-finger directions (B, 3) orthogonal to the heading.
+
+    If absent or parallel to it, that of the hand at the start, `held`, so that the hand does not roll; if that is
+    parallel as well, an arbitrary one.
+    """
 
     def across(vector: jax.Array) -> jax.Array:
         """Component orthogonal to the heading."""
@@ -294,6 +302,8 @@ def _orthogonal(cross: jax.Array, direction: jax.Array) -> jax.Array:
     def unit(vector: jax.Array) -> jax.Array:
         return vector / jnp.linalg.norm(vector, axis=-1, keepdims=True)
 
-    rest, other = across(cross), across(jnp.eye(3)[jnp.abs(direction).argmin(-1)])
-    rest = jnp.where(jnp.linalg.norm(rest, axis=-1, keepdims=True) < 1e-3, other, rest)
+    rest = across(jnp.eye(3)[jnp.abs(direction).argmin(-1)])
+    for wanted, least in ((held, 0.3), (cross, 1e-3)):
+        wanted = across(wanted)
+        rest = jnp.where(jnp.linalg.norm(wanted, axis=-1, keepdims=True) < least, rest, wanted)
     return unit(across(unit(rest)))  # repeated, because a nearly parallel one leaves mostly rounding error

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text
+from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.wire.codec import Message
@@ -71,6 +73,25 @@ def test_the_cross_direction_is_made_unit_and_orthogonal_to_the_heading(directio
     _, received = parse(heading_direction=direction / length, heading_cross=cross)
     assert np.linalg.norm(received["heading_cross"]) == pytest.approx(1.0, abs=1e-5)
     assert received["heading_cross"] @ received["heading_direction"] == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("turn", "along"), [([np.cos(0.3), 0, 0, np.sin(0.3)], 0.0), ([1, 0, 0, 0], 0.0), ([1, 0, 0, 0], 1.0)]
+)
+def test_without_a_cross_direction_the_hand_does_not_roll(turn, along):
+    """It is the hand's own at the start, in the object's frame; along the heading it says nothing."""
+    own = grasp_frame(get_hand("human")).cross
+    wrist, thing = Rotation.from_euler("x", 0.4), Rotation.from_quat(turn, scalar_first=True)
+    held = thing.inv().apply(wrist.apply(own))
+    across = np.cross(held, [0.36, 0.48, 0.8])
+    direction = held if along else across / np.linalg.norm(across)
+    _, received = parse(
+        heading_direction=direction,
+        heading_cross=None,
+        base_quaternion=wrist.as_quat(scalar_first=True),
+        object_quaternion_initial=np.array(turn),
+    )
+    assert received["heading_cross"] @ held == pytest.approx(1.0 - along, abs=1e-5)
 
 
 @pytest.mark.parametrize("count", [3, 8, 20])

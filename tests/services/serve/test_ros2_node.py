@@ -130,7 +130,7 @@ def node_of(example, bus, lift=0.0, **given):
     policy, obj = SteadyPolicy(), procedural.generate(7)
     limits = congrasp.JointLimits.of_hand(HAND)
     arguments = example.Arguments("capsule:7", robot_age=3.0, **given)  # on a machine with other work
-    plan = example.Plan("world", 3, lift, 0.02, arguments.dry_run)
+    plan = example.Plan("world", 3, 3, lift, 0.02, arguments.dry_run)
     with congrasp.Guard(policy, limits, HAND.q_open, period=0.05, wait=0.04, stale=0.2, hold=0.6) as guard:
         sensors = example.Sensors(arguments, NAMES, 0.4)
         target = example.Tracked(sensors, congrasp.GraspRequest(surface=obj.points), obj.origin)
@@ -369,6 +369,21 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
         assert command is not None and bus.sent == {} and line.startswith(command.mode)
 
 
+@pytest.mark.parametrize(("radius", "height"), [(0.06, 0.04), (0.015, 0.0)])
+def test_the_hand_s_centre_stops_two_centimetres_below_the_surface_or_at_the_middle(example, radius, height):
+    """Of a ball, from above: 6 cm - 2 cm over the middle; the middle of a ball of 1.5 cm is nearer to its surface."""
+    middle = np.array([0.1, 0.0, 0.5])
+    points = np.random.default_rng(0).normal(size=(4000, 3))
+    points = middle + radius * points / np.linalg.norm(points, axis=1, keepdims=True)
+    stop = example.below_surface(points, middle, np.array([0.0, 0.0, -1.0]))
+    np.testing.assert_allclose(stop - middle, [0.0, 0.0, height], atol=1e-3)
+
+
+def test_the_policy_s_clock_reaches_the_removal_when_the_object_may_leave_the_table(example):
+    plan = example.Plan("world", approach_steps=200, trained_steps=100, lift=0.1, step=0.001, dry_run=False)
+    assert [plan.time(followed) for followed in (0, 100, 200, 230)] == [0.0, 50.0, 100.0, 130.0]
+
+
 def test_a_step_waits_for_the_measurement_of_its_time(example):
     """Not for one that came more than half a period early, and for none more than half a period late."""
     bus, began = Wire(), time.monotonic()
@@ -401,7 +416,7 @@ def camera_node(example, bus, lift=0.0, age=3.0, **given):
     policy = SteadyPolicy()
     box = "0.5 0.1 0.2 0.3 0.3 0.4"
     arguments = example.Arguments(cloud_topic=TOPIC, robot_age=3.0, box=box, **given)
-    plan = example.Plan("world", 3, lift, 0.02, arguments.dry_run)
+    plan = example.Plan("world", 3, 3, lift, 0.02, arguments.dry_run)
     limits = congrasp.JointLimits.of_hand(HAND)
     with congrasp.Guard(policy, limits, HAND.q_open, period=0.05, wait=0.04, stale=0.2, hold=0.6) as guard:
         sensors = example.Sensors(arguments, NAMES, age)
