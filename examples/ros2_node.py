@@ -51,7 +51,7 @@ LIFT_SPEED = 0.1
 _POLL, _TOGETHER = 0.0005, 0.001
 """Seconds between two looks at the topics, and in which measurements of one moment arrive."""
 _MET = 0.01  # m around the line of approach within which the surface is met
-SETTLING_STEPS = 50
+SETTLING_STEPS = 100
 """Control steps after the rise until the targets freeze."""
 TRACKER_AGE = 0.5
 """Seconds that a student's object or cloud may be old: it learnt with 10 Hz, 100 ms, and samples that are lost."""
@@ -275,7 +275,7 @@ class Plan:
         return self.trained_steps + (over if over > 0 else over * self.trained_steps / self.approach_steps)
 
     def lifted(self, followed: int) -> bool:
-        """True half a second after the end of the rise: no policy was trained to hold longer than two seconds."""
+        """True a second after the end of the rise: no policy was trained to hold longer than two seconds."""
         steps = self.approach_steps + self.lift / self.step + SETTLING_STEPS
         return self.lift > 0.0 and followed >= steps
 
