@@ -52,7 +52,7 @@ def task_faults(task: TaskConfig) -> Iterator[str]:
         low, high = getattr(task, name)
         if not 0 <= low <= high:
             yield f"{name} is {low:g} to {high:g}"
-    for name, most in _SENSING.items():
+    for name, most in {**_SENSING, "latency": (task.history - 1) * task.control_dt}.items():
         low, high = getattr(task.sensing, name)
         if not 0 <= low <= high <= most:
             yield f"{name} is {low:g} to {high:g}, not within 0 and {most:g}"

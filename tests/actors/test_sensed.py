@@ -10,6 +10,7 @@ import pytest
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import RolloutWorker
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.motors import motor_positions
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import observation, privileged
@@ -67,6 +68,20 @@ def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
     assert not np.array_equal(seen.object_position, true.object_position)
     np.testing.assert_array_equal(seen.object_position_initial, true.object_position_initial)
     assert not seen.contact_force.any()
+
+
+def test_servos_follow_the_target_of_so_many_steps_ago():
+    """The teacher sees the targets that they follow, the student its newest ones."""
+    running = worker(dataclasses.replace(TASK, observation="tracked", sensing=SensingConfig(latency=(0.02, 0.02))))
+    running.collect(None, 6)
+    env, state = running.env, running.state
+    readings, action = state.readings, jnp.zeros((BATCH, len(HAND.motors) + 6))
+    target, (command, _) = env.targets(state, action, env.settings)
+    np.testing.assert_allclose(command[:, :6], readings.u_target[:, 1], atol=1e-6)
+    np.testing.assert_allclose(command[:, 6:], motor_positions(HAND, readings.q_target[:, 1]), atol=1e-6)
+    np.testing.assert_array_equal(env.scene_of(state).state.q_target, readings.q_target[:, 2])
+    np.testing.assert_array_equal(env.seen(state).state.q_target, readings.q_target[:, 0])
+    assert np.abs(readings.q_target[:, 0] - readings.q_target[:, 2]).max() > 0.1
 
 
 def test_a_teacher_sees_all_beside_a_student(late):

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common import rotations
+from congrasp.common.ranges import task_faults
 from congrasp.common.task import observation, sensing
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.features import scene_of
@@ -273,3 +274,10 @@ def test_the_wrist_s_velocity_is_its_way_in_the_last_step():
     np.testing.assert_array_equal(full.u_velocity, state.u_velocity)
     np.testing.assert_array_equal(full.contact_force, state.contact_force)
     assert full.q_velocity.shape == (4, F) and full.contact_found.shape[1] == L
+
+
+@pytest.mark.parametrize(("latency", "faults"), [(0.07, 0), (0.08, 1)])
+def test_a_target_is_followed_within_the_history(latency, faults):
+    """8 control steps of 10 ms: the oldest is 7 old."""
+    task = TaskConfig(history=8, sensing=SensingConfig(latency=(0.0, latency)))
+    assert len(list(task_faults(task))) == faults

@@ -358,7 +358,7 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
         assert [float(node._plan.rise(3 + n)[2]) for n in range(6)] == pytest.approx(rise)
         # 3 steps of approach, 5 of the rise, a second: from then on the targets are kept.
         assert [node._plan.lifted(n) for n in (8, 107, 108)] == [False, False, True]
-        node._followed = 58
+        node._followed = 108
         bus.said = robot_says(obj)
         assert [node.step().mode for _ in range(2)] == ["freeze", "freeze"]
     bus.sent = {}
