@@ -7,6 +7,7 @@ import hypothesis.extra.numpy as npst
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
