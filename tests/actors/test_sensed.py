@@ -76,7 +76,7 @@ def test_servos_follow_the_target_of_so_many_steps_ago():
     running.collect(None, 6)
     env, state = running.env, running.state
     readings, action = state.readings, jnp.zeros((BATCH, len(HAND.motors) + 6))
-    target, (command, _) = env.targets(state, action, env.settings)
+    _, (command, _) = env.targets(state, action, env.settings)
     np.testing.assert_allclose(command[:, :6], readings.u_target[:, 1], atol=1e-6)
     np.testing.assert_allclose(command[:, 6:], motor_positions(HAND, readings.q_target[:, 1]), atol=1e-6)
     np.testing.assert_array_equal(env.scene_of(state).state.q_target, readings.q_target[:, 2])
