@@ -76,7 +76,8 @@ def export_motions(
     if camera and kind not in FILMED:
         raise CongraspError(f"A {kind} file holds no video.", f"Remove --camera, or pass --to {FILMED[0]}.")
     if (suffix := FORMATS[kind]) and path.suffix.lower() != suffix:
-        name = path / f"grasp{suffix}" if path.is_dir() else f"{path}{suffix}"
+        named = path.with_suffix("") if path.suffix and suffix.startswith(path.suffix) else path
+        name = path / f"grasp{suffix}" if path.is_dir() else f"{named}{suffix}"
         raise CongraspError(f"The name of a {kind} file ends in {suffix}, and {path} does not.", f"Use --out {name}")
     if path.is_dir():
         raise CongraspError(f"The folder {path} exists already.", "Remove it or pass another with --out.")

@@ -478,6 +478,7 @@ def test_recorded_episodes_and_motion_files_are_exported_by_the_command(
         (["mug.npz", "logs", "--to", "glb"], "one motion, but 2 were given"),
         (["mug.npz", "--to", "lerobot"], "exists already"),
         (["mug.npz", "--to", "usd", "--out", "x.glb"], "ends in .usda, and x.glb does not"),
+        (["mug.npz", "--to", "usd", "--out", "x.usd"], "does not. Use --out x.usda"),
         (["mug.npz", "--out", "logs"], "Use --out logs/grasp.glb"),
         (["nothing.npz"], "There is no file nothing.npz"),
         (["logs", "--index", "4"], "holds 1 episodes"),
