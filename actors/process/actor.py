@@ -1,6 +1,5 @@
 """The actor process: pulls weights, steps environments, uploads rollouts, until the run ends."""
 
-import functools
 import pathlib
 import threading
 import time
@@ -18,13 +17,14 @@ from congrasp.actors.physics import make_physics
 from congrasp.actors.process.failure_weights import FailureWeights
 from congrasp.actors.process.link import ActorLink, RunFinished, RunInfo, RunRestarted, Ticket
 from congrasp.actors.process.own_references import save_references, with_kept_references
-from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
+from congrasp.actors.rollout import Rollout, finished_episodes
 from congrasp.actors.training_set import training_set
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import RunConfig, run_config_from_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.io.journal import Journal
-from congrasp.common.policy.bundle import PolicyBundle, policy_spec, sample_action
+from congrasp.common.policy.bundle import PolicyBundle, acting, policy_spec
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.stages import stage
 from congrasp.common.task.sampling.bank import ConstraintBank
@@ -130,7 +130,7 @@ class _Actor:
                 config.task,
                 self._physics,
                 bank,
-                functools.partial(sample_action, self._spec.layout),
+                acting(self._spec.layout, mean=False),
                 batch=config.environments,
                 # Another incarnation must not repeat the episodes of the one it replaces.
                 seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),

@@ -17,12 +17,12 @@ from rich.table import Table
 from congrasp.actors.physics import make_physics, resolve_physics
 from congrasp.actors.physics.engine import Physics, PhysicsState
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.pool import load_pool, scale_objects
-from congrasp.common.policy.bundle import PolicyBundle, sample_action
+from congrasp.common.policy.bundle import PolicyBundle, acting
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.train.command import untrained
@@ -141,7 +141,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
             config.task,
             physics,
             bank,
-            functools.partial(sample_action, policy.spec.layout),
+            acting(policy.spec.layout, mean=False),
             batch=environments,
             seed=0,
             half_precision=True,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common import rotations
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
@@ -36,7 +36,7 @@ def running():
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     worker = RolloutWorker(
         HAND, TASK, physics, build_bank(HAND, TASK, OBJECTS, 0), close, batch=BATCH, seed=0, half_precision=False,
-        traced=slice(None), taught=True, privileged=OBJECTS,
+        traced="all", taught=True, privileged=OBJECTS,
     )  # fmt: skip
     return worker, worker.collect(None, 18)
 
