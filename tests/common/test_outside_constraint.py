@@ -50,8 +50,8 @@ class Level(Constraint):
         height = jnp.asarray(bank.points)[..., 2]
         return {"upper": jnp.mean(height > height.mean(-1, keepdims=True), -1)}
 
-    def sample(self, hand, draw, key):
-        return LevelGoal(jax.random.bernoulli(key, draw.own("level")["upper"])[:, None])
+    def sample(self, hand, draw, uniform):
+        return LevelGoal(uniform < draw.own("level")["upper"][:, None])
 
     def labels(self, hand):
         return {"wrist": ("wrist",)}

@@ -110,7 +110,7 @@ class Affordance(Constraint):
         """True where the object has both regions, and its graspable one can be approached in the resting pose."""
         return draw.bank.has_affordance[draw.objects, draw.rests]
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> AffordanceGoal:
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> AffordanceGoal:
         """Regions of the object."""
         return AffordanceGoal()
 

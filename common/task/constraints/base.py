@@ -210,8 +210,18 @@ class Constraint:
         """
         return draw.allowed
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> Any:
-        """Samples its goal arrays for the drawn episodes, whether or not they request it."""
+    def numbers(self, hand: Hand, task: "TaskConfig") -> int:
+        """Number U of random numbers that `sample` uses for an episode."""
+        return 1
+
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> Any:
+        """Samples its goal arrays for the drawn episodes, whether or not they request it.
+
+        Args:
+          hand: the hand.
+          draw: the drawn episodes.
+          uniform: (B, U) independent random numbers in [0, 1), which depend on no other constraint.
+        """
         raise NotImplementedError
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:

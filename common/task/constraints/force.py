@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -62,11 +61,10 @@ class Force(Constraint):
             ),
         )
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> ForceGoal:
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> ForceGoal:
         """Samples log-uniformly between the least limit for the episode's object and 20 N."""
         low = jnp.log(jnp.minimum(draw.least_force, MOST))
-        drawn = jax.random.uniform(key, draw.objects.shape)
-        return ForceGoal(jnp.exp(low + drawn * (jnp.log(MOST) - low)))
+        return ForceGoal(jnp.exp(low + uniform[:, 0] * (jnp.log(MOST) - low)))
 
     def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
         """A limit of 5 N."""
