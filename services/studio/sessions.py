@@ -21,7 +21,7 @@ class Sessions:
           new: opens a session.
 
         Raises:
-          CongraspError: of `new`.
+          CongraspError: `new` failed.
         """
         self._new, self._spare = new, [new()]
         self._open: collections.OrderedDict[str, Session] = collections.OrderedDict()
