@@ -64,7 +64,7 @@ class Recorder(NativePhysics):
 
 
 def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> None:
-    """Repeats recorded control steps by `mj_step` alone; threads share the worlds, and only wait where tables change."""
+    """Repeats recorded control steps by `mj_step` alone; threads share the worlds and wait only where tables change."""
 
     def run(environments: np.ndarray, targets: Sequence[np.ndarray]) -> None:
         for target in targets:

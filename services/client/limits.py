@@ -24,8 +24,8 @@ _EQUAL = 1e-12
 class JointLimits:
     """Limits and servo gains of F finger joints, then the wrist's three slides and three hinges: J = F + 6.
 
-    SI units: N and m for slides, N.m and rad for hinges and fingers. For the slides, the norm of speed, acceleration and
-    torque is limited, to the least of the three limits; likewise for the hinges.
+    SI units: N and m for slides, N.m and rad for hinges and fingers. For the slides, the norm of speed, acceleration
+    and torque is limited, to the least of the three limits; likewise for the hinges.
     """
 
     lower: np.ndarray

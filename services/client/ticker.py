@@ -13,7 +13,7 @@ _KEPT = 6000  # ticks whose jitter is kept: a minute at 100 Hz
 class Ticker:
     """Ticks at multiples of a period.
 
-    A tick that is late by a period or more has missed its deadline. Missed ticks are skipped, so that there is no burst.
+    A tick that is late by a period or more has missed its deadline. Missed ticks are skipped to avoid a burst.
 
     Attributes:
       period: s.

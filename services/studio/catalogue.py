@@ -65,7 +65,7 @@ class Upload:
     sides: tuple[float, float, float]
     """In the file's own unit."""
     unit: str = ""
-    """Its unit: the user's choice, else the guessed one; empty if several units give an object that a hand can grasp."""
+    """Its unit: the user's choice, else the guessed one; empty unless exactly one is likely."""
     notes: tuple[str, ...] = ()
     """Notes of its import for the user."""
 

@@ -57,7 +57,7 @@ def _add(
     bodies: Triangles,
     total: np.ndarray,
 ) -> None:
-    """Adds the visible share of a distant lamp in direction (3,), times a strength (n,), to the light (n,) of points."""
+    """Adds the visible share of a distant lamp in direction (3,), times a strength (n,), to the points' light (n,)."""
     if not len(bodies.faces):
         total += strength
         return

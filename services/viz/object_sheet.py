@@ -82,7 +82,7 @@ def rests_sheet(obj: GraspObject) -> np.ndarray:
 
 
 def overview(objects: Sequence[GraspObject]) -> np.ndarray:
-    """(H, W, 3) uint8: each object in its likeliest resting pose, its graspable region green and its avoid region red."""
+    """(H, W, 3) uint8: each object in its likeliest resting pose, graspable region green and avoid region red."""
     images, titles = [], []
     for obj in objects:
         shape = _painted(obj)

@@ -64,7 +64,7 @@ def relabelled(
 
 
 def two_parts(obj: GraspObject, graspable: np.ndarray, name: str = "") -> GraspObject:
-    """The object with the surface points `graspable` (512,) bool as graspable region, and the others as avoid region."""
+    """The object with the surface points `graspable` (512,) bool as graspable region, the others as avoid region."""
     return relabelled(obj, np.where(graspable, 0, 1), ("grasp", "avoid"), (True, False), name)
 
 

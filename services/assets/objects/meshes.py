@@ -60,7 +60,7 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
 def import_sources(
     sources: Sequence[Source], options: ImportOptions
 ) -> Iterator[tuple[int, GraspObject | CongraspError]]:
-    """Imports objects in parallel, one for each core; yields the index of each when it is done, and the object or error.
+    """Imports objects in parallel, one for each core; yields the index of each when done, and the object or error.
 
     Each decomposition is a separate process with a deadline and a memory limit, for which daemon threads of this
     process wait.

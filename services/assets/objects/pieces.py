@@ -57,7 +57,7 @@ class _Merger:
                     self._consider(i, j)
 
     def reduce(self, max_pieces: int) -> None:
-        """Makes joins, cheapest first, until none is left; below the limit of pieces only those within the tolerances."""
+        """Makes joins, cheapest first, until none is left; below the limit of pieces only those within tolerances."""
         grown = 0.0
         while self._joins:
             join = heapq.heappop(self._joins)
