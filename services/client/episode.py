@@ -152,6 +152,9 @@ class _Packer:
         """The episode's query in each of several states, after the control steps of `past`, newest first.
 
         The oldest step is repeated where the history reaches back beyond the start of the episode.
+
+        Raises:
+          RefusedError: a state lacks a measured field.
         """
         vectors = np.tile(self._episode, (len(states), 1))
         for vector, state in zip(vectors, states, strict=True):

@@ -94,7 +94,7 @@ class Policy(Protocol):
           `tracked` or `camera`), `constraints`, `surface_points`, `trajectory_points`.
 
         Raises:
-          TransportError: there is no response from the server.
+          TransportError: there is no response from the server, or it serves another hand.
         """
         ...
 

@@ -117,6 +117,7 @@ class Batcher(Generic[T, R]):
 
         Raises:
           OverloadedError: `depth` items are queued already, or `share` of this peer.
+          CongraspError: the queue is closed.
         """
         now = time.monotonic()
         waiting: _Waiting[T, R] = _Waiting(item, self._weigh(item), Future(), now, now + timeout)

@@ -69,7 +69,11 @@ def two_parts(obj: GraspObject, graspable: np.ndarray, name: str = "") -> GraspO
 
 
 def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> np.ndarray:
-    """(512,) bool: surface points x with normal . x >= offset (m), in the object frame."""
+    """(512,) bool: surface points x with normal . x >= offset (m), in the object frame; `normal` has any length.
+
+    Raises:
+      CongraspError: the normal is zero or not finite, or the offset is larger than the object.
+    """
     length = float(np.linalg.norm(normal))
     if not np.isfinite(length) or length < 1e-9:
         raise CongraspError(f"The direction {tuple(normal)} has no length.", "Give three finite numbers, not all zero.")
