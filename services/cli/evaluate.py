@@ -83,7 +83,7 @@ def evaluate(
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
       hand: Hand of the pretrained policy.
       method: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center, no-feedforward,
-        two-phase, single-stage or student. A policy of another method is refused; by default that of the policy.
+        two-phase, single-stage, student or camera. A policy of another method is refused; default: that of the policy.
       by: object: also print the rates of each object; --json always has them.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.
