@@ -31,7 +31,7 @@ class Phases(NamedTuple):
     """Requested durations and heights around a grasp."""
 
     approach: float = 0.0
-    """Seconds in which the hand first comes from beside the table; 0 begins near the object."""
+    """Seconds in which the hand first comes from next to the table; 0 begins near the object."""
     lift: float = 0.0
     """Metres by which the hand lifts the object off the table, which then stays; 0 removes the table."""
     hold: float = 2.0
@@ -61,7 +61,7 @@ class Attempts:
     """Grasps objects one after another with a policy's mean action, each in several ways in parallel.
 
     Attributes:
-      phases: of the next run.
+      phases: durations and heights of the next run.
     """
 
     def __init__(self, hand: Hand, task: TaskConfig, bundle: PolicyBundle, *, threads: int, phases: Phases = PLAIN):
@@ -120,7 +120,7 @@ class Attempts:
         if self._worker is None or self._worker.batch != batch:
             self.close()
             self._worker = self._new_worker(obj, batch)
-        height = 0.0 if lift else protocols.LIFT_HEIGHT  # duration of the lift after the hold
+        height = 0.0 if lift else protocols.LIFT_HEIGHT  # height of the lift after the hold, m
         protocol = protocols.stress(task, [obj], hold, height)
         if lift:
             protocol = protocols.lift_first(task, [obj], hold, lift)

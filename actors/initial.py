@@ -341,7 +341,8 @@ def initial_hand(
 ) -> tuple[Array, Array, Array]:
     """Initial finger angles (B, F) and world wrist poses (B, 3), (B, 4), determined by the constraints.
 
-    The fingers are opened to the object's width at the heading, and a hand that would be in the table is raised.
+    With `TaskConfig.preshape` the fingers are opened to the object's width at the heading, unless a constraint sets
+    them. A hand that would be in the table is raised.
 
     Args:
       hand: the hand.

@@ -51,8 +51,8 @@ class ObjectsConfig:
     """Rollouts after which an actor's procedural objects are replaced by those of the next seeds and its episodes
     restart; 0 keeps them. Generating them takes as long as at the start."""
     by_failure: bool = False
-    """Draws objects that fall more often than others up to twice as often, and those that fall less often down to half
-    as often, by the actor's episodes (the folder's share shifts with them)."""
+    """Draws objects whose success is less certain than that of others up to twice as often, and those whose success or
+    failure is more certain down to half as often, by the actor's episodes (the folder's share shifts with them)."""
 
     def __post_init__(self) -> None:
         """Raises a CongraspError for constraint sets without objects."""
@@ -220,8 +220,8 @@ class RunConfig:
     collapse_patience: int = 60
     """Consecutive updates without contact, or with less than half of the best success, that end the run; 0: never."""
     episode_every: int = 10
-    """Rollouts of an actor between two episodes published for logs. It is a minimum, since only an episode that ends
-    within its rollout is published."""
+    """Rollouts of an actor between two episodes published for logs. It is a minimum, since an episode may extend over
+    several rollouts."""
     log_rollout_every: int = 20
     """Rollouts of an actor between two published for logs; 1 publishes all of them, 0 none."""
     log_rollout_worlds: int = 4

@@ -188,7 +188,7 @@ def relative_pose(
 def compose_pose(
     position: Array, quaternion: Array, local_position: Array, local_quaternion: Array
 ) -> tuple[Array, Array]:
-    """Composes poses: a pose local to the first one, expressed in the frame of the first one."""
+    """Composes poses: a pose local to the first one, expressed in the frame in which the first one is given."""
     return position + rotate(quaternion, local_position), multiply(quaternion, local_quaternion)
 
 

@@ -74,7 +74,7 @@ class NativePhysics:
         self.threads = max(1, threads)
         self._pool = concurrent.futures.ThreadPoolExecutor(self.threads, thread_name_prefix="physics")
         self._compiled: dict[int, Scene] = {}
-        self.scenes: list[Scene] = []  # state of each environment
+        self.scenes: list[Scene] = []  # scene of each environment
         self.instances: list[EnvInstance] = []
         self._where = addresses(self._scene(0).model, hand)
         self._physics_state = jax.jit(functools.partial(physics_state, jnp, self._where))

@@ -55,9 +55,9 @@ def run_actor(
     """Acts for the learner of `run` until it ends or `stop` is set.
 
     Args:
-      transport: connected to the learner.
+      transport: transport connected to the learner.
       run: name of the run.
-      actor: this actor's name, unique in the run; it also decides on its objects and random numbers.
+      actor: this actor's name, unique in the run; it also determines the actor's objects and random numbers.
       stop: ends the actor between two rollouts.
       physics: engine; that of the run by default.
       threads: threads of the `native` engine.

@@ -75,7 +75,7 @@ class PolicySpec:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def require(self, spec: "PolicySpec", source: str) -> None:
-        """Raises a `CongraspError` unless `spec`, that of `source`, equals this one."""
+        """Raises a `CongraspError` unless `spec`, that of `source`, has the schema of this one."""
         if spec.schema != self.schema:
             raise CongraspError(
                 f"The policy {source} is for hand '{spec.hand_name}' (schema {spec.schema}), not for hand "

@@ -58,7 +58,7 @@ class Tracker(NamedTuple):
     first: Array
     """(B, 7) resting pose of the object: the pose shown at the start of the episode, or the mean since then."""
     rested: Array
-    """(B,) number of readings in that mean; 0 once the object has moved."""
+    """(B,) number of readings in that mean; 0 once the object has moved or the table is removed."""
     shown: Array
     """(B, 7) pose shown now."""
 

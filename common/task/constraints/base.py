@@ -159,7 +159,7 @@ class Constraint:
     overrides: ClassVar[tuple[str, ...]] = ()
     """Weaker constraints, or blocks of them, that are inactive when this one is requested."""
     overridden_by: ClassVar[tuple[str, ...]] = ()
-    """Relations to weaker constraints, and constraints that make this one inactive without declaring it themselves."""
+    """Stronger constraints that make this one inactive without listing it in their `overrides`."""
     guides: ClassVar[str] = ""
     """Block whose activity passes the wrist's guidance to `guidance`; empty if it does not guide the wrist."""
     region: ClassVar[int] = 0
@@ -171,6 +171,7 @@ class Constraint:
     weights: ClassVar[tuple[Weight, ...]] = ()
     errors: ClassVar[tuple[ErrorSpec, ...]] = ()
     relations: ClassVar[tuple[Relation, ...]] = ()
+    """Relations to weaker constraints."""
     options: ClassVar[tuple[Option, ...]] = ()
     needs: ClassVar[tuple[str, ...]] = ()
     """Fields of a query, in addition to its goal arrays, that a request for it must contain."""
@@ -385,7 +386,7 @@ class Constraint:
         return self.among(goal.active)
 
     def among(self, blocks: Mapping[str, Array]) -> Array:
-        """(B,) bool: one of its blocks is active; True for a constraint without blocks.
+        """(B,) bool: one of its blocks is active. Only optional constraints have blocks.
 
         A reference pose of which a trajectory keeps only the fingers is therefore active.
         """

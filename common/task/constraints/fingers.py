@@ -59,7 +59,7 @@ class Fingers(Constraint):
     )
     errors = (ErrorSpec("fingers_ratio", "", "hold", 0.0, 0.1, "share of touching links of other fingers"),)
     options = (
-        Option("fingers", "Which fingers may touch the object, such as: thumb index. All by default.", many=True),
+        Option("fingers", "Fingers that may touch the object, such as: thumb index. All by default.", many=True),
     )
     invalid = (_NEEDED, "Allow both.")
 

@@ -117,7 +117,7 @@ class Force(Constraint):
 
 
 def least_force(mass: Array, friction: Array) -> Array:
-    """Least sensible limit in N for objects of this mass (kg) with this friction: m g / (2 mu), at least 1 N.
+    """Least sensible limit in N for objects of this mass (kg) with this friction: m g / (2 mu), between 1 and 20 N.
 
     Thumb and fingers press on opposite sides, each of which carries half of the weight by friction. The fingers share
     their side; the thumb carries the other.

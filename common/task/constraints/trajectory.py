@@ -145,7 +145,7 @@ class Trajectory(Constraint):
         return {"trajectory_position": -active * far, "trajectory_rotation": -active * turned**2}
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
-        """Geodesic distance and distance between the wrist and the tracked waypoint."""
+        """Angle and distance between the wrist and the tracked waypoint."""
         position, quaternion = tracked_waypoint(scene, current=True)
         return {
             "trajectory_rad": rotations.angle(scene.features.wrist_quaternion, quaternion),

@@ -56,7 +56,7 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
       seed: random seed.
 
     Raises:
-      CongraspError: an object has no heading that the hand can reach in any resting pose.
+      CongraspError: an object is too wide or cannot be approached in any resting pose, or all objects lie too flat.
     """
     bank = kept_bank(hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed))
     return with_columns(hand, task, bank)

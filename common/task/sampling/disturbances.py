@@ -16,7 +16,7 @@ from congrasp.common.task.types import Array
 JOINTS = 0.3
 """rad, largest standard deviation of an independent error of every finger joint."""
 CLOSURE = (0.6, 1.1)
-"""Least and greatest requested share of the range from the open hand to the reference's fingers."""
+"""Least and greatest closure at full scale, as a share of the range from the open hand to the reference's fingers."""
 WRIST = 0.01, 0.2
 """m and rad, largest standard deviation of the wrist's errors along and about each axis."""
 JITTER = 0.005

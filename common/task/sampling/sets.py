@@ -19,7 +19,7 @@ SUFFIX = ".constraints.safetensors"
 REGIONS = ("whole surface", "graspable region")
 """The axis V: constraints for the whole surface, and for the graspable region only."""
 FORMAT = 2
-_LARGEST = 100.0  # tolerance, m or rad
+_LARGEST = 100.0  # bound of all numbers, m or rad
 _MASS = 0.2  # mass in kg of an object whose set was written before sets recorded it
 MEANING = {
     "surface/points": "(P, 3) m, object frame",
