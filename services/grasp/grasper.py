@@ -362,9 +362,10 @@ def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspReque
 
 
 def surface_of(task: TaskConfig, obj: GraspObject) -> Surface:
-    """As many labelled points of an object as the policy looks at, without batch axis."""
+    """Labelled points of an object, as many as the policy observes, with their normals if it observes them."""
     points = task.surface_points
-    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points])
+    normals = np.asarray(obj.normals[:points], np.float32) if task.surface_normals else None
+    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points], normals)
 
 
 def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
