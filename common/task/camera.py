@@ -144,14 +144,13 @@ def _normals(points: Array, eye: Array) -> Array:
     batch = points.shape[0]
     if batch <= _TOGETHER:
         return estimated_normals(points, eye)
-    rest = -batch % _TOGETHER
-    parts = jax.tree.map(
-        lambda array: jnp.pad(array, ((0, rest), *[(0, 0)] * (array.ndim - 1))).reshape(
-            -1, _TOGETHER, *array.shape[1:]
-        ),
-        (points, eye),
-    )
-    return jax.lax.map(lambda part: estimated_normals(*part), parts).reshape(-1, *points.shape[1:])[:batch]
+
+    def parts(array: Array) -> Array:
+        filled = jnp.pad(array, ((0, -batch % _TOGETHER), *[(0, 0)] * (array.ndim - 1)))
+        return filled.reshape(-1, _TOGETHER, *array.shape[1:])
+
+    found = jax.lax.map(lambda part: estimated_normals(*part), (parts(points), parts(eye)))
+    return found.reshape(-1, *points.shape[1:])[:batch]
 
 
 def facing(eye: Array, points: Array) -> Array:
