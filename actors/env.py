@@ -123,7 +123,7 @@ class Transition(NamedTuple):
     errors: dict[str, tuple[Array, Array]]
     """Numerator and denominator (B,) of every error of the constraints."""
     occupancy: Array
-    """(2,) occupancy of the engine's buffers, see `actors.physics.engine.PhysicsState`."""
+    """(3,) occupancy of the engine's buffers, see `actors.physics.engine.PhysicsState`."""
 
 
 class GraspEnv:

@@ -16,7 +16,7 @@ from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import known, optional
 from congrasp.common.task.constraints.force import least_force
 from congrasp.common.task.constraints.priority import Resolution, active_blocks, resolve
-from congrasp.common.task.sampling.bank import ConstraintBank, Draw
+from congrasp.common.task.sampling.bank import ConstraintBank, Draw, surface_of
 from congrasp.common.task.sampling.headings import Headings, local_width
 from congrasp.common.task.sensing import Sensors, draw_sensors
 from congrasp.common.task.types import Array, Goal, Surface
@@ -205,7 +205,7 @@ def _drawn(
     draw = draw._replace(least_force=least_force(bank.mass[draw.objects] * mass, friction))
     draw = draw._replace(reference=_references(task, draw, asked, uniform, common))
     values = {c.name: c.sample(hand, draw, uniform[c.name][:, 2:]) for c in known(task)}
-    surface = Surface(bank.points[draw.objects], bank.avoid[draw.objects])
+    surface = surface_of(task, bank, draw.objects)
     goal = resolve(hand, surface, Goal(values, {}), asked).goal
     gain_low, gain_high = task.gain_range
     reset_state = start(

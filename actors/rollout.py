@@ -82,7 +82,7 @@ class Rollout(NamedTuple):
     truncated: Array
     """(T, B) bool: it ended by its time limit with the object held (`actors.env.Transition`)."""
     occupancy: Array
-    """(T, 2), see `actors.physics.engine.PhysicsState`."""
+    """(T, 3), see `actors.physics.engine.PhysicsState`."""
     last_observation: Array
     """(B, D)."""
     episodes: Array

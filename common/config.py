@@ -114,6 +114,9 @@ class PPOConfig:
     final_std: float = 0.1
     """Standard deviation of the action at the end of `settling`, in units of action. With n updates left, it is capped
     at std (final_std / std)^(1/n): a geometric decay. Smaller deviations are kept; 0 sets no cap."""
+    least_std: float = 0.0
+    """Smallest standard deviation of the action before `settling`, in units of action: each update raises smaller ones
+    to it. 0 sets no floor."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     value_coefficient: float = 0.5
@@ -137,6 +140,11 @@ class PPOConfig:
         if self.final_std <= 0.0 or not self.settling or self._settled(version, updates) < 0.0:
             return math.inf
         return 1.0 - 1.0 / max(updates - version, 1)
+
+    def least_std_at(self, version: int, updates: int) -> float:
+        """Returns the floor of the action's standard deviation in the update of this version; 0 during `settling`."""
+        settles = bool(self.settling) and self._settled(version, updates) >= 0.0
+        return 0.0 if settles else self.least_std
 
     def _settled(self, version: int, updates: int) -> float:
         """Share of `settling` completed before the update of this version; negative before it begins."""

@@ -310,12 +310,14 @@ class _Since(NamedTuple):
 
 
 def buffer_occupancy(occupancy: np.ndarray) -> dict[str, float]:
-    """Metrics of `Rollout.occupancy`: steps in which the engine exceeded its contacts or rows, and the fullest."""
-    contacts, rows = occupancy.max(0)
+    """Metrics of `Rollout.occupancy`: steps that exceeded contacts or rows, the fullest, and unconverged solutions."""
+    buffers, limited = occupancy[:, :2], occupancy[:, 2]
+    contacts, rows = buffers.max(0)
     return {
-        "overflow": float((occupancy > 1.0).any(-1).sum()),
+        "overflow": float((buffers > 1.0).any(-1).sum()),
         "contacts_peak": float(contacts),
         "rows_peak": float(rows),
+        "solver_limited": float(limited.mean()),
     }
 
 

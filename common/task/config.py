@@ -172,6 +172,10 @@ class TaskConfig(_Shares):
     """Distance by which the fingers are opened wider than the object in training, m, drawn uniformly at every reset."""
     surface_points: int = 256
     """Surface points of an object that the policy observes (at most 512)."""
+    surface_normals: bool = False
+    """Adds to the observation the surface's normal at each keypoint's nearest surface point, and the keypoint's height
+    above the tangent plane there: points alone lie up to 2 cm apart. Requests may contain normals
+    (`common.task.normals` estimates missing ones)."""
     trajectory_points: int = 15
     """K, waypoints of a wrist trajectory."""
     constraints: tuple[str, ...] = OURS

@@ -18,7 +18,8 @@ _WITH_CAMERA = ("cloud", "q", "wrist")
 _MEASURED = ("q", "u", "object_position", "object_quaternion")
 _FIRST = ("object_position_initial", "object_quaternion_initial")
 _READ = (*_MEASURED, "q_target", "u_target")
-_POINTS = ("surface_points", "cloud", "surface_avoid")
+_POINTS = ("surface_points", "cloud", "surface_avoid", "surface_normals")
+_NORMALS = ("surface_normals", "camera_position")
 _LONGEST = 64  # largest history of a policy, control steps
 
 
@@ -94,6 +95,7 @@ class EpisodePolicy(Policy):
     def _ask(self, episode: Mapping[str, np.ndarray], states: Sequence[State]) -> list[Answer]:
         """Returns the answers to one query, which is repeated if the layout of packed ones has changed."""
         began = time.perf_counter()
+        states = [_with_own_normals(state, episode) for state in states]
         try:
             reply, parts = self._exchange(episode, states)
         except LayoutError:
@@ -173,6 +175,8 @@ class _Packer:
 
     def _write(self, vector: np.ndarray, name: str, value: np.ndarray) -> None:
         """Writes a field's numbers to their place in a vector."""
+        if name not in self._fields and name in _NORMALS:  # the policy does not observe normals
+            return
         if name not in self._fields:
             raise RefusedError(f"The query has an unknown field '{name}'.", f"Known: {', '.join(self._fields)}.")
         offset, *shape = self._fields[name]
@@ -200,9 +204,19 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
         **({} if request.object_pose is None else dict(zip(_FIRST, request.object_pose, strict=True))),
         **{name: x for name, x in (("cloud", request.cloud), ("surface_points", request.surface)) if x is not None},
         **({} if request.avoid is None else {"surface_avoid": request.avoid}),
+        **({} if request.normals is None else {"surface_normals": request.normals}),
+        **({} if request.camera is None else {"camera_position": request.camera}),
         **{f"{name}_{field}": value for name, own in request.constraints.items() for field, value in own.items()},
     }
     return {name: _numbers(name, value) for name, value in given.items()}
+
+
+def _with_own_normals(state: State, episode: Mapping[str, np.ndarray]) -> State:
+    """Returns a state whose new points do not get the normals of the episode's first ones: zeros are estimated."""
+    new = [state[name] for name in ("cloud", "surface_points") if name in state]
+    if not new or "surface_normals" in state or "surface_normals" not in episode:
+        return state
+    return {**state, "surface_normals": np.zeros(np.shape(new[0]), np.float32)}
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:

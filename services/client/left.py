@@ -55,6 +55,7 @@ def mirrored_request(request: GraspRequest) -> GraspRequest:
         request,
         constraints={name: mirror.fields(own) for name, own in request.constraints.items()},
         surface=None if request.surface is None else mirror.vector(request.surface),
+        normals=None if request.normals is None else mirror.vector(request.normals),
         wrist=request.wrist and _pose(request.wrist),
         object_pose=request.object_pose and _pose(request.object_pose),
     )

@@ -25,7 +25,7 @@ from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint
-from congrasp.common.task.types import Array, Goal, Surface
+from congrasp.common.task.types import Array, Goal
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.protocol import two_seconds
 from congrasp.services.evaluate.scores import Sample
@@ -172,7 +172,7 @@ class Episodes:
             self._task,
             trace,
             begun.goal.row(episode),
-            Surface(*(np.asarray(field)[episode] for field in begun.surface)),
+            jax.tree.map(lambda array: np.asarray(array)[episode], begun.surface),
             self._objects[int(np.asarray(begun.reset_state.object_index)[episode])],
             {
                 "version": self._bundle.version,

@@ -363,9 +363,10 @@ def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspReque
 
 
 def surface_of(task: TaskConfig, obj: GraspObject) -> Surface:
-    """The labelled surface points of an object that the policy observes, without batch axis."""
+    """Labelled points of an object, as many as the policy observes, with their normals if it observes them."""
     points = task.surface_points
-    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points])
+    normals = np.asarray(obj.normals[:points], np.float32) if task.surface_normals else None
+    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points], normals)
 
 
 def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:

@@ -258,7 +258,7 @@ class _Touching:
             contact_position=jnp.zeros((batch, links, CONTACTS_PER_LINK, 3)),
             contact_found=jnp.full((batch, links, CONTACTS_PER_LINK), touching),
             diverged=jnp.zeros(batch, bool),
-            occupancy=jnp.zeros(2),
+            occupancy=jnp.zeros(3),
         )
 
 

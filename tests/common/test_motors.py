@@ -108,7 +108,7 @@ def _closing(hand):
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep, spec.option.integrator = 0.0025, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.iterations, spec.option.ls_iterations = 8, 20
+    spec.option.iterations, spec.option.ls_iterations = 24, 40
     add_hand(spec, hand)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0

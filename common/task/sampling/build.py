@@ -253,6 +253,7 @@ def headings_of(
     avoided = obj.non_graspable_points[keep]
     floats = {
         "points": obj.points[keep],
+        "normals": obj.normals[keep],
         "rest": obj.rest_poses[usable],
         **{f"heading_{name}": np.stack([getattr(s, name) for s in sets]) for name in Headings._fields},
         "heading_back": np.take_along_axis(back, index, -1),

@@ -88,6 +88,7 @@ def set_of(
         heading_training = for_training(row.heading_position.shape[1], seed)
     arrays = {
         "surface/points": row.points,
+        "surface/normals": row.normals,
         "surface/avoid": row.avoid,
         "rest": row.rest[:rests],
         "heading/position": row.heading_position,
