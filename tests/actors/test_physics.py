@@ -305,6 +305,7 @@ def optimised():
 
 
 @pytest.mark.timeout(900)
+@pytest.mark.slow
 def test_jax_agrees_with_native(env, optimised):
     """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
     start = above(env.reset_state, 0.2)

@@ -115,6 +115,7 @@ def _scanned(folder: pathlib.Path) -> GraspObject:
 
 
 @pytest.mark.timeout(900)
+@pytest.mark.slow
 def test_scanned_objects_agree_with_native(shared_objects):
     objects = [_scanned(shared_objects / name) for name in ("camera", "flashlight", "hammer")]
     assert max(len(obj.pieces) for obj in objects) > 1
@@ -190,6 +191,7 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(start):
     native.close()
 
 
+@pytest.mark.slow
 def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(start, others):
     warp, untouched = WarpPhysics(HAND, TASK, OBJECTS), WarpPhysics(HAND, TASK, OBJECTS)
     step, step_untouched, table = jax.jit(warp.step), jax.jit(untouched.step), jnp.ones(4, bool)
@@ -317,6 +319,7 @@ def test_more_pieces_than_slots_are_one_clear_line(start):
     assert not after.diverged.any()
 
 
+@pytest.mark.slow
 def test_an_engine_uses_its_own_ranks_device():
     """Two processes of one job: JAX counts the devices of both."""
     port, environment = free_port(), {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}

@@ -165,6 +165,7 @@ def test_mjx_gets_the_same_force(monkeypatch):
     np.testing.assert_array_equal(pushed.data.xfrc_applied, expected)
 
 
+@pytest.mark.slow
 def test_warp_pushes_with_the_same_force():
     warp = pytest.importorskip("congrasp.actors.physics.warp")
     check_fall(warp.WarpPhysics(HAND, TASK, OBJECTS, mesh_slots=0))
