@@ -58,8 +58,8 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     spec.option.timestep = task.control_dt / task.substeps
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Held objects creep out of every grasp within seconds with pyramidal friction cones. With elliptic ones they do
-    # so unless friction is much harder than normal forces and the solver converges: with impratio 10 they creep, and
-    # with impratio 100 eight iterations are too few (docs/notes/training.md).
+    # too unless friction is much harder than normal forces and the solver converges: with impratio 100 eight iterations
+    # are too few (docs/notes/training.md).
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 100.0
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
