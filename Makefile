@@ -1,4 +1,4 @@
-# quickstart: set up and train a small policy.  test, coverage, lint: check the code.  docs: build the site.  bench: install its peers, print the benchmark tables.
+# quickstart: set up and train a small policy.  test, test-all, coverage, lint: check the code.  docs: build the site.  bench: install its peers, print the benchmark tables.
 # Everything runs in .venv, which the first target makes; another interpreter: make quickstart PYTHON=python3.12
 
 FAST := tests/test_architecture.py $(addprefix tests/common/,$(addsuffix .py,test_rotations test_kinematics test_motors test_priority \
@@ -14,23 +14,23 @@ CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/congrasp
 # Compiled programs are kept between runs; another folder: JAX_COMPILATION_CACHE_DIR=...
 export JAX_COMPILATION_CACHE_DIR ?= $(CACHE)/jax
 
-.PHONY: quickstart test check coverage lint docs bench install clean
+.PHONY: quickstart test test-all check coverage lint docs bench install clean
 .DEFAULT_GOAL := quickstart
 
 quickstart: install
 	$(VENV)/bin/congrasp train --preset quickstart
 
 # Three workers on two cores: many tests wait for processes that they start or kill.
-test: install
+test test-all: install
 	@tests/install_browser.sh $(VENV)/bin/python
-	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 3 --dist loadfile -m "not gpu" $(ARGS)
+	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 3 --dist loadfile -m "not gpu$(if $(filter test,$@), and not slow)" $(ARGS)
 
 # Without processes, engines and pictures: about a minute.
 check: lint
 	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -q -n 3 $(FAST)
 
 coverage:
-	$(MAKE) test ARGS="--cov --cov-report=term $(ARGS)"
+	$(MAKE) test-all ARGS="--cov --cov-report=term $(ARGS)"
 
 lint: install
 	$(VENV)/bin/ruff check .

@@ -3,7 +3,6 @@
 Training and evaluation draw their episodes at random; attempts follow a request.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,11 +15,12 @@ from congrasp.actors.env import metric_names
 from congrasp.actors.episode import episode_message
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker, Trace
+from congrasp.actors.rollout import Trace
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.policy.bundle import PolicyBundle, act_by_mean
+from congrasp.common.policy.bundle import PolicyBundle, acting
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import Goal, Surface
@@ -31,7 +31,7 @@ class Phases(NamedTuple):
     """Requested durations and heights around a grasp."""
 
     approach: float = 0.0
-    """Seconds in which the hand first comes from beside the table; 0 begins near the object."""
+    """Seconds in which the hand first comes from next to the table; 0 begins near the object."""
     lift: float = 0.0
     """Metres by which the hand lifts the object off the table, which then stays; 0 removes the table."""
     hold: float = 2.0
@@ -61,7 +61,7 @@ class Attempts:
     """Grasps objects one after another with a policy's mean action, each in several ways in parallel.
 
     Attributes:
-      phases: of the next run.
+      phases: durations and heights of the next run.
     """
 
     def __init__(self, hand: Hand, task: TaskConfig, bundle: PolicyBundle, *, threads: int, phases: Phases = PLAIN):
@@ -78,7 +78,6 @@ class Attempts:
         self._hand, self._task, self._bundle = hand, task, bundle
         self._threads = threads
         self._worker: RolloutWorker | None = None
-        self._initial = jax.jit(functools.partial(initial.given, hand, task))
 
     @property
     def steps(self) -> int:
@@ -116,12 +115,12 @@ class Attempts:
           progress: called with the number of completed control steps.
         """
         task, hold, lift = self._task, self._after, self.phases.lift
-        conditions, resolution = self._initial(request, hold=hold, speed=self.speed)
+        conditions, resolution = _given(self._hand, task, request, hold, self.speed)
         batch = len(request.rest)
         if self._worker is None or self._worker.batch != batch:
             self.close()
             self._worker = self._new_worker(obj, batch)
-        height = 0.0 if lift else protocols.LIFT_HEIGHT  # duration of the lift after the hold
+        height = 0.0 if lift else protocols.LIFT_HEIGHT  # height of the lift after the hold, m
         protocol = protocols.stress(task, [obj], hold, height)
         if lift:
             protocol = protocols.lift_first(task, [obj], hold, lift)
@@ -164,17 +163,20 @@ class Attempts:
 
     def _new_worker(self, obj: GraspObject, batch: int) -> RolloutWorker:
         """Returns a worker of `batch` environments on this object that acts with the mean and traces all of them."""
-        policy = functools.partial(act_by_mean, self._bundle.spec.layout)
         physics = NativePhysics(self._hand, self._task, [obj], self._threads)
         return RolloutWorker(
             self._hand,
             self._task,
             physics,
             None,
-            policy,
+            acting(self._bundle.spec.layout, mean=True),
             batch=batch,
             seed=0,
             half_precision=False,
             probe=plausibility.sample,
-            traced=slice(None),
+            traced="all",
         )
+
+
+_given = jax.jit(initial.given, static_argnums=(0, 1))
+"""One program for all attempts at a task."""

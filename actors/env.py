@@ -1,7 +1,7 @@
 """The environment: `reset` and `step` over a batch of hands and objects.
 
 A step consists of `targets`, the physics step, and `advance`. An engine that JAX cannot trace is called between the two
-compiled halves (`actors.rollout`); for traceable engines `step` combines all three.
+compiled halves (`actors.worker`); for traceable engines `step` combines all three.
 """
 
 import dataclasses
@@ -123,26 +123,28 @@ class Transition(NamedTuple):
     errors: dict[str, tuple[Array, Array]]
     """Numerator and denominator (B,) of every error of the constraints."""
     occupancy: Array
-    """(2,) occupancy of the engine's buffers, see `actors.physics.engine.PhysicsState`."""
+    """(3,) occupancy of the engine's buffers, see `actors.physics.engine.PhysicsState`."""
 
 
 class GraspEnv:
     """The grasping task on a physics engine."""
 
-    def __init__(self, hand: Hand, task: TaskConfig, physics: Physics):
+    def __init__(self, hand: Hand, task: TaskConfig, engine: Physics | None):
         """Creates the environment; nothing is allocated yet.
 
         Args:
           hand: the hand.
           task: the task.
-          physics: the engine, with the objects that initial conditions refer to by index.
+          engine: an engine that JAX can trace, with the objects that initial conditions refer to by index; None for
+            one that is stepped outside, between `targets` and `advance`.
         """
-        self.hand, self.task, self.physics = hand, task, physics
+        self.hand, self.task, self._engine = hand, task, engine
         self.settings = Settings(task.reward, task.control)
 
     def reset(self, initial: InitialConditions) -> EnvState:
         """Starts episodes from initial conditions, in every environment."""
-        return self.state_of(initial, self.physics.start(initial.reset_state))
+        assert self._engine is not None, "the engine is stepped outside"
+        return self.state_of(initial, self._engine.start(initial.reset_state))
 
     def state_of(self, initial: InitialConditions, physics: Any) -> EnvState:
         """Returns the state of episodes whose engine was just started from their `reset_state`."""
@@ -151,7 +153,7 @@ class GraspEnv:
         reset_state = initial.reset_state
         sums = {**metrics.empty_sums(self.task, batch), **dict.fromkeys(("return", *FORCES), zero)}
         state = EnvState(
-            physics=physics if self.physics.compiled else None,
+            physics=physics,
             views=None,
             reset_state=reset_state,
             goal=initial.goal,
@@ -172,17 +174,18 @@ class GraspEnv:
             finished=jnp.zeros((batch, len(episode_fields(self.task)))),
             has_finished=no,
         )
-        return self.with_scene(state, self.physics.read(physics)) if self.physics.compiled else state
+        return state if self._engine is None else self.with_scene(state, self._engine.read(physics))
 
     def restart(self, state: EnvState, mask: Array, initial: InitialConditions) -> EnvState:
         """Starts new episodes in the masked environments (B,); the others continue, with their contacts."""
-        physics = self.physics.reset(state.physics, mask, initial.reset_state)
+        assert self._engine is not None, "the engine is stepped outside"
+        physics = self._engine.reset(state.physics, mask, initial.reset_state)
         return self.merge(state, mask, self.state_of(initial, physics))
 
     def merge(self, state: EnvState, mask: Array, fresh: EnvState) -> EnvState:
         """Selects `fresh` in the masked environments (B,) for all episode fields; the engine is already merged."""
         kept: dict[str, Any] = {name: getattr(state, name) for name in ("grasps", "finished", "has_finished")}
-        views = where_environments(mask, fresh.views, state.views) if self.physics.compiled else None
+        views = None if self._engine is None else where_environments(mask, fresh.views, state.views)
         apart: dict[str, Any] = {"physics": None, "views": None}
         merged = where_environments(mask, fresh._replace(**kept, **apart), state._replace(**apart))
         return merged._replace(physics=fresh.physics, views=views)
@@ -197,7 +200,8 @@ class GraspEnv:
         """
         settings = settings or self.settings
         target, command = self.targets(state, action, settings)
-        physics, physics_state = self.physics.step(state.physics, *command)
+        assert self._engine is not None, "the engine is stepped outside"
+        physics, physics_state = self._engine.step(state.physics, *command)
         return self.advance(state._replace(physics=physics), target, physics_state, settings)
 
     def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, tuple[Array, ...]]:

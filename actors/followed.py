@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from congrasp.actors.env import EnvState
@@ -62,7 +63,7 @@ def _begun(state: EnvState, trace: Trace, first: int) -> Followed:
     """Returns an episode with the goal and object of a state, whose trace begins with step `first` of a rollout."""
     return Followed(
         state.goal.row(0),
-        Surface(*(np.asarray(field[0]) for field in state.surface)),
+        jax.tree.map(lambda array: np.asarray(array[0]), state.surface),
         int(np.asarray(state.reset_state.object_index[0])),
         Trace(*(np.asarray(field)[first:] for field in trace)),
     )

@@ -1,7 +1,7 @@
 """Reference poses and trajectories from the policy's grasps (paper, section Hand Morphology).
 
-Final states of successful episodes under a heading only periodically replace poses of the constraint bank. Many of the
-goals of later episodes are thus feasible for this hand.
+Final states of successful episodes periodically replace poses of the constraint bank, unless a constraint excludes them
+(`Constraint.harvested`). Many of the goals of later episodes are thus feasible for this hand.
 """
 
 import functools
@@ -27,7 +27,7 @@ class Grasps(NamedTuple):
     """Final states of grasps in a batch of environments, in the object frame."""
 
     found: Array
-    """(B,) bool: the environment had a successful episode since its grasp was last collected."""
+    """(B,) bool: the environment had a successful episode since its grasp was last taken."""
     object_index: Array
     """(B,) int."""
     region: Array

@@ -1,6 +1,5 @@
 """Initial conditions, given or drawn from a constraint bank (paper, sections Training Setup, Hand Initialization)."""
 
-import zlib
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors.physics.engine import ResetState
-from congrasp.common import rotations
+from congrasp.common import chance, rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.closure import MARGIN, preshape
 from congrasp.common.hands.spec import Hand
@@ -17,7 +16,7 @@ from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import known, optional
 from congrasp.common.task.constraints.force import least_force
 from congrasp.common.task.constraints.priority import Resolution, active_blocks, resolve
-from congrasp.common.task.sampling.bank import ConstraintBank, Draw
+from congrasp.common.task.sampling.bank import ConstraintBank, Draw, surface_of
 from congrasp.common.task.sampling.headings import Headings, local_width
 from congrasp.common.task.sensing import Sensors, draw_sensors
 from congrasp.common.task.types import Array, Goal, Surface
@@ -71,7 +70,7 @@ def sample(
 ) -> InitialConditions:
     """Draws objects, resting poses, constraints and initial hands at random.
 
-    Each constraint draws from a separate key, so that adding one does not change the draws of the others.
+    Each constraint has random numbers of its own, so that adding one does not change the draws of the others.
 
     Args:
       hand: the hand.
@@ -81,26 +80,36 @@ def sample(
       batch: number B of episodes.
       stationary: () bool, fixes the objects (the paper's first phase).
     """
-    keys = iter(jax.random.split(key, 3))
-    share = jnp.cumsum(bank.weight)
-    objects = jnp.searchsorted(share, share[-1] * jax.random.uniform(next(keys), (batch,)), side="right")
-    objects = jnp.minimum(objects, len(bank.weight) - 1).astype(jnp.int32)  # rounding may reach the upper bound
-    rests = jax.random.randint(next(keys), (batch,), 0, bank.rest.shape[1])
-    wanted = {
-        c.name: jax.random.uniform(own_key(key, c.name, 0), (batch,)) < getattr(task, f"p_{c.name}")
-        for c in optional(task)
-    }
+    uniform = _uniforms(hand, task, key, batch)
+    episode = uniform[_TRAINING].T
+    objects, rests = chance.weighted(episode[0], bank.weight), chance.index(episode[1], bank.rest.shape[1])
+    wanted = {c.name: uniform[c.name][:, 0] < getattr(task, f"p_{c.name}") for c in optional(task)}
     if "affordance" in wanted and "trajectory" in wanted:
-        more = jax.random.uniform(own_key(key, "together", 0), (batch,)) < task.p_together
-        wanted["trajectory"] |= active_blocks(wanted)["affordance"] & more
-    draw = Draw(bank, objects, rests, disturbance=_disturbance(task, own_key(key, "disturbance", 0), batch))
-    approach = _varied(task, own_key(key, "approach", 0), batch)
-    return _drawn(hand, task, draw, next(keys), wanted, stationary, approach)
+        wanted["trajectory"] |= active_blocks(wanted)["affordance"] & (episode[2] < task.p_together)
+    disturbance = None
+    if task.disturbed_references:
+        disturbance = jnp.where(episode[3] < task.disturbed_references, episode[4], 0.0)
+    draw = Draw(bank, objects, rests, disturbance=disturbance)
+    return _drawn(hand, task, draw, key, uniform, wanted, stationary, _varied(task, *episode[5:]))
 
 
-def _varied(task: TaskConfig, key: Array, batch: int) -> Approach:
-    """Draws approaches for training: from near and far, at rest or in motion, with different openings."""
-    distance, margin, speed = jax.random.uniform(key, (3, batch))
+_TRAINING, _EPISODE = "training", "episode"
+"""Random numbers of an episode apart from those of its constraints, which have their names."""
+
+
+def _uniforms(hand: Hand, task: TaskConfig, key: Array, batch: int) -> dict[str, Array]:
+    """Random numbers (B, U) in [0, 1) of B episodes by name.
+
+    A constraint has two before those of `Constraint.sample`: whether it is requested, and its reference.
+    """
+    numbers = {c.name: 2 + c.numbers(hand, task) for c in known(task)}
+    return chance.uniforms(key, {_TRAINING: 8, _EPISODE: 5, **numbers}, batch)
+
+
+def _varied(task: TaskConfig, distance: Array, margin: Array, speed: Array) -> Approach:
+    """Approaches for training from random numbers (B,) in [0, 1): from near and far, at rest or in motion, with
+    different openings.
+    """
     near, far = task.back_off_range
     narrow, wide = task.preshape_margin
     back_off = near + (far - near) * distance
@@ -110,14 +119,6 @@ def _varied(task: TaskConfig, key: Array, batch: int) -> Approach:
 def _nominal(task: TaskConfig, batch: int) -> Approach:
     """Returns the nominal approaches of evaluation and requests."""
     return Approach(jnp.full(batch, task.back_off), jnp.full(batch, MARGIN), jnp.zeros(batch))
-
-
-def _disturbance(task: TaskConfig, key: Array, batch: int) -> Array | None:
-    """Scale (B,) between 0 and 1 of the disturbance of an episode's references; None if there is none."""
-    if not task.disturbed_references:
-        return None
-    which, amount = jax.random.uniform(key, (2, batch))
-    return jnp.where(which < task.disturbed_references, amount, 0.0)
 
 
 class PlannedEpisodes(NamedTuple):
@@ -153,7 +154,7 @@ def planned(
         own = jax.random.fold_in(jax.random.fold_in(key, episode.names), episode.numbers)
         draw = Draw(bank, episode.objects[None], episode.rests[None])
         wanted = {name: jnp.reshape(flag, 1) for name, flag in asked.items()}
-        return _drawn(hand, task, draw, own, wanted, False, _nominal(task, 1))
+        return _drawn(hand, task, draw, own, _uniforms(hand, task, own, 1), wanted, False, _nominal(task, 1))
 
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(one)(plan))
 
@@ -185,22 +186,26 @@ def _drawn(
     task: TaskConfig,
     draw: Draw,
     key: Array,
+    uniform: Mapping[str, Array],
     wanted: Mapping[str, Array],
     stationary: Array | bool,
     approach: Approach,
 ) -> InitialConditions:
-    """Draws the rest of B episodes with given objects, resting poses and (where available) constraints."""
+    """Draws the rest of B episodes with given objects, resting poses and (where available) constraints.
+
+    `uniform` are numbers of `_uniforms`, the key is that of the sensors.
+    """
     bank, batch = draw.bank, draw.objects.shape
-    mass, friction, length = (jax.random.uniform(part, batch) for part in jax.random.split(key, 3))
+    mass, friction, length, gain, common = uniform[_EPISODE].T
     low, high = task.mass_range
     friction_low, friction_high = task.friction_range
     mass = low + (high - low) * mass
     friction = friction_low + (friction_high - friction_low) * friction
     draw, asked = _available(task, draw, wanted)
     draw = draw._replace(least_force=least_force(bank.mass[draw.objects] * mass, friction))
-    draw = draw._replace(reference=_references(task, draw, asked, key))
-    values = {c.name: c.sample(hand, draw, own_key(key, c.name, 1)) for c in known(task)}
-    surface = Surface(bank.points[draw.objects], bank.avoid[draw.objects])
+    draw = draw._replace(reference=_references(task, draw, asked, uniform, common))
+    values = {c.name: c.sample(hand, draw, uniform[c.name][:, 2:]) for c in known(task)}
+    surface = surface_of(task, bank, draw.objects)
     goal = resolve(hand, surface, Goal(values, {}), asked).goal
     gain_low, gain_high = task.gain_range
     reset_state = start(
@@ -213,29 +218,31 @@ def _drawn(
         objects=draw.objects,
         mass_scale=mass,
         friction=friction,
-        gain_scale=gain_low + (gain_high - gain_low) * jax.random.uniform(own_key(key, "gains", 0), batch),
+        gain_scale=gain_low + (gain_high - gain_low) * gain,
         stationary=jnp.broadcast_to(stationary, batch),
     )
     # Squared, so that short holds, whose beginning every episode shares, remain the most common.
     longer = jnp.floor(length**2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
     hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
-    sensors = draw_sensors(task.sensing, task.control_dt, own_key(key, "sensing", 0), len(hold))
+    sensors = draw_sensors(task.sensing, task.control_dt, key, len(hold))
     return InitialConditions(reset_state, goal, surface, draw.region, hold, sensors)
 
 
-def _references(task: TaskConfig, draw: Draw, asked: Mapping[str, Array], key: Array) -> dict[str, Array]:
+def _references(
+    task: TaskConfig, draw: Draw, asked: Mapping[str, Array], uniform: Mapping[str, Array], common: Array
+) -> dict[str, Array]:
     """Index (B,) of the reference of each constraint that is drawn from references.
 
     Each constraint draws independently (the paper's potentially misaligned pairs). With `aligned_references`, all use
-    one that every requested constraint allows; where there is none, each draws independently.
+    one that every requested constraint allows, by the random numbers `common` (B,); where there is none, each draws
+    independently.
     """
     together = _allowed_together(task, draw, asked)
     found = {}
     for name, own in _allowed(task, draw).items():
         if task.aligned_references:
             own = jnp.where(jnp.any(together, -1, keepdims=True), together, own)
-        order = jax.random.uniform(own_key(key, "reference" if task.aligned_references else name, 2), own.shape)
-        found[name] = jnp.argmax(jnp.where(own, order, -1.0), -1)
+        found[name] = chance.among(common if task.aligned_references else uniform[name][:, 1], own)
     return found
 
 
@@ -250,11 +257,6 @@ def _allowed_together(task: TaskConfig, draw: Draw, asked: Mapping[str, Array]) 
     for name, own in _allowed(task, draw).items():
         together &= own | ~asked[name][:, None]
     return together
-
-
-def own_key(key: Array, name: str, stage: int) -> Array:
-    """Random key of one stage of a constraint's draws: whether it is requested, its goal arrays, its reference."""
-    return jax.random.fold_in(jax.random.fold_in(key, zlib.crc32(name.encode())), stage)
 
 
 def handover_speed(hand: Hand, task: TaskConfig) -> float:
@@ -339,7 +341,8 @@ def initial_hand(
 ) -> tuple[Array, Array, Array]:
     """Initial finger angles (B, F) and world wrist poses (B, 3), (B, 4), determined by the constraints.
 
-    The fingers are opened to the object's width at the heading, and a hand that would be in the table is raised.
+    With `TaskConfig.preshape` the fingers are opened to the object's width at the heading, unless a constraint sets
+    them. A hand that would be in the table is raised.
 
     Args:
       hand: the hand.

@@ -1,28 +1,26 @@
-"""Rollouts: the single driver of control steps, for training, evaluation, attempts and benchmarks.
+"""Rollouts and the compiled functions that produce them.
 
-With a compiled engine the whole rollout is one program (`jax.lax.scan`); otherwise the same functions are compiled
-separately around the engine's step.
+With an engine that JAX can trace the whole rollout is one program (`jax.lax.scan`); otherwise the same functions are
+compiled separately around the engine's step. `actors.worker` drives both.
 """
 
-import concurrent.futures
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors import harvest, initial
+from congrasp.actors import initial
 from congrasp.actors import stress as protocols
 from congrasp.actors.env import EnvState, GraspEnv, Settings, Transition, episode_fields
-from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics.engine import Physics, PhysicsState
 from congrasp.actors.stress import Frame
 from congrasp.common.hands.spec import Hand
-from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import metrics
-from congrasp.common.task.config import RewardWeights, TaskConfig
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.observation import observe
 from congrasp.common.task.sampling.bank import ConstraintBank
@@ -34,6 +32,13 @@ ActFunction = Callable[[Any, Array, Array], tuple[Array, Array]]
 Probe = Callable[[Scene, Array, Any], Any]
 """(scene after a control step, indices of the objects (B,), `Settings.probe_data`) -> a pytree of arrays to record for
 every environment and step."""
+Traced = Literal["first", "all", "none"]
+"""Environments whose steps are recorded (`Trace`)."""
+_WHICH: dict[Traced, int | slice] = {"first": 0, "all": slice(None), "none": slice(0)}
+
+
+def no_probe(scene: Scene, index: Array, data: Any) -> None:
+    """Probe that records nothing."""
 
 
 class Trace(NamedTuple):
@@ -77,7 +82,7 @@ class Rollout(NamedTuple):
     truncated: Array
     """(T, B) bool: it ended by its time limit with the object held (`actors.env.Transition`)."""
     occupancy: Array
-    """(T, 2), see `actors.physics.engine.PhysicsState`."""
+    """(T, 3), see `actors.physics.engine.PhysicsState`."""
     last_observation: Array
     """(B, D)."""
     episodes: Array
@@ -117,186 +122,55 @@ class _Decision(NamedTuple):
     """Inputs of the engine's step."""
 
 
-class RolloutWorker:
-    """Environments that continue from one rollout to the next."""
+class Programs:
+    """Compiled functions of the rollouts of one hand, task, policy and batch size.
+
+    The methods with an underscore are what the attributes without it compile.
+    """
 
     def __init__(
         self,
         hand: Hand,
         task: TaskConfig,
-        physics: Physics,
-        bank: ConstraintBank | None,
+        engine: Physics | None,
         policy: ActFunction,
         *,
         batch: int,
-        seed: int,
         half_precision: bool,
-        probe: Probe = lambda scene, index, data: None,
-        traced: int | slice = 0,
-        staggered: bool = False,
-        taught: bool = False,
-        privileged: Sequence[GraspObject] = (),
+        probe: Probe,
+        traced: Traced,
+        taught: bool,
     ):
-        """Creates the worker, and starts episodes if there is a bank.
+        """Declares the functions; nothing is compiled yet. `actors.worker.RolloutWorker` describes the arguments.
 
         Args:
-          hand: the hand.
-          task: the task.
-          physics: the engine, with the objects of the bank.
-          bank: constraint bank of the episodes; without one, `begin` sets the episodes, which do not restart at their
-            end.
-          policy: a pure function; `collect` passes its parameters.
-          batch: number B of environments.
-          seed: seed of episodes and actions.
-          half_precision: rounds observations to half precision, for the policy and for the learner.
-          probe: computes additional values to record at every step.
-          traced: environments whose trace is recorded.
-          staggered: ends the first episodes early at different times, so that short rollouts then contain all phases of
-            the task.
-          taught: records `Rollout.teacher_observation`.
-          privileged: the engine's objects, if `Rollout.privileged` is recorded.
+          engine: an engine that JAX can trace; None for one that is stepped between the functions.
         """
-        self.physics, self.env = physics, GraspEnv(hand, task, physics)
-        self._hand, self._task, self._bank, self._policy = hand, task, _on_device(bank), policy
-        self._probe, self._traced, self._staggered, self.batch = probe, traced, staggered, batch
-        self._taught = taught
+        self.env = GraspEnv(hand, task, engine)
+        self._engine, self._policy, self._probe = engine, policy, probe
+        self._batch, self._traced, self._taught = batch, _WHICH[traced], taught
         self._dtype = jnp.float16 if half_precision else jnp.float32
-        self._settings, self._stationary = self.env.settings, np.array(False)
-        if privileged:
-            self.adjust(masses=_masses(privileged))
-        self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
-        self._sample_jit = jax.jit(self._sample)
-        self._begin_jit = jax.jit(self._begin)
-        self._decide_jit = jax.jit(self._decide)
-        self._advance_jit = jax.jit(self._advance)
-        self._merge_jit = jax.jit(self._merge)
-        self._restart_jit = jax.jit(self.env.restart)
-        self._look_jit = jax.jit(self._look)
-        self._with_scene_jit = jax.jit(self.env.with_scene)
-        self._scan_jit = jax.jit(self._scan, static_argnames="steps")
-        self.state: EnvState | None = None
-        if bank is not None:
-            self.restart()
-
-    def adjust(self, **settings: Any) -> None:
-        """Changes `Settings` by name from the next control step on; new types or shapes are recompiled."""
-        self._settings = self._settings._replace(**settings)
-
-    def configure(self, weights: RewardWeights, *, stationary: bool) -> None:
-        """Sets the reward weights, and whether the objects of episodes that start from now on are fixed."""
-        self._settings, self._stationary = self._settings._replace(weights=weights), np.array(stationary)
-
-    def replace_objects(self, objects: Sequence[GraspObject], bank: ConstraintBank | None) -> None:
-        """Replaces the objects by as many others, with their bank, for episodes that start from now on."""
-        physics = self.physics.replace_objects(self.state.physics if self.state else None, objects)
-        self._bank = _on_device(bank)
-        if self._settings.masses is not None:
-            self.adjust(masses=_masses(objects))
-        if self.state is not None:
-            self.state = self.state._replace(physics=physics if self.physics.compiled else None)
-            self.take_grasps()
-
-    def restart(self) -> None:
-        """Starts new episodes in every environment."""
-        self._episode_key, key = _split(self._episode_key)
-        conditions = self._sample_jit(self._bank, key, self._stationary)
-        if self._staggered:
-            whole = self._task.approach_steps + np.asarray(conditions.hold)
-            share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
-            conditions = conditions._replace(hold=_on_device(np.int32(conditions.hold - np.floor(share * whole))))
-        self.begin(conditions)
-
-    def begin(self, conditions: InitialConditions) -> None:
-        """Starts these episodes, one in each environment."""
-        kept, conditions = self.state, _on_device(conditions)
-        if self.physics.compiled:
-            self.state = self._begin_jit(conditions, _on_device(kept))
-            return
-        if kept is None:
-            self.physics.start(conditions.reset_state)
-        else:
-            self.physics.reset(None, np.ones(self.batch, bool), conditions.reset_state)
-        state = self._begin_jit(conditions, None)
-        self.state = self._with_scene_jit(state._replace(views=None), self.physics.read(None))
-        if kept is not None:
-            self.state = self.state._replace(grasps=kept.grasps)
-
-    def renew(self, mask: np.ndarray, conditions: InitialConditions) -> None:
-        """Starts these episodes in the masked environments (B,)."""
-        assert self.state is not None, "call `begin` first"
-        conditions = _on_device(conditions)
-        if self.physics.compiled:
-            self.state = self._restart_jit(self.state, mask, conditions)
-            return
-        self.physics.reset(None, mask, conditions.reset_state)
-        state = self._merge_jit(self.state._replace(views=None), mask, conditions)
-        self.state = self._with_scene_jit(state, self.physics.read(None))
-
-    def observe(self) -> Array:
-        """Observation (B, D) of the current control step by the policy."""
-        return self._look_jit(self.state, self._settings).observation
-
-    def compile(self, parameters: Any, steps: int) -> None:
-        """Compiles the programs of `collect` and `renew_references` without running them; for compiled engines.
-
-        Args:
-          parameters: parameters of the policy, as for `collect`.
-          steps: number T of steps.
-        """
-        given, grasps = self._scan_arguments(parameters, self._key), self.state.grasps if self.state else None
-        programs = [self._scan_jit.lower(*given, steps=steps)]
-        programs.append(harvest.renew.lower(self._hand, self._task, self._bank, grasps, self._key))
-        with concurrent.futures.ThreadPoolExecutor(len(programs)) as threads:
-            list(threads.map(lambda program: program.compile(), programs))
-
-    @property
-    def bank(self) -> ConstraintBank:
-        """Current constraint bank of the episodes."""
-        assert self._bank is not None, "these episodes are given"
-        return self._bank
-
-    def weigh_objects(self, weight: np.ndarray) -> None:
-        """Sets the weights (N,) with which episodes that start from now on draw objects."""
-        self._bank = self.bank._replace(weight=jnp.asarray(weight, jnp.float32))
-
-    def renew_references(self) -> None:
-        """Stores the grasps that succeeded since the last call as reference poses in the bank."""
-        self._key, key = _split(self._key)
-        self._bank = harvest.renew(self._hand, self._task, self.bank, self.take_grasps(), key)
-
-    def take_grasps(self) -> Grasps:
-        """Returns the grasps that succeeded since the last call."""
-        assert self.state is not None, "call `begin` first"
-        grasps = self.state.grasps
-        self.state = self.state._replace(grasps=grasps._replace(found=_on_device(np.zeros(self.batch, bool))))
-        return grasps
-
-    def collect(self, parameters: Any, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
-        """Simulates the next `steps` control steps with these policy parameters.
-
-        Args:
-          parameters: parameters of the policy.
-          steps: number T of steps.
-          progress: called with the number of completed steps, by engines that are not compiled.
-        """
-        assert self.state is not None, "call `begin` first"
-        self._key, key = _split(self._key)
-        self.state = _on_device(self.state._replace(has_finished=np.zeros(self.batch, bool)))
-        if self.physics.compiled:
-            return self._collect_compiled(parameters, key, steps)
-        return self._collect_stepwise(parameters, key, steps, progress)
+        self.sample = jax.jit(self._sample)
+        self.begin = jax.jit(self._begin)
+        self.merge = jax.jit(self._merge)
+        self.restart = jax.jit(self.env.restart)
+        self.with_scene = jax.jit(self.env.with_scene)
+        self.look = jax.jit(self._look)
+        self.decide = jax.jit(self._decide)
+        self.advance = jax.jit(self._advance)
+        self.scan = jax.jit(self._scan, static_argnames="steps")
 
     def _sample(self, bank: ConstraintBank, key: Array, stationary: Array) -> InitialConditions:
         """Draws initial conditions for all environments from the bank."""
-        return initial.sample(self._hand, self._task, bank, key, self.batch, stationary)
+        return initial.sample(self.env.hand, self.env.task, bank, key, self._batch, stationary)
 
     def _begin(self, conditions: InitialConditions, kept: EnvState | None) -> EnvState:
         """Starts episodes in every environment; a compiled engine is started or, if it runs already, reset."""
-        if not self.physics.compiled:
+        if self._engine is None:
             return self.env.state_of(conditions, None)
         if kept is None:
             return self.env.reset(conditions)
-        physics = self.physics.reset(kept.physics, jnp.ones(self.batch, bool), conditions.reset_state)
+        physics = self._engine.reset(kept.physics, jnp.ones(self._batch, bool), conditions.reset_state)
         return self.env.state_of(conditions, physics)._replace(grasps=kept.grasps)
 
     def _merge(self, state: EnvState, mask: Array, fresh: InitialConditions) -> EnvState:
@@ -347,50 +221,6 @@ class RolloutWorker:
         changed.pop("views")
         return changed, transition, kept, following
 
-    def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
-        """Collects a rollout with an engine that JAX cannot trace; see `collect`."""
-        # One more key than steps: the decision after the last step only yields `last_observation`.
-        keys = jax.random.split(key, steps + 1)
-        key_data = np.asarray(jax.random.key_data(keys))
-        parameters, settings = _on_device((parameters, self._settings))
-        assert self.state is not None
-        decision = self._decide_jit(parameters, settings, self.state, keys[0])
-        state = self.state._replace(views=None)
-        rows: list[dict[str, Any]] = []
-        extras = []
-        for step in range(1, steps + 1):
-            _, physics_state = self.physics.step(None, *map(np.asarray, decision.command))
-            decided = decision
-            changed, transition, kept, decision = self._advance_jit(
-                parameters, settings, state, physics_state, decision, key_data[step]
-            )
-            state = state._replace(**changed)
-            rows.append(_row(decided.seen, decided.action, decided.log_probability, transition))
-            extras.append(kept)
-            if self._bank is not None and np.asarray(transition.terminal).any():
-                self._episode_key, episode_key = _split(self._episode_key)
-                fresh = self._sample_jit(self._bank, episode_key, self._stationary)
-                self.physics.reset(None, transition.terminal, fresh.reset_state)
-                state = self._merge_jit(state, transition.terminal, fresh)
-                physics_state = self.physics.read(None)
-                decision = self._decide_jit(
-                    parameters, settings, self._with_scene_jit(state, physics_state), keys[step]
-                )
-            progress(step)
-        self.state = self._with_scene_jit(state, physics_state)
-        columns, (trace, probed) = jax.tree.map(lambda *x: np.stack(x), *zip(rows, extras, strict=True))
-        return _rollout(self.state, columns, decision.seen, trace, probed)
-
-    def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
-        """Collects a rollout as one program; see `collect`."""
-        (self.state, self._episode_key), rollout = self._scan_jit(*self._scan_arguments(parameters, key), steps=steps)
-        return rollout
-
-    def _scan_arguments(self, parameters: Any, key: Array) -> tuple[Any, ...]:
-        """Arguments of `_scan` except for the steps."""
-        parameters, bank, carry = _on_device((parameters, self._bank, (self.state, self._episode_key)))
-        return parameters, self._settings, self._stationary, bank, carry, key
-
     def _scan(
         self,
         parameters: Any,
@@ -419,24 +249,31 @@ class RolloutWorker:
             if bank is not None:
                 ended = jnp.any(transition.terminal)
                 carry = jax.lax.cond(ended, renew, lambda x: x[:2], (*carry, transition.terminal))
-            return carry, (_row(seen, action, log_probability, transition), kept)
+            return carry, (row_of(seen, action, log_probability, transition), kept)
 
         carry, (columns, (trace, probed)) = jax.lax.scan(body, carry, jax.random.split(key, steps))
         state, _ = carry
-        return carry, _rollout(state, columns, self._look(state, settings), trace, probed)
+        return carry, rollout_of(state, columns, self._look(state, settings), trace, probed)
 
 
-def _on_device(tree: Any) -> Any:
-    """Commits the arrays to this process's device: uncommitted ones would cause another compilation."""
-    return jax.device_put(tree, jax.local_devices()[0])
+@functools.lru_cache(maxsize=16)
+def _shared(hand: Hand, task: TaskConfig, policy: ActFunction, **settings: Any) -> Programs:
+    """Returns the programs around an engine that is stepped between them; the same ones for the same arguments."""
+    return Programs(hand, task, None, policy, **settings)
 
 
-def _masses(objects: Sequence[GraspObject]) -> Array:
-    """Masses (N,) in kg."""
-    return _on_device(np.array([obj.mass for obj in objects], np.float32))
+def programs_of(hand: Hand, task: TaskConfig, engine: Physics, policy: ActFunction, **settings: Any) -> Programs:
+    """Returns the programs of rollouts on an engine.
+
+    Workers on equal tasks share them, so that each is compiled once in a process; the programs of an engine that JAX
+    can trace belong to that engine.
+    """
+    if engine.compiled:
+        return Programs(hand, task, engine, policy, **settings)
+    return _shared(hand, task, policy, **settings)
 
 
-def _row(seen: _Seen, action: Array, log_probability: Array, transition: Transition) -> dict[str, Any]:
+def row_of(seen: _Seen, action: Array, log_probability: Array, transition: Transition) -> dict[str, Any]:
     """Fields of a `Rollout` for one control step."""
     return {
         **seen._asdict(),
@@ -449,8 +286,8 @@ def _row(seen: _Seen, action: Array, log_probability: Array, transition: Transit
     }
 
 
-def _rollout(state: EnvState, columns: dict[str, Any], last: _Seen, trace: Trace, probed: Any) -> Rollout:
-    """Returns the rollout of stacked rows (`_row`) that ends in this state, with the observations `last`."""
+def rollout_of(state: EnvState, columns: dict[str, Any], last: _Seen, trace: Trace, probed: Any) -> Rollout:
+    """Returns the rollout of stacked rows (`row_of`) that ends in this state, with the observations `last`."""
     return Rollout(
         **columns,
         last_observation=last.observation,
@@ -460,10 +297,6 @@ def _rollout(state: EnvState, columns: dict[str, Any], last: _Seen, trace: Trace
         trace=trace,
         probed=probed,
     )
-
-
-_split = jax.jit(lambda key: tuple(jax.random.split(key)))
-"""Two random keys, in one call."""
 
 
 def _traced(scene: Scene, frame: Frame, action: Array, transition: Transition, where: int | slice) -> Trace:

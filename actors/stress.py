@@ -51,11 +51,11 @@ class Protocol(NamedTuple):
     """
 
     lift_start: Array
-    """() start, control steps."""
+    """() start of the lift, control steps."""
     lift_height: Array
     """() m."""
     push_start: Array
-    """() duration, control steps."""
+    """() start of the pushes, control steps."""
     masses: Array
     """(N,) masses of the engine's objects, kg."""
     table: Array | bool = False

@@ -51,8 +51,8 @@ class ObjectsConfig:
     """Rollouts after which an actor's procedural objects are replaced by those of the next seeds and its episodes
     restart; 0 keeps them. Generating them takes as long as at the start."""
     by_failure: bool = False
-    """Draws objects that fall more often than others up to twice as often, and those that fall less often down to half
-    as often, by the actor's episodes (the folder's share shifts with them)."""
+    """Draws objects whose success is less certain than that of others up to twice as often, and those whose success or
+    failure is more certain down to half as often, by the actor's episodes (the folder's share shifts with them)."""
 
     def __post_init__(self) -> None:
         """Raises a CongraspError for constraint sets without objects."""
@@ -114,6 +114,9 @@ class PPOConfig:
     final_std: float = 0.1
     """Standard deviation of the action at the end of `settling`, in units of action. With n updates left, it is capped
     at std (final_std / std)^(1/n): a geometric decay. Smaller deviations are kept; 0 sets no cap."""
+    least_std: float = 0.0
+    """Smallest standard deviation of the action before `settling`, in units of action: each update raises smaller ones
+    to it. 0 sets no floor."""
     entropy: float = 0.0
     """Weight of the entropy bonus."""
     value_coefficient: float = 0.5
@@ -137,6 +140,11 @@ class PPOConfig:
         if self.final_std <= 0.0 or not self.settling or self._settled(version, updates) < 0.0:
             return math.inf
         return 1.0 - 1.0 / max(updates - version, 1)
+
+    def least_std_at(self, version: int, updates: int) -> float:
+        """Returns the floor of the action's standard deviation in the update of this version; 0 during `settling`."""
+        settles = bool(self.settling) and self._settled(version, updates) >= 0.0
+        return 0.0 if settles else self.least_std
 
     def _settled(self, version: int, updates: int) -> float:
         """Share of `settling` completed before the update of this version; negative before it begins."""
@@ -220,8 +228,8 @@ class RunConfig:
     collapse_patience: int = 60
     """Consecutive updates without contact, or with less than half of the best success, that end the run; 0: never."""
     episode_every: int = 10
-    """Rollouts of an actor between two episodes published for logs. It is a minimum, since only an episode that ends
-    within its rollout is published."""
+    """Rollouts of an actor between two episodes published for logs. It is a minimum, since an episode may extend over
+    several rollouts."""
     log_rollout_every: int = 20
     """Rollouts of an actor between two published for logs; 1 publishes all of them, 0 none."""
     log_rollout_worlds: int = 4

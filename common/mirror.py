@@ -2,7 +2,7 @@
 
 A left hand is the mirror image of a right one, and so is everything that it does: a policy of the right hand grasps the
 mirrored object under mirrored constraints, and the mirror image of its motion is that of the left hand. Joint angles
-stay as they are, because joint axes are mirrored as axes of rotation.
+are unchanged, because joint axes are mirrored as axes of rotation.
 """
 
 from collections.abc import Mapping

@@ -36,6 +36,11 @@ class GraspRequest:
     """Initial pose of the object in the world frame."""
     cloud: np.ndarray | None = None
     """(N, 3) points of the visible part of the object's surface, world frame, m."""
+    normals: np.ndarray | None = None
+    """(N, 3) outward unit normals at the points of surface or cloud, in their frame, for a policy that observes normals
+    (`TaskConfig.surface_normals`); without them, it estimates them."""
+    camera: np.ndarray | None = None
+    """(3,) position of the camera of the cloud, world frame, m, toward which estimated normals point."""
 
     def given(self, constraint: str, field: str) -> np.ndarray | None:
         """Returns a goal array, or None if it is not requested."""

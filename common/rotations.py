@@ -1,27 +1,27 @@
-"""Rotations: unit quaternions (w, x, y, z), matrices and intrinsic x-y-z angles, over any leading axes."""
+"""Rotations: unit quaternions (w, x, y, z), matrices and intrinsic x-y-z angles, over any leading axes.
+
+Products are written over whole vectors instead of components: each component would add a slice to programs that contain
+hundreds of rotations, and compiling takes longer than running them.
+"""
 
 import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common.task.types import Array
 
+_FACTORS = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+_SIGNS = np.array([[1, 1, 1, 1], [-1, 1, -1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1]], np.float32)
+"""Component k of the Hamilton product a b is the sum over i of a_i signs[i, k] b[factors[i, k]]."""
+_SKEW = np.array([[0, 2, 1], [2, 1, 0], [1, 0, 2]])
+_SKEW_SIGNS = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]], np.float32)
+_IDENTITY, _AXES = np.eye(4, dtype=np.float32)[0], np.eye(4, dtype=np.float32)[1:]
 _UNDECIDED = 1e-5
 """Cosine of the y angle below which the x angle keeps its previous value (`quaternion_to_euler`)."""
 
 
 def multiply(a: Array, b: Array) -> Array:
     """Hamilton product of quaternions (..., 4): first `b`, then `a`."""
-    aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
-    bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
-    return jnp.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        -1,
-    )
+    return jnp.sum(a[..., :, None] * (b[..., _FACTORS] * _SIGNS), -2)
 
 
 def conjugate(q: Array) -> Array:
@@ -29,39 +29,39 @@ def conjugate(q: Array) -> Array:
     return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross product of vectors (..., 3)."""
+    return jnp.roll(a * jnp.roll(b, -1, -1) - jnp.roll(a, -1, -1) * b, -1, -1)
+
+
 def rotate(q: Array, v: Array) -> Array:
     """Vectors (..., 3) rotated by unit quaternions (..., 4)."""
     w, axis = q[..., :1], q[..., 1:]
-    t = 2.0 * jnp.cross(axis, v)
-    return v + w * t + jnp.cross(axis, t)
+    t = 2.0 * cross(axis, v)
+    return v + w * t + cross(axis, t)
 
 
 def to_matrix(q: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    w, x, y, z = jnp.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4): (2 w^2 - 1) I + 2 (v v^T + w [v]_x)."""
+    w, v = q[..., :1, None], q[..., 1:]
+    return (2.0 * w * w - 1.0) * np.eye(3, dtype=np.float32) + 2.0 * (v[..., :, None] * v[..., None, :] + w * skew(v))
+
+
+def skew(v: Array) -> Array:
+    """Matrices (..., 3, 3) of the cross product with vectors (..., 3): skew(v) @ x = v x x."""
+    return v[..., _SKEW] * _SKEW_SIGNS
 
 
 def from_matrix(m: Array) -> Array:
     """Unit quaternions (..., 4) with w >= 0 of rotation matrices (..., 3, 3), stable for every rotation."""
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
-    diagonal = jnp.stack([trace, m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], -1)
-    skew = jnp.stack(
-        [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]],
-        -1,
-    )
+    entries = m.reshape(*m.shape[:-2], 9)
+    axes, trace = entries[..., ::4], jnp.sum(entries[..., ::4], -1, keepdims=True)
+    diagonal = jnp.concatenate([trace, axes], -1)
+    opposite = entries[..., np.array([7, 2, 3])] - entries[..., np.array([5, 6, 1])]
     # Row k holds 4 q_k q; the candidate with the largest component is the most accurate.
-    w_row = jnp.concatenate([1.0 + trace[..., None], skew], -1)
-    symmetric = m + jnp.swapaxes(m, -1, -2)
-    squares = 1.0 - trace[..., None] + 2.0 * diagonal[..., 1:]
-    off_diagonal = symmetric * (1.0 - jnp.eye(3, dtype=m.dtype))
-    axis_rows = jnp.concatenate([skew[..., :, None], off_diagonal + squares[..., None] * jnp.eye(3, dtype=m.dtype)], -1)
-    rows = jnp.concatenate([w_row[..., None, :], axis_rows], -2)
+    w_row = jnp.concatenate([1.0 + trace, opposite], -1)
+    axis_rows = m + m.mT + (1.0 - trace)[..., None] * np.eye(3, dtype=np.float32)
+    rows = jnp.concatenate([w_row[..., None, :], jnp.concatenate([opposite[..., :, None], axis_rows], -1)], -2)
     best = jnp.argmax(diagonal, -1)
     q = jnp.take_along_axis(rows, best[..., None, None], -2)[..., 0, :]
     q = q / jnp.linalg.norm(q, axis=-1, keepdims=True)
@@ -86,25 +86,16 @@ def from_rotation_vector(vector: Array) -> Array:
 
 def axis_rotation(axis: Array, theta: Array) -> Array:
     """Rotation matrices (..., 3, 3) about unit axes (..., 3) by angles (...,), by Rodrigues' formula."""
-    zero = jnp.zeros_like(axis[..., 0])
-    x, y, z = jnp.moveaxis(axis, -1, 0)
-    k = jnp.stack(
-        [jnp.stack([zero, -z, y], -1), jnp.stack([z, zero, -x], -1), jnp.stack([-y, x, zero], -1)],
-        -2,
-    )
     s, c = jnp.sin(theta)[..., None, None], jnp.cos(theta)[..., None, None]
-    return jnp.eye(3, dtype=axis.dtype) + s * k + (1.0 - c) * (k @ k)
+    outer = axis[..., :, None] * axis[..., None, :]
+    return c * np.eye(3, dtype=np.float32) + s * skew(axis) + (1.0 - c) * outer
 
 
 def euler_to_quaternion(angles: Array) -> Array:
     """Quaternions of intrinsic x-y-z angles (..., 3): R = Rx Ry Rz, the order of the wrist's hinges."""
-    half = 0.5 * angles
-    zero = jnp.zeros_like(half[..., 0])
-    c, s = jnp.cos(half), jnp.sin(half)
-    qx = jnp.stack([c[..., 0], s[..., 0], zero, zero], -1)
-    qy = jnp.stack([c[..., 1], zero, s[..., 1], zero], -1)
-    qz = jnp.stack([c[..., 2], zero, zero, s[..., 2]], -1)
-    return multiply(multiply(qx, qy), qz)
+    half = 0.5 * angles[..., :, None]
+    turns = jnp.cos(half) * _IDENTITY + jnp.sin(half) * _AXES
+    return multiply(multiply(turns[..., 0, :], turns[..., 1, :]), turns[..., 2, :])
 
 
 def quaternion_to_euler(q: Array, near: Array) -> Array:
@@ -151,7 +142,7 @@ def shortest(a: Array, b: Array, axis: Array) -> Array:
       b: final vectors.
       axis: (..., 3) unit, orthogonal to a: the axis used if b is -a, where any is valid.
     """
-    q = jnp.concatenate([1.0 + jnp.sum(a * b, -1, keepdims=True), jnp.cross(a, b)], -1)
+    q = jnp.concatenate([1.0 + jnp.sum(a * b, -1, keepdims=True), cross(a, b)], -1)
     length = jnp.linalg.norm(q, axis=-1, keepdims=True)
     half_turn = jnp.concatenate([jnp.zeros_like(length), axis], -1)
     return jnp.where(length < 1e-3, half_turn, q / jnp.maximum(length, 1e-3))
@@ -165,7 +156,7 @@ def frame_from_axes(primary: Array, secondary: Array) -> Array:
     first = primary / jnp.linalg.norm(primary, axis=-1, keepdims=True)
     second = secondary - jnp.sum(secondary * first, -1, keepdims=True) * first
     second = second / jnp.linalg.norm(second, axis=-1, keepdims=True)
-    return from_matrix(jnp.stack([first, second, jnp.cross(first, second)], -1))
+    return from_matrix(jnp.stack([first, second, cross(first, second)], -1))
 
 
 def apply(matrix: Array, points: Array) -> Array:
@@ -197,7 +188,7 @@ def relative_pose(
 def compose_pose(
     position: Array, quaternion: Array, local_position: Array, local_quaternion: Array
 ) -> tuple[Array, Array]:
-    """Composes poses: a pose local to the first one, expressed in the frame of the first one."""
+    """Composes poses: a pose local to the first one, expressed in the frame in which the first one is given."""
     return position + rotate(quaternion, local_position), multiply(quaternion, local_quaternion)
 
 

@@ -1,4 +1,4 @@
-"""Dexterous grasps under constraints: what a program of one's own imports.
+"""Dexterous grasps under constraints: the public Python interface.
 
     import congrasp
 
@@ -9,7 +9,7 @@
         policy.reset(congrasp.GraspRequest(...))
         answer = policy.act(state)
 
-Names are imported when they are first used: the client and its errors need numpy and zenoh alone.
+Names are imported on first use: the client and its errors need only numpy and zenoh.
 """
 
 import importlib

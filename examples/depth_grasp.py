@@ -80,7 +80,11 @@ def simulated(arguments: Arguments) -> np.ndarray:
 
 
 def cloud_of(depth: np.ndarray, arguments: Arguments) -> np.ndarray:
-    """(N, 3) points of the object, world frame, m."""
+    """(N, 3) points of the object, world frame, m.
+
+    Raises:
+      CongraspError: no point is above the floor.
+    """
     fx, fy, cx, cy = arguments.intrinsics
     rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
     z = depth[rows, columns]

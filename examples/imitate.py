@@ -2,8 +2,8 @@
 
     python examples/imitate.py MyoHand_hammer_use1.npz --meshes object_sim --affordance contacts --hand allegro sharpa
 
-From the demonstration come the way the hand approached, the point between the fingers, and what of the object it
-touched; finger angles and the wrist's path, which belong to the human hand, do not count.
+The demonstration provides the approach direction, the point between the fingers, and the parts of the object that were
+touched; finger angles and the wrist's path, which belong to the human hand, are not used.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ _FRAMES = 4
 
 @dataclasses.dataclass
 class Arguments:
-    """What is imitated, and by whom."""
+    """Options of the example."""
 
     demonstration: tyro.conf.Positional[pathlib.Path]
     """A file or folder of the data set."""
@@ -40,13 +40,13 @@ class Arguments:
     mano: pathlib.Path | None = None
     """Your MANO_RIGHT.pkl, where the data set needs it."""
     affordance: Literal["auto", "contacts", "none"] = "auto"
-    """What may be touched: labelled parts that the demonstration touched, or whatever is near to where it touched."""
+    """Graspable surface: the labelled parts that the demonstration touched, the surface near its contacts, or all."""
     hand: tuple[str, ...] = ("allegro", "sharpa")
     """Hands that imitate; objects are scaled for each."""
     policy: pathlib.Path | None = None
     """Policy file of the one hand, if none comes with the package."""
     out: pathlib.Path = pathlib.Path("imitated")
-    """Folder for the results: of each object the picture, and a motion of each hand."""
+    """Folder for the results: a picture of each object, and a motion for each object and hand."""
 
 
 def main(arguments: Arguments) -> None:

@@ -12,7 +12,7 @@ import trimesh
 
 RADIUS, HEIGHT, WALL = 0.040, 0.095, 0.004
 HANDLE_RADIUS, REACH, HALF = 0.0055, 0.032, 0.030
-"""Of the handle: thickness, how far it stands out, and half of its height."""
+"""Of the handle, m: radius of its tube, distance of its centre line from the wall, and half of its height."""
 BAND_WIDTH = 0.016
 SECTIONS, SIDES, STEPS = 48, 12, 32
 GLAZE, BAND, INSIDE = (38, 84, 124), (239, 160, 75), (244, 238, 226)

@@ -15,7 +15,7 @@ import numpy as np
 import onnxruntime
 
 RADIUS, HALF_HEIGHT, MASS = 0.03, 0.06, 0.2
-HEADING = np.array([-1.0, 0.0, -1.0]) / np.sqrt(2)  # the way the hand comes, in the object's frame
+HEADING = np.array([-1.0, 0.0, -1.0]) / np.sqrt(2)  # approach direction in the object's frame
 
 
 def matrix(quaternion):
@@ -117,7 +117,7 @@ class Grasp:
         mujoco.mj_forward(model, data)
 
     def guidance(self, center):
-        """The wrist pose in the world that puts the hand's centre and axes where the heading wants them."""
+        """The wrist pose in the world at which the hand's centre and axes match the heading."""
         turn = self.target @ self.own.T
         position = self.heading_position - turn @ center
         return self.object_position + self.object_matrix @ position, self.object_matrix @ turn
@@ -157,7 +157,7 @@ class Grasp:
         return force, touching
 
     def read(self):
-        """What sensors and controller say now: fingers, wrist, the targets of both, and the object's pose."""
+        """Current joint positions of fingers and wrist, the targets of both, and the object's pose."""
         data = self.data
         position, matrix = data.xpos[self.object].copy(), data.xmat[self.object].reshape(3, 3).copy()
         return data.qpos[self.fingers], data.qpos[self.wrist], self.q_target, self.u_target, position, matrix
@@ -217,7 +217,7 @@ class Grasp:
         return np.concatenate(numbers).astype(np.float32)
 
     def lead(self, ahead, residual, speed):
-        """How far the wrist's targets are ahead of it, within its limits of speed and acceleration."""
+        """Lead of the wrist's targets over its position, within its limits of speed and acceleration."""
         table = self.time < self.meta["task"]["approach_steps"]
         share = 1.0 if table else self.control["hold_acceleration"]
         found = []
@@ -233,7 +233,7 @@ class Grasp:
         return np.concatenate(found)
 
     def load(self):
-        """(6,) m/s^2 and rad/s^2 that everything but its servos gives the wrist."""
+        """(6,) acceleration of the wrist by everything but its servos, m/s^2 and rad/s^2."""
         return self.control["load_rate"] * (self.generalised_speed() - self.momentum)
 
     def generalised_speed(self):

@@ -2,9 +2,9 @@
 
     python examples/robot_loop.py --seconds 600 --kill-every 30
 
-The policy answers over Zenoh from a process of its own, which is killed (SIGKILL) and started again every so often. The
-robot is told a target every 10 ms all the while, within the limits of position, speed and torque. At the end the loop
-prints how far joints, targets and torques were from their limits, and what its clock missed.
+The policy answers over Zenoh from a separate process, which is killed (SIGKILL) and restarted every `--kill-every`
+seconds. The robot receives a target every 10 ms throughout, within the limits of position, speed and torque. At the end
+the loop prints how far joints, targets and torques were from their limits, and the deadlines that it missed.
 """
 
 import dataclasses
@@ -40,20 +40,20 @@ HOLD_STEPS = 200
 
 @dataclasses.dataclass
 class Arguments:
-    """How long, and what goes wrong."""
+    """Options of the example."""
 
     seconds: float = 20.0
-    """How long the loop runs."""
+    """Duration of the loop, s."""
     kill_every: float = 0.0
     """Seconds from one kill of the server to the next; 0 leaves it alone."""
     hand: str = "allegro"
-    """Hand whose pretrained policy is taken."""
+    """Hand whose pretrained policy is used."""
     policy: pathlib.Path | None = None
-    """A policy file instead."""
+    """A policy file to use instead of the pretrained policy."""
     object_seed: int = 1_000_000
     """Seed of the procedural object and of the heading."""
     fallback: Literal["freeze", "open"] = "open"
-    """What a hand that holds nothing does when half a second went by without a fresh answer."""
+    """Behaviour of a hand that holds nothing after half a second without a fresh answer."""
 
 
 class MujocoRobot:
@@ -83,7 +83,7 @@ class MujocoRobot:
         self.reset()
 
     def reset(self) -> None:
-        """Puts hand, object and table to the episode's begin."""
+        """Puts hand, object and table to their poses at the start of the episode."""
         where, request, data = self._where, self.request, self.data
         mujoco.mj_resetData(self.model, data)
         self.model.body_pos[where.base_body], self.model.body_quat[where.base_body] = request.wrist
@@ -103,7 +103,7 @@ class MujocoRobot:
         return float(self.data.xpos[self._where.object_body][2])
 
     def state(self) -> dict[str, np.ndarray]:
-        """What `Policy.act` takes."""
+        """The state for `Policy.act`."""
         raw = (np.float32(x)[None] for x in (self.data.qpos, self.data.qvel, self.data.sensordata))
         found = physics_state(np, self._where, *raw, np.zeros(1, bool), np.zeros(2))._asdict()
         return {name: x[0] for name, x in found.items() if name not in ("diverged", "occupancy")} | {
@@ -125,7 +125,7 @@ class MujocoRobot:
 
 
 class Server:
-    """A policy server in a process of its own."""
+    """A policy server in a separate process."""
 
     def __init__(self, policy: pathlib.Path):
         """Starts it at a free port."""
@@ -156,7 +156,7 @@ class Server:
 
 
 class Grasps:
-    """One grasp after the other: approach, table away, hold; a new one when the policy is back after a fallback."""
+    """Repeated grasps: approach, table away, hold; after a fallback a new one starts once the policy answers again."""
 
     def __init__(self, robot: MujocoRobot, guard: congrasp.Guard, task: TaskConfig):
         self._robot, self._guard, self._task = robot, guard, task
@@ -178,7 +178,7 @@ class Grasps:
             self._end("held" if self._up() else "lost")
 
     def _up(self) -> bool:
-        """Whether the object is where it was when the table was taken away, or that is still there."""
+        """True if the object has not dropped since the table was removed, or the table is still there."""
         return self._height is None or self._robot.height > self._height - self._task.drop_height
 
     def _begin(self) -> None:
@@ -192,12 +192,14 @@ class Grasps:
 
 
 def run(arguments: Arguments) -> dict[str, object]:
-    """Runs the loop; what it measured."""
+    """Runs the loop and returns its measurements."""
     policy = policy_file(arguments.policy, arguments.hand)
     task = bundles.load(policy).task
     hand = get_hand(task.hand)
     if len(hand.motors) != len(hand.joints):
-        raise congrasp.CongraspError(f"Joints of the hand '{hand.name}' are coupled.", "This loop is for other hands.")
+        raise congrasp.CongraspError(
+            f"Joints of the hand '{hand.name}' are coupled.", "Choose a hand with a motor for each joint."
+        )
     limits = congrasp.JointLimits.of_hand(hand, task.control)
     robot = MujocoRobot(hand, task, arguments.object_seed, limits)
     server, kills = Server(policy), 0
@@ -234,7 +236,7 @@ def run(arguments: Arguments) -> dict[str, object]:
 
 
 def main() -> int:
-    """Runs the loop and prints what it measured; the exit code is 1 if a joint left its limits."""
+    """Runs the loop and prints its measurements; the exit code is 1 if a joint left its limits."""
     result = run(tyro.cli(Arguments, description=__doc__))
     print(json.dumps(result, indent=1))
     return int(not float(str(result["joint_beyond_its_limit_rad"])) <= 0.0)

@@ -14,7 +14,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 INPUTS = {"joint_states": JOINTS, "wrist_pose": POSE, "object_pose": POSE, "tf": FRAMES, "tf_static": FRAMES}
 OUTPUTS = {"joint_command": JOINTS, "wrist_command": POSE}
 _MOST = 64
-"""Messages of a topic that wait at most."""
+"""Maximum number of waiting messages of a topic."""
 
 
 class Bus(Protocol):
@@ -25,7 +25,7 @@ class Bus(Protocol):
         ...
 
     def receive(self) -> list[tuple[str, Any]]:
-        """Topics and messages of the inputs that have come since the last call, in their order."""
+        """Topics and messages received since the last call; those of one topic are in their order."""
         ...
 
     def publish(self, topic: str, message: Any) -> None:
@@ -41,10 +41,13 @@ class RosBus:
     """Topics of ROS 2 through rclpy."""
 
     def __init__(self, inputs: Mapping[str, str] = INPUTS) -> None:
-        """Creates the node, which takes inputs: types by topics.
+        """Creates the node.
+
+        Args:
+          inputs: message types by topic.
 
         Raises:
-          CongraspError: there is no rclpy.
+          CongraspError: rclpy is not installed.
         """
         try:
             self._rclpy, qos = importlib.import_module("rclpy"), importlib.import_module("rclpy.qos")
@@ -56,7 +59,7 @@ class RosBus:
         self._node = self._rclpy.create_node("congrasp")
         self._received: list[tuple[str, Any]] = []
         for topic, kind in inputs.items():
-            # Takes reliable publishers, too. Static transforms are published once and kept for who comes later.
+            # Takes reliable publishers, too. Static transforms are published once and kept for later subscribers.
             lasting = {"durability": qos.DurabilityPolicy.TRANSIENT_LOCAL} if topic == "tf_static" else {}
             depth = 1 if kind in (POSE, CLOUD) else _MOST  # several nodes publish joints and frames
             profile = qos.QoSProfile(depth=depth, reliability=qos.ReliabilityPolicy.BEST_EFFORT, **lasting)
@@ -92,7 +95,7 @@ class RosBus:
         return getattr(importlib.import_module(f"{package}.{folder}"), name)
 
     def _keep(self, topic: str) -> Callable[[Any], None]:
-        """Takes a topic's messages."""
+        """Returns a callback that stores a topic's messages."""
 
         def keep(message: Any) -> None:
             self._received.append((topic, message))
@@ -104,10 +107,14 @@ class ZenohBus:
     """The same topics over Zenoh, as CDR, which rosbags writes and reads."""
 
     def __init__(self, endpoint: str, inputs: Mapping[str, str] = INPUTS):
-        """Connects to a router, a bridge or a robot, and takes inputs: types by topics.
+        """Connects to a router, a bridge or a robot.
+
+        Args:
+          endpoint: the Zenoh endpoint, such as `tcp/127.0.0.1:7447`.
+          inputs: message types by topic.
 
         Raises:
-          CongraspError: none answers there.
+          CongraspError: nothing answers at the endpoint.
         """
         import zenoh
         from rosbags.typesys import Stores, get_typestore
@@ -138,7 +145,7 @@ class ZenohBus:
         return self._store.types[kind](**{**fields, **arrays})
 
     def receive(self) -> list[tuple[str, Any]]:
-        """See `Bus.receive`; a message that is none of its topic's type is reported and left out."""
+        """See `Bus.receive`; a message that is not of its topic's type is reported and skipped."""
         received = []
         for topic, subscriber in self._subscribers.items():
             for _ in range(_MOST):

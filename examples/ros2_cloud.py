@@ -1,4 +1,4 @@
-"""Visible surface of the object in a camera's point clouds, for `ros2_node.py` and a policy with a camera."""
+"""Visible surface of the object in a camera's point clouds, for `ros2_node.py` with a camera policy."""
 
 import dataclasses
 from typing import Any
@@ -16,21 +16,30 @@ from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 
 FLOOR = 0.005
 """Height above the table from which a point belongs to the object, m."""
-_FEWEST = 16  # points that are an object
-_MOST = 50_000  # points of a message that are looked at
+_FEWEST = 16  # least number of points of an object
+_MOST = 50_000  # greatest number of points used of a message
 _CLEARANCE = 0.01  # m around the hand's capsules in which points belong to the hand
 _KINDS = {7: "f4", 8: "f8"}  # FLOAT32 and FLOAT64 of PointField
 _DENSITY = 300.0  # kg/m^3, of the box around the cloud
 
 
 class Eye:
-    """The object's visible surface in the newest cloud that shows any.
+    """The object's visible surface in the newest cloud that shows it.
 
-    Everything is in the frame that rises with the hand, which is the world frame until then.
+    Everything is in the frame that rises with the hand; until the lift that is the world frame.
     """
 
     def __init__(self, hand: Hand, count: int, box: str):
-        """Args: the hand; points that the policy takes; X Y Z DX DY DZ of the box in which the object is, m."""
+        """Reads the box.
+
+        Args:
+          hand: the hand, whose points are removed from the clouds.
+          count: number of points that the policy observes.
+          box: X Y Z DX DY DZ: middle and sides of the box in which the object is, m.
+
+        Raises:
+          CongraspError: the box is no six numbers, or a side is not positive.
+        """
         try:
             middle, sides = np.array(box.split(), float).reshape(2, 3)
         except ValueError:
@@ -44,12 +53,12 @@ class Eye:
         self._hand, self._count = hand, count
         self._last: Any = None
         self.points: np.ndarray | None = None
-        """(N, 3) m; None until an object was seen."""
+        """(count, 3) m; None until an object was seen."""
         self.seen = ""
-        """What the newest cloud has of the object."""
+        """Text that counts the newest cloud's points on the object."""
 
     def look(self, message: Any, camera: Pose, palm: Pose, q: np.ndarray) -> None:
-        """Takes a PointCloud2 in, unless it is the last one, or the hand hides the object in it.
+        """Updates the points from a new PointCloud2; they stay if it is the last one again, or hides the object.
 
         Args:
           message: the cloud.
@@ -69,7 +78,7 @@ class Eye:
             self.points = points[np.arange(self._count) * len(points) // self._count]
 
     def _on_hand(self, points: np.ndarray, palm: Pose, q: np.ndarray) -> np.ndarray:
-        """(N,) whether points (N, 3) belong to the hand."""
+        """(N,) true for points (N, 3) that belong to the hand."""
         local = palm.rotation.inv().apply(points - palm.position) if len(points) else points
         near = np.zeros(len(points), bool)
         for link, position, quaternion in zip(self._hand.links, *mujoco_link_poses(self._hand, q), strict=True):
@@ -84,7 +93,7 @@ class Eye:
 
 
 def read_points(message: Any) -> np.ndarray:
-    """(N, 3) finite points of a PointCloud2, every so manieth of a large one; none if it has no x, y, z."""
+    """(N, 3) finite points of a PointCloud2, evenly thinned if it is large; none if it has no x, y, z."""
     order, fields = ">" if message.is_bigendian else "<", {field.name: field for field in message.fields}
     try:
         formats = [order + _KINDS[fields[name].datatype] for name in "xyz"]
@@ -102,9 +111,9 @@ def read_points(message: Any) -> np.ndarray:
 
 
 def seen_object(points: np.ndarray) -> GraspObject:
-    """The stand-in for an object of which only points (N, 3) are known: constraints on it are in their frame.
+    """Stand-in for an object of which only points (N, 3) are known; constraints on it are in their frame.
 
-    Its mass, which `--gentle` needs, is that of the box around the points with 300 kg/m^3.
+    Its mass, which `--gentle` needs, is that of the box around the points at 300 kg/m^3.
     """
     low, high = points.min(0), points.max(0)
     x, y, z = np.maximum((high - low) / 2, 1e-3).tolist()
@@ -116,5 +125,5 @@ def seen_object(points: np.ndarray) -> GraspObject:
 
 
 def labelled(points: np.ndarray, first: np.ndarray, avoid: np.ndarray) -> np.ndarray:
-    """(N,) whether points (N, 3) must not be touched, as their nearest ones among the first (M, 3), (M,)."""
+    """(N,) avoid labels of points (N, 3): that of the nearest of the first points (M, 3), which have labels (M,)."""
     return avoid[cKDTree(first).query(points)[1]]

@@ -45,29 +45,29 @@ from congrasp.services.grasp.parse import read_request
 from congrasp.services.ops.logs import announced
 
 WAITING = 2.0
-"""Seconds after which the node says what it waits for."""
+"""Seconds after which the node prints what it is waiting for."""
 LIFT_SPEED = 0.1
-"""m/s, the mean."""
+"""Mean speed of the lift, m/s."""
 _POLL, _TOGETHER = 0.0005, 0.001
-"""Seconds between two looks at the topics, and in which measurements of one moment arrive."""
+"""Seconds between two polls of the topics, and within which measurements of one moment arrive."""
 _MET = 0.01  # m around the line of approach within which the surface is met
 SETTLING_STEPS = 100
 """Control steps after the rise until the targets freeze."""
 TRACKER_AGE = 0.5
-"""Seconds that a student's object or cloud may be old: it learnt with 10 Hz, 100 ms, and samples that are lost."""
+"""Greatest age of a student's object or cloud, s: it was trained with 10 Hz, 100 ms delay and lost samples."""
 
 
 @dataclasses.dataclass
 class Arguments:
-    """What is grasped, with what, and where the robot is."""
+    """Options of the node."""
 
     object: tyro.conf.Positional[str] = ""
     """A mesh, an object file, or FAMILY:SEED; none for a policy with a camera."""
     hand: str = "allegro"
     """Name of the hand."""
     constraint: Annotated[Constraints, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Constraints)
-    """What the grasp must keep to, for a policy with a camera in `--world`; the hand comes along the -z axis where
-    nothing guides it."""
+    """Constraints on the grasp, in `--world` for a policy with a camera; without a heading the hand approaches along
+    -z."""
     connect: str = "tcp/127.0.0.1:7457"
     """The policy server's endpoint."""
     wait: float = 120.0
@@ -77,7 +77,7 @@ class Arguments:
     zenoh: str = ""
     """Endpoint of a Zenoh router, bridge or robot; ROS 2 otherwise."""
     joint_map: tuple[str, ...] = ()
-    """HAND=ROBOT pairs: the robot's names of joints that it calls otherwise."""
+    """HAND=ROBOT pairs: the robot's names of joints that it names differently."""
     world: str = "world"
     """Name of the world frame."""
     cloud_topic: str = ""
@@ -87,12 +87,12 @@ class Arguments:
     mount: str = "0 0 0 0 0 0"
     """X Y Z ROLL PITCH YAW of the palm in the frame of `wrist_pose`: metres, degrees."""
     hand_eye: str = "0 0 0 0 0 0"
-    """X Y Z ROLL PITCH YAW by which the camera is off, in its own frame: metres, degrees."""
+    """X Y Z ROLL PITCH YAW of the true camera frame in the frame of its messages: metres, degrees."""
     approach: float = 0.0
     """Seconds of fresh answers, at full speed, until the object may leave the table; 0: twice as long as in training,
     since the hand is slower by what the robot is late."""
     lift: float = 0.0
-    """Metres by which the hand then rises; half a second later its targets freeze."""
+    """Metres by which the hand then rises; a second after the rise its targets freeze."""
     slow: float = 1.0
     """Share of the speed: of the policy's steps and of the limits; 0.25 to begin with."""
     dry_run: bool = False
@@ -102,9 +102,9 @@ class Arguments:
     hold: float = 0.5
     """Seconds without an answer after which the hand freezes or opens."""
     robot_age: float = 0.1
-    """Seconds after which joints and wrist count as not measured, from their arrival and by their stamps."""
+    """Seconds after which joints and wrist count as not measured, from their stamps; without a stamp, from arrival."""
     object_age: float = 0.0
-    """The same of object or cloud; 0: that of the robot, or 0.5 for a student (10 Hz, 100 ms, lost samples)."""
+    """The same for object or cloud; 0: as `--robot-age`, or 0.5 for a student (10 Hz, 100 ms, lost samples)."""
 
 
 Read = Callable[[GraspObject, np.ndarray], congrasp.GraspRequest]
@@ -115,14 +115,17 @@ class Target(Protocol):
     """The object, as the policy observes it."""
 
     def fields(self, down: Pose, palm: Pose | None, q: np.ndarray) -> dict[str, np.ndarray]:
-        """What a state says of the object; not finite where it is not measured.
+        """The state's fields of the object; not finite where it is not measured.
 
-        Args: the world in the frame that rises with the hand; the palm in the world; (F,) rad.
+        Args:
+          down: the world in the frame that rises with the hand.
+          palm: the palm in the world; None if it is not measured.
+          q: (F,) finger angles, rad.
         """
         ...
 
     def request(self, fields: dict[str, np.ndarray]) -> congrasp.GraspRequest:
-        """What is asked for of an object with these fields, without where the hand is."""
+        """The request for an object with these fields, without the hand's pose."""
         ...
 
 
@@ -130,7 +133,13 @@ class Tracked:
     """An object whose pose is measured."""
 
     def __init__(self, sensors: Sensors, request: congrasp.GraspRequest, origin: np.ndarray):
-        """Args: the request lacks where all is; (3,) the object frame's origin in its file, m."""
+        """Stores the request.
+
+        Args:
+          sensors: the measurements.
+          request: constraints and surface, without poses.
+          origin: (3,) coordinates of the file's origin in the object frame, m.
+        """
         self._sensors, self._request = sensors, request
         self._centre = Pose(-np.asarray(origin), Rotation.identity())
 
@@ -177,7 +186,7 @@ class Pictured:
 
 
 class PolicyNode:
-    """Commands of a guarded policy for what the topics say."""
+    """Commands of a guarded policy, from the measurements of the topics."""
 
     def __init__(self, bus: Bus, guard: congrasp.Guard, sensors: Sensors, target: Target, plan: "Plan"):
         self._bus, self._guard, self._sensors, self._target, self._plan = bus, guard, sensors, target, plan
@@ -259,13 +268,13 @@ class Plan:
     trained_steps: int
     """The same in the policy's training."""
     lift: float
-    """m by which the hand then rises."""
+    """Height by which the hand then rises, m."""
     step: float
-    """m of the way up in a control step, the mean."""
+    """Mean rise per control step, m."""
     dry_run: bool
 
     def rise(self, followed: int) -> np.ndarray:
-        """(3,) m by which the hand has risen after so many control steps: a smooth step."""
+        """(3,) rise of the hand after a number of control steps, m: a smooth step."""
         share = np.clip((followed - self.approach_steps) * self.step / self.lift, 0.0, 1.0) if self.lift else 0.0
         return np.array([0.0, 0.0, self.lift * share**2 * (3.0 - 2.0 * share)])
 
@@ -281,7 +290,7 @@ class Plan:
 
 
 def slowed(limits: congrasp.JointLimits, share: float) -> congrasp.JointLimits:
-    """Limits of a hand that does everything at a share of the speed."""
+    """Limits of a hand that moves at a share of the speed."""
     return dataclasses.replace(limits, speed=limits.speed * share, acceleration=limits.acceleration * share**2)
 
 
@@ -321,7 +330,7 @@ def target_of(arguments: Arguments, sensors: Sensors, hand: Hand, described: dic
 
 
 def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described: dict[str, Any]) -> None:
-    """Commands by a policy and its metadata until it is interrupted, and prints what changes."""
+    """Commands the robot by a policy with this metadata until interrupted, and prints changes of the mode."""
     slow = arguments.slow
     if described["limits"] is None:
         raise congrasp.CongraspError(f"Joints of the hand '{arguments.hand}' share motors.", "This node is for others.")
@@ -351,7 +360,7 @@ def run(arguments: Arguments, bus: Bus, client: congrasp.PolicyClient, described
 
 
 def report(command: congrasp.Command | None, guard: congrasp.Guard, sensors: Sensors) -> str:
-    """What the node does, in a line."""
+    """One line of text on the node's state."""
     missing = sensors.missing()
     if command is None:
         return f"Waiting for {missing}."

@@ -1,4 +1,4 @@
-"""What the inputs of `ros2_node.py` say: joints, and poses in the world frame."""
+"""Joints, and poses in the world frame, from the inputs of `ros2_node.py`."""
 
 import dataclasses
 import time
@@ -22,7 +22,7 @@ class Pose:
     rotation: Rotation
 
     def __matmul__(self, other: "Pose") -> "Pose":
-        """A pose in this frame, in the other one."""
+        """Composes a pose in this frame with this one: the same pose in the frame that this one is in."""
         return Pose(self.position + self.rotation.apply(other.position), self.rotation * other.rotation)
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
@@ -35,10 +35,19 @@ class Pose:
 
 
 class Sensors:
-    """What the topics say, in the world frame; None or NaN for what is not there, or too old."""
+    """Newest measurements of the topics, in the world frame; None or NaN for missing and outdated ones."""
 
     def __init__(self, arguments: "Arguments", joints: list[str], object_age: float):
-        """Args: names and offsets; the hand's joints; s."""
+        """Reads the names and offsets.
+
+        Args:
+          arguments: options of the node.
+          joints: names of the hand's joints.
+          object_age: seconds after which the object or the cloud counts as not measured.
+
+        Raises:
+          CongraspError: an offset or a pair of joints cannot be read.
+        """
         renamed = joints_of(arguments.joint_map, joints)
         self.names = [renamed.get(joint, joint) for joint in joints]
         """The robot's names of the joints, in the hand's order."""
@@ -46,7 +55,7 @@ class Sensors:
         self.eyes = arguments.cloud_topic or "object_pose"
         """The topic that shows the object."""
         self.unseen = ""
-        """Why no object was found in what it shows."""
+        """Reason that no object was found in that topic's messages; empty if one was."""
         self._world, self._ages = arguments.world, dict.fromkeys(INPUTS, arguments.robot_age)
         self._ages[self.eyes] = object_age
         self._joints: dict[str, tuple[float, float, float]] = {}
@@ -54,7 +63,7 @@ class Sensors:
         self._frames: dict[str, tuple[str, Pose, float]] = {}
 
     def take(self, received: list[tuple[str, Any]]) -> None:
-        """Takes messages in."""
+        """Stores received messages."""
         for topic, message in received:
             if topic == "joint_states":
                 velocity = (
@@ -84,12 +93,12 @@ class Sensors:
         return frame @ pose @ self.mount if frame and pose else None
 
     def sight(self) -> tuple[Any, Pose | None]:
-        """What shows the object, and the camera's frame in the world; no frame where there is none, or too old."""
+        """The newest message that shows the object, and the camera's frame in the world; no frame if too old."""
         message, frame = self._framed(self.eyes)
         return message, frame and frame @ self._hand_eye
 
     def missing(self) -> str:
-        """What is not there, in words; empty when all is."""
+        """Text that lists the missing measurements; empty if there are none."""
         lacking = []
         if absent := [name for name, q in zip(self.names, self.joints()[0], strict=True) if not np.isfinite(q)]:
             others = ", ".join(sorted(set(self._joints) - set(absent))) or "none"
@@ -107,7 +116,7 @@ class Sensors:
         return "; ".join(lacking)
 
     def _framed(self, topic: str) -> tuple[Any, Pose | None]:
-        """A topic's newest message, and the frame that it is in in the world; none if it is too old."""
+        """A topic's newest message, and the pose of its frame in the world; no pose if it is too old."""
         message, when = self._newest.get(topic, (None, -np.inf))
         fresh = time.monotonic() - when <= self._ages[topic]
         return message, self._frame(message.header.frame_id) if fresh else None
@@ -126,13 +135,13 @@ class Sensors:
 
 
 def stamped(header: Any) -> float:
-    """When a message was stamped, by `time.monotonic`; now without a stamp, or with one that is yet to come."""
+    """Time of a message's stamp on the clock of `time.monotonic`; now if it has no stamp, or one in the future."""
     stamp = header.stamp.sec + 1e-9 * header.stamp.nanosec
     return time.monotonic() - (max(time.time() - stamp, 0.0) if stamp else 0.0)
 
 
 def read_pose(place: Any, turn: Any) -> Pose | None:
-    """The pose of a message's vector and quaternion; None if it is none."""
+    """The pose of a message's vector and quaternion; None if it is not finite, or the quaternion is far from unit."""
     position, quaternion = np.array([place.x, place.y, place.z]), np.array([turn.x, turn.y, turn.z, turn.w])
     if not (np.isfinite(position).all() and 0.5 < np.linalg.norm(quaternion) < 2.0):
         return None
@@ -140,7 +149,11 @@ def read_pose(place: Any, turn: Any) -> Pose | None:
 
 
 def offset_of(text: str) -> Pose:
-    """The pose of X Y Z ROLL PITCH YAW, metres and degrees."""
+    """The pose of X Y Z ROLL PITCH YAW, metres and degrees.
+
+    Raises:
+      CongraspError: the text is no such six numbers.
+    """
     try:
         x, y, z, *angles = map(float, text.split())
         return Pose(np.array([x, y, z]), Rotation.from_euler("xyz", angles, degrees=True))
@@ -149,7 +162,11 @@ def offset_of(text: str) -> Pose:
 
 
 def joints_of(pairs: tuple[str, ...], joints: list[str]) -> dict[str, str]:
-    """The robot's names of the hand's joints, from HAND=ROBOT."""
+    """The robot's names of the hand's joints, from HAND=ROBOT pairs.
+
+    Raises:
+      CongraspError: a pair names none of the hand's joints, or no joint of the robot.
+    """
     renamed = {hand: robot for hand, _, robot in (pair.partition("=") for pair in pairs)}
     for hand, robot in renamed.items():
         if hand not in joints or not robot:

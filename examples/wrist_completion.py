@@ -25,16 +25,16 @@ from congrasp.services.viz.sheets import save_png
 
 @dataclasses.dataclass
 class Arguments:
-    """What is completed."""
+    """Options of the example."""
 
     motion: tyro.conf.Positional[pathlib.Path]
     """The motion: CSV, NPZ or BVH."""
     mesh: str = "mug:7"
     """The object: a mesh, an object file, or FAMILY:SEED."""
     object_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where the origin of its file lies in the motion's world, m, z up."""
+    """Position of the file's origin in the motion's world, m, z up."""
     object_turn: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """How it is turned there, quaternion w x y z."""
+    """Orientation of the file's frame in the motion's world, quaternion w x y z."""
     joint: str = "RightHand"
     """Joint of a BVH skeleton that is the wrist."""
     fingers: str = "-y"
@@ -42,15 +42,15 @@ class Arguments:
     back: str = "+z"
     """Axis of that joint towards the back of the hand."""
     hand: str = "human"
-    """Hand whose pretrained policy is taken; any but the human one follows the wrist by its own grasp axes."""
+    """Hand whose pretrained policy is used; any but the human one follows the wrist by its own grasp axes."""
     policy: pathlib.Path | None = None
-    """A policy file instead."""
+    """A policy file to use instead of the pretrained policy."""
     out: pathlib.Path = pathlib.Path("completed")
     """Folder for the results."""
 
 
 def main(arguments: Arguments) -> None:
-    """Cuts the path, grasps, and writes motion and picture."""
+    """Cuts the path, grasps, and writes the motion and its picture."""
     obj = find_object(arguments.mesh)
     path = read_wrist_path(arguments.motion, joint=arguments.joint, fingers=arguments.fingers, back=arguments.back)
     position, rotation = followed(get_hand(arguments.hand), path.position, path.rotation)

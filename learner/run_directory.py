@@ -126,7 +126,7 @@ def listening(run_dir: pathlib.Path, url: str) -> Iterator[None]:
 
 
 def learner_url(run_dir: pathlib.Path) -> str:
-    """Address of the learner of a run directory; empty if none is running."""
+    """Address stored by `listening`; empty if there is none. It may be that of a killed learner."""
     try:
         return read_file(run_dir / _ENDPOINT_FILE, _MAX_ENDPOINT).decode(errors="replace")
     except CongraspError:

@@ -17,6 +17,7 @@ if os.environ["JAX_PLATFORMS"] == "cpu":
 
 import pathlib
 
+import psutil
 import pytest
 from hypothesis import settings
 
@@ -26,13 +27,14 @@ settings.register_profile("search", derandomize=False, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
+_MOST_MEMORY = 4 << 30  # bytes of a worker
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _programs_end_with_their_module():
-    """Compiled programs that no other module uses would fill the memory."""
+def _bounded_memory():
+    """Compiled programs stay for the modules that follow, until they fill the memory."""
     yield
-    if "jax" in sys.modules:
+    if "jax" in sys.modules and psutil.Process().memory_info().rss > _MOST_MEMORY:
         sys.modules["jax"].clear_caches()
 
 

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
+from congrasp.actors.rollout import Rollout, finished_episodes
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject

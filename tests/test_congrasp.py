@@ -62,7 +62,7 @@ def test_client_guard_and_errors_need_numpy_and_zenoh_alone():
     assert lines[0].startswith("congrasp.load_policy needs the package '")
     assert lines[0].endswith("'. Run: pip install 'congrasp[train]'")
     assert lines[1:] == [
-        "The request lacks 'surface' and 'q' and 'wrist' and 'object_pose'. A control loop begins from where all is.",
+        "The request lacks 'surface' and 'q' and 'wrist' and 'object_pose'. A control loop starts from measured poses.",
         "follow (16,) True",
     ]
 

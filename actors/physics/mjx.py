@@ -130,14 +130,14 @@ class MjxPhysics:
         )
         sensors = jnp.where(diverged, 0.0, self._contacts(data))
         state = state._replace(data=data)
-        return state, physics_state(jnp, where, data.qpos, data.qvel, sensors, diverged[:, 0], jnp.zeros(2))
+        return state, physics_state(jnp, where, data.qpos, data.qvel, sensors, diverged[:, 0], jnp.zeros(3))
 
     def read(self, state: MjxState) -> PhysicsState:
         """Returns the current state of the environments, without contacts; see `Physics.read`."""
         data = state.data
         batch = data.qpos.shape[0]
         none = jnp.zeros((batch, len(self._links) * CONTACTS_PER_LINK * SENSOR_WIDTH))
-        return physics_state(jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
+        return physics_state(jnp, self._where, data.qpos, data.qvel, none, jnp.zeros(batch, bool), jnp.zeros(3))
 
     def close(self) -> None:
         """Does nothing: there is nothing to release."""

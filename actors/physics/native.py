@@ -74,7 +74,7 @@ class NativePhysics:
         self.threads = max(1, threads)
         self._pool = concurrent.futures.ThreadPoolExecutor(self.threads, thread_name_prefix="physics")
         self._compiled: dict[int, Scene] = {}
-        self.scenes: list[Scene] = []  # state of each environment
+        self.scenes: list[Scene] = []  # scene of each environment
         self.instances: list[EnvInstance] = []
         self._where = addresses(self._scene(0).model, hand)
         self._physics_state = jax.jit(functools.partial(physics_state, jnp, self._where))
@@ -99,6 +99,7 @@ class NativePhysics:
         self._qpos = np.zeros((batch, model.nq), np.float32)
         self._qvel = np.zeros((batch, model.nv), np.float32)
         self._sensors = np.zeros((batch, model.nsensordata), np.float32)
+        self._limited = np.zeros(batch, bool)  # the solver reached its limit of iterations
         self._table = np.ones(batch, bool)
         return self.reset(self, np.ones(batch, bool), reset_state)
 
@@ -204,11 +205,11 @@ class NativePhysics:
                 instance = self.instances[i]
                 instance.ctrl[:] = target[i]
                 mujoco.mj_step(instance.model, instance.data, substeps)
+                self._limited[i] = instance.data.solver_niter.max() >= instance.model.opt.iterations
                 self._copy_out(i)
 
     def _current_state(self, diverged: np.ndarray) -> PhysicsState:
         """Returns the physics state from the batch's arrays; `diverged` (B,) is passed through."""
         # Copies: the next step writes into the buffers while JAX may still read.
-        return self._physics_state(
-            self._qpos.copy(), self._qvel.copy(), self._sensors.copy(), diverged, np.zeros(2, np.float32)
-        )
+        occupancy = np.array([0.0, 0.0, self._limited.mean()], np.float32)
+        return self._physics_state(self._qpos.copy(), self._qvel.copy(), self._sensors.copy(), diverged, occupancy)

@@ -43,7 +43,7 @@ def physics_state(
       qvel: generalised velocities; the free joint's angular part is converted from the object frame to the world frame.
       sensordata: contact sensors of all links, strongest contacts first.
       diverged: (B,) bool, returned unchanged.
-      occupancy: (2,), returned unchanged.
+      occupancy: (3,), returned unchanged.
     """
     batch = qpos.shape[0]
     contacts = sensordata.reshape(batch, -1, CONTACTS_PER_LINK, SENSOR_WIDTH)

@@ -58,13 +58,13 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     spec.option.timestep = task.control_dt / task.substeps
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Held objects creep out of every grasp within seconds with pyramidal friction cones. With elliptic ones they do
-    # so unless friction is harder than normal forces and the solver converges: 6 iterations, or 12 of its line search,
-    # are too few.
+    # too unless friction is much harder than normal forces and the solver converges: with impratio 100 eight iterations
+    # are too few (docs/notes/training.md).
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0
+    spec.option.impratio = 100.0
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    spec.option.iterations = 8
-    spec.option.ls_iterations = 20
+    spec.option.iterations = 24
+    spec.option.ls_iterations = 40
     # A hundredth of a millimetre: in single precision the default of a micrometre is hardly ever reached.
     spec.option.ccd_tolerance = 1e-5
     spec.option.ccd_iterations = 16

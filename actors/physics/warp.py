@@ -61,7 +61,8 @@ class WarpPhysics:
           hand: the hand.
           task: timing and collision settings.
           objects: the pool indexed by `ResetState.object_index`.
-          mesh_slots: most mesh pieces of an object, 0 for primitives only; by default those of this pool, or 8.
+          mesh_slots: most mesh pieces of an object, 0 for primitives only; by default as many as in this pool, at
+            least 8.
 
         Raises:
           CongraspError: an object has more pieces than slots.
@@ -72,10 +73,9 @@ class WarpPhysics:
             mesh_slots = max(most, _LEAST_SLOTS)
         self._catalogue = Catalogue(hand, task, objects[0], mesh_slots)
         model = self._catalogue.model
-        # Measured: more iterations of either kind hold no more grasps. Dense Jacobians double the solver's time with
-        # elliptic cones.
+        # Dense Jacobians double the solver's time with elliptic cones.
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-        model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 4, 10, 1e-5
+        model.opt.tolerance = 1e-5  # single precision does not reach the default
         self._where = addresses(model, hand)
         self._sensors = len(hand.links) * CONTACTS_PER_LINK * SENSOR_WIDTH
         device = jax.local_devices()[0]
@@ -121,7 +121,7 @@ class WarpPhysics:
             reset_state.object_position,
             reset_state.object_quaternion,
             reset_state.stationary,
-            output_dims={"sensordata": (batch, self._sensors), "occupancy": (2,)},
+            output_dims={"sensordata": (batch, self._sensors), "occupancy": (3,)},
         )
         diverged = has_diverged(jnp, qpos, qvel)
         moved = WarpState(qpos, qvel, warmstart, reset_state)
@@ -154,7 +154,7 @@ class WarpPhysics:
         """Returns the current state of the environments, without contacts; see `Physics.read`."""
         batch = state.qpos.shape[0]
         none = jnp.zeros((batch, self._sensors))
-        return physics_state(jnp, self._where, state.qpos, state.qvel, none, jnp.zeros(batch, bool), jnp.zeros(2))
+        return physics_state(jnp, self._where, state.qpos, state.qvel, none, jnp.zeros(batch, bool), jnp.zeros(3))
 
     def repeat(self, batch: int, steps: int) -> None:
         """Repeats control steps of a batch from its last state and targets; no state observes them.

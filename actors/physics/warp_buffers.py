@@ -50,15 +50,16 @@ class WarpBuffers:
         """
         self._substeps, self._device = substeps, device
         self._graph: wp.Graph | None = None
-        self.limits = np.array([CONTACTS_PER_ENVIRONMENT * batch, CONSTRAINTS_PER_ENVIRONMENT], np.float32)
-        """(2,) capacities of contacts and constraint rows."""
+        capacities = [CONTACTS_PER_ENVIRONMENT * batch, CONSTRAINTS_PER_ENVIRONMENT, substeps * batch]
+        self.limits = np.array(capacities, np.float32)
+        """(3,) capacities of contacts and constraint rows, and physics steps of all environments in a control step."""
         with wp.ScopedDevice(device):
             # A single row would mark the field as shared, and meshes could then never be absent.
             self._model = mujoco_warp.put_model(model, dict.fromkeys(MODEL_LEAVES, max(batch, 2)))
             self._data = mujoco_warp.make_data(
                 model, batch, naconmax=CONTACTS_PER_ENVIRONMENT * batch, njmax=CONSTRAINTS_PER_ENVIRONMENT
             )
-            self._occupancy = wp.zeros(2, dtype=int)
+            self._occupancy = wp.zeros(3, dtype=int)
             self._leaves = leaves = Leaves()
             for name in MODEL_LEAVES:
                 setattr(leaves, name, getattr(self._model, name))
@@ -134,7 +135,7 @@ class WarpBuffers:
         for left in reversed(range(self._substeps)):
             model.opt.disableflags = self._blind if left else self._sensing
             mujoco_warp.step(model, data)
-            counts = [data.ncollision, data.nacon, data.nefc, self._occupancy]
+            counts = [data.ncollision, data.nacon, data.nefc, data.solver_niter, model.opt.iterations, self._occupancy]
             wp.launch(count, data.nworld, counts, device=self._device)
 
 

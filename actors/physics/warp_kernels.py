@@ -130,12 +130,25 @@ def place(
     if env == 0:
         occupancy[0] = 0
         occupancy[1] = 0
+        occupancy[2] = 0
 
 
 @wp.kernel
-def count(ncollision: wp.array[int], nacon: wp.array[int], nefc: wp.array[int], occupancy: wp.array[int]) -> None:
-    """Records the most contacts of all environments and the most constraint rows of any, including dropped ones."""
+def count(
+    ncollision: wp.array[int],
+    nacon: wp.array[int],
+    nefc: wp.array[int],
+    solver_niter: wp.array[int],
+    iterations: int,
+    occupancy: wp.array[int],
+) -> None:
+    """Records the most contacts of all environments and the most constraint rows of any, including dropped ones.
+
+    Also counts environments whose solver reached its limit of iterations.
+    """
     env = wp.tid()
     wp.atomic_max(occupancy, 1, nefc[env])
+    if solver_niter[env] >= iterations:
+        wp.atomic_add(occupancy, 2, 1)
     if env == 0:
         wp.atomic_max(occupancy, 0, wp.max(ncollision[0], nacon[0]))

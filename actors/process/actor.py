@@ -1,6 +1,5 @@
 """The actor process: pulls weights, steps environments, uploads rollouts, until the run ends."""
 
-import functools
 import pathlib
 import threading
 import time
@@ -18,13 +17,14 @@ from congrasp.actors.physics import make_physics
 from congrasp.actors.process.failure_weights import FailureWeights
 from congrasp.actors.process.link import ActorLink, RunFinished, RunInfo, RunRestarted, Ticket
 from congrasp.actors.process.own_references import save_references, with_kept_references
-from congrasp.actors.rollout import Rollout, RolloutWorker, finished_episodes
+from congrasp.actors.rollout import Rollout, finished_episodes
 from congrasp.actors.training_set import training_set
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import RunConfig, run_config_from_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.io.journal import Journal
-from congrasp.common.policy.bundle import PolicyBundle, policy_spec, sample_action
+from congrasp.common.policy.bundle import PolicyBundle, acting, policy_spec
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.stages import stage
 from congrasp.common.task.sampling.bank import ConstraintBank
@@ -55,9 +55,9 @@ def run_actor(
     """Acts for the learner of `run` until it ends or `stop` is set.
 
     Args:
-      transport: connected to the learner.
+      transport: transport connected to the learner.
       run: name of the run.
-      actor: this actor's name, unique in the run; it also decides on its objects and random numbers.
+      actor: this actor's name, unique in the run; it also determines the actor's objects and random numbers.
       stop: ends the actor between two rollouts.
       physics: engine; that of the run by default.
       threads: threads of the `native` engine.
@@ -130,7 +130,7 @@ class _Actor:
                 config.task,
                 self._physics,
                 bank,
-                functools.partial(sample_action, self._spec.layout),
+                acting(self._spec.layout, mean=False),
                 batch=config.environments,
                 # Another incarnation must not repeat the episodes of the one it replaces.
                 seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
@@ -310,12 +310,14 @@ class _Since(NamedTuple):
 
 
 def buffer_occupancy(occupancy: np.ndarray) -> dict[str, float]:
-    """Metrics of `Rollout.occupancy`: steps in which the engine exceeded its contacts or rows, and the fullest."""
-    contacts, rows = occupancy.max(0)
+    """Metrics of `Rollout.occupancy`: steps that exceeded contacts or rows, the fullest, and unconverged solutions."""
+    buffers, limited = occupancy[:, :2], occupancy[:, 2]
+    contacts, rows = buffers.max(0)
     return {
-        "overflow": float((occupancy > 1.0).any(-1).sum()),
+        "overflow": float((buffers > 1.0).any(-1).sum()),
         "contacts_peak": float(contacts),
         "rows_peak": float(rows),
+        "solver_limited": float(limited.mean()),
     }
 
 

@@ -52,7 +52,7 @@ class Ticket(NamedTuple):
 
 
 class ActorLink:
-    """An actor's connection to its learner; one thread uses it."""
+    """An actor's connection to its learner, for use by one thread."""
 
     def __init__(
         self,
@@ -72,11 +72,11 @@ class ActorLink:
           transport: a connected transport.
           run: name of the run.
           actor: the actor's name, unique in the run.
-          window: rollouts on their way at a time.
-          max_refusals: rollouts refused in a row after which the link fails.
-          request_timeout: seconds that one request may take; a rollout gets more, by its size.
-          patience: seconds without any answer after which the link gives the learner up.
-          journal: where every rollout and each answer to it is written down; it stays the caller's.
+          window: most rollouts in transit.
+          max_refusals: consecutive refused rollouts after which the link fails.
+          request_timeout: deadline of a request in seconds, extended by the size of a rollout.
+          patience: seconds without a reply after which the link fails.
+          journal: records every rollout and its outcome; the caller closes it.
         """
         self.keys = Keys(run)
         self.actor = actor
@@ -84,7 +84,7 @@ class ActorLink:
         self.incarnation = secrets.token_hex(4)
         self._transport = transport
         self._timeout = request_timeout
-        self._patience = Patience(patience)  # which the thread that follows announcements reads often
+        self._patience = Patience(patience)  # read often by the thread that receives announcements
         self._info: RunInfo | None = None
         self._learner = (-1, "")  # version and session last reported by the learner
         self._held_session = ""
@@ -129,7 +129,7 @@ class ActorLink:
         An unreachable learner grants nothing.
 
         Raises:
-          RunRestarted, RunFinished: see there.
+          RunRestarted, RunFinished: see these classes.
           CongraspError: the learner refused too many rollouts, or has been silent for too long.
         """
         deadline = self._patience.now() + timeout
@@ -168,7 +168,8 @@ class ActorLink:
           newer_than: the version that the caller has; -1 for none.
 
         Raises:
-          RunRestarted: see there.
+          RunRestarted, RunFinished: see these classes.
+          CongraspError: see `acquire_ticket`.
         """
         self._check()
         if newer_than >= 0 and (newer_than, self._held_session) == self._learner:
@@ -197,10 +198,10 @@ class ActorLink:
           ticket: ticket of the rollout.
 
         Returns:
-          Its outcome, once the learner has answered.
+          Future of its outcome.
 
         Raises:
-          RunRestarted: see there; this rollout is not sent.
+          RunRestarted, RunFinished: see these classes; this rollout is not sent.
           CongraspError: the learner refused too many rollouts, or has been silent for too long.
         """
         self._check()
@@ -249,7 +250,7 @@ class ActorLink:
             raise CongraspError("The link is closed.")
 
     def _note(self, meta: Any) -> None:
-        """Takes in the learner's state, which comes with every answer and announcement."""
+        """Records the learner's state, which comes with every reply and announcement."""
         self._answered = self._patience.now()
         self._learner = int(meta["version"]), str(meta["session_id"])
         self._finished = bool(meta["finished"])

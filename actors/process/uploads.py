@@ -18,30 +18,31 @@ from congrasp.common.wire.codec import Message
 Outcome = Literal["accepted", "duplicate", "stale", "refused"]
 """Outcome of a rollout: `duplicate` if it had been accepted before, `stale` if it was too old."""
 _BACKOFF = (0.1, 0.5)  # first and longest delay between two attempts, s
-_SLOWEST = 100e3  # bytes a second of a link that is waited for
+_SLOWEST = 100e3  # slowest link that is waited for, bytes/s
 _LONGEST_TICK = 1.0  # s
-_NOTICED, _NOTICE_AGAIN = 5.0, 60.0  # seconds of silence of which a line is logged, and between two lines
+_NOTICED, _NOTICE_AGAIN = 5.0, 60.0  # silence after which a line is logged, and time between two lines, s
 _log = logging.getLogger(__name__)
 
 
 class Patience:
-    """Limit of the learner's silence, in seconds for which this process ran.
+    """Limit of the learner's silence, in seconds during which this process ran.
 
-    Of a time in which it was frozen or starved, one second counts. It must be read more often than that to be right.
+    An interval in which the process was frozen or starved counts as one second. `now` must therefore be called at least
+    once a second.
 
     Attributes:
-      limit: seconds.
+      limit: longest silence, s.
     """
 
     def __init__(self, limit: float):
-        """Begins to count."""
+        """Starts to count."""
         self.limit = limit
         self._lock = threading.Lock()
         self._seconds, self._read = 0.0, time.monotonic()
         self._noticed = -math.inf
 
     def now(self) -> float:
-        """The seconds until now."""
+        """Returns the seconds so far."""
         with self._lock:
             now = time.monotonic()
             self._seconds += min(now - self._read, _LONGEST_TICK)
@@ -49,11 +50,14 @@ class Patience:
             return self._seconds
 
     def check(self, answered: float, error: TransportError) -> None:
-        """Logs that there is no answer, once a minute, and raises `TransportError` when that has been so for too long.
+        """Logs a silence of the learner, at most once a minute.
 
         Args:
-          answered: when there was one last.
-          error: what came instead of an answer.
+          answered: time of its last reply, by `now`.
+          error: error of the latest query.
+
+        Raises:
+          TransportError: the silence exceeds the limit.
         """
         now = self.now()
         silence = now - answered
@@ -79,7 +83,7 @@ class Uploads:
     Attributes:
       failure: the reason why sending has stopped, if it has; also set by the owner.
       free: acquired by the owner for each queued rollout; released when that rollout has its outcome.
-      closed: set once no more is sent.
+      closed: set once sending has been stopped.
     """
 
     def __init__(
@@ -98,13 +102,13 @@ class Uploads:
 
         Args:
           transport: a connected transport.
-          key: what rollouts are sent to.
-          on_reply: given the state of the learner that comes with every answer.
-          window: rollouts on their way at a time.
-          max_refusals: rollouts refused in a row after which nothing more is sent.
-          request_timeout: seconds that sending may take, and more by the rollout's size.
-          patience: after which the learner is given up.
-          journal: where each answer is written down.
+          key: key to which rollouts are sent.
+          on_reply: called with the state of the learner, which comes with every reply.
+          window: most rollouts in transit.
+          max_refusals: consecutive refused rollouts after which sending stops.
+          request_timeout: deadline of a query in seconds, extended by the rollout's size.
+          patience: limit of the learner's silence.
+          journal: records the outcome of each rollout.
         """
         self.failure: CongraspError | None = None
         self.free = threading.Semaphore(window)
@@ -165,7 +169,7 @@ class Uploads:
         """Sends one rollout until it has an outcome."""
         answered = self._patience.now()
         damaged = 0
-        # To send again what is still on its way would only fill a slow link; a dead one ends the query by itself.
+        # Repeating a query in transit would only fill a slow link; a dead link ends the query by itself.
         timeout = min(self._timeout + sum(a.nbytes for a in message.arrays.values()) / _SLOWEST, self._patience.limit)
         delays = backoff()
         while not self.closed.is_set():

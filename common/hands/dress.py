@@ -8,16 +8,16 @@ from congrasp.common.hands.skeleton import Skeleton
 
 _AROUND = 28  # points of a ring
 _NAIL = ((0.2, 0.0004), (0.55, 0.0004), (0.9, 0.0003), (1.0, 0.0), (0.9, -0.0012), (0.2, -0.0012))
-"""Rings of a nail: their size as a share of its outline, and their height above the skin, m."""
+"""Rings of a nail: size as a share of the nail's outline, and height above the skin, m."""
 _NAIL_WIDTH, _NAIL_LENGTH, _NAIL_BACK = 0.90, 0.85, 0.30
-"""Of a nail: half of its width, rad about the finger; half of its length and how far it lies behind the centre of the
-fingertip, in radii of the tip."""
+"""Half width of a nail, rad about the finger; its half length, and its distance behind the centre of the fingertip, in
+radii of the tip."""
 _SQUARE = 0.65  # exponent of the nail's outline; 1 is an ellipse
 _SLEEVE = (
     *((0.026, -0.004), (0.0245, 0.0008), (0.0245, 0.0030), (0.0265, 0.0042), (0.034, 0.0044)),
     *((0.036, 0.0034), (0.060, 0.0042), (0.082, 0.0056), (0.086, 0.0040)),
 )
-"""Rings of the sleeve: how far behind the wrist's beginning they are, and how much wider than the wrist, m."""
+"""Rings of the sleeve: distance behind the start of the wrist, and radius in excess of the wrist's, m."""
 
 
 def nails(skeleton: Skeleton) -> list[Surface]:

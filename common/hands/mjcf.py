@@ -28,8 +28,8 @@ def add_hand(
     """Adds the hand under a fixed body `hand_base` and returns that body.
 
     The base carries three slides (x, y, z) and three hinges (intrinsic x-y-z) of the first link; their origin is the
-    initial wrist pose, so that all six start at zero. Actuators are in the order of (u, q). Gravity on the hand is
-    compensated, because the wrist is a virtual mount.
+    initial wrist pose, so that all six start at zero. The actuators are those of the wrist's joints, then the motors.
+    Gravity on the hand is compensated, because the wrist is a virtual mount.
 
     With `self_collision`, links collide without friction, except neighbours and `overlapping` pairs. All contacts of
     the hand have the time constant `contact_time` in seconds. Contacts of fingertips have the torsional friction

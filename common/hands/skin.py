@@ -23,9 +23,9 @@ HUMAN_HANDS = ("human", "mano")
 MATERIALS = ("flesh", "nail", "sleeve", "link", "joint")
 """Materials of a surface."""
 _LARGEST = 0.5  # m
-_SECTIONS = 20  # bevel of a housing
-_BEVEL = 0.45  # length of a housing's ends, in radii
-_DRUM_RADIUS, _DRUM_LENGTH = 0.72, 1.04  # radius of a joint's drum, in radii of its link
+_SECTIONS = 20  # sides of a housing
+_BEVEL = 0.45  # bevel of a housing's ends, in radii
+_DRUM_RADIUS, _DRUM_LENGTH = 0.72, 1.04  # radius and half length of a joint's drum, in radii of its link
 
 
 class Skin(NamedTuple):

@@ -1,8 +1,8 @@
 """Append-only journals of JSON lines, for comparing afterwards what several processes did.
 
-Every line is one write to the operating system, so that it survives the death of its process. It ends with the CRC-32
-of the line before, as the field `after`, and that of what comes before in its own, as the field `crc32`. A line that
-was cut or changed is left out when reading, and counted, and so are places where whole lines are missing.
+Every line is one write to the operating system, so that it survives the death of its process. It ends with two
+checksums (CRC-32): that of the previous line, as the field `after`, and that of its own preceding text, as the field
+`crc32`. Lines that were cut or changed are skipped when reading, and counted, as are places where lines are missing.
 """
 
 import json
@@ -19,7 +19,7 @@ from congrasp.common.io.inputs import open_file
 AUDIT = "audit"
 """Folder of the journals in a run directory."""
 MAX_NUMBER = 1 << 53
-"""Integers from here on, which JSON readers do not keep exactly, are in no journal."""
+"""Exclusive bound of the integers in a journal, since JSON readers do not represent larger ones exactly."""
 _CHECK = ', "crc32": "{}"}}\n'
 _CHECK_BYTES = len(_CHECK.format("00000000"))
 _END = re.compile(_CHECK.format("([0-9a-f]{8})").encode())
@@ -80,11 +80,11 @@ class JournalLines(NamedTuple):
     lost: int
     """Lines that are missing because the disk was full, or that were cut at the end."""
     damaged: int
-    """Lines that are not what was written."""
+    """Lines that were changed after they were written."""
     missing: int
-    """Places where lines are missing that were there."""
+    """Places where written lines are missing."""
     unchecked: int
-    """Lines of older versions of congrasp, which do not bear the checksum of the line before."""
+    """Lines of older versions of congrasp, which lack the checksum of the previous line."""
 
     @property
     def intact(self) -> list[dict[str, Any]]:
@@ -175,7 +175,7 @@ def _line(entry: dict[str, Any]) -> tuple[bytes, str]:
 
 
 def _parse(line: bytes) -> tuple[dict[str, Any] | None, str]:
-    """A line's entry, None if it is none or its checksum is another; and its checksum."""
+    """Entry of a line, None if it is invalid or its checksum differs, and the checksum of the line's text."""
     check = f"{zlib.crc32(line[:-_CHECK_BYTES]):08x}"
     try:
         entry = json.loads(line)

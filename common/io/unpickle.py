@@ -68,7 +68,7 @@ def _dtype(kind: Any) -> np.dtype[Any]:
 
 
 def _encode(text: str, _: str) -> bytes:
-    """Bytes that Python 3 wrote as Latin-1 text, for protocols that know no bytes."""
+    """Bytes that Python 3 wrote as Latin-1 text, for protocols without bytes."""
     return text.encode("latin-1")
 
 

@@ -29,8 +29,8 @@ GROUPS = {
 MASS_RANGE = (0.02, 0.6)
 """Kilograms."""
 _SETTLED = {True: (0.05, 0.5), False: (0.02, 0.5)}
-"""Masses in kilograms at which objects settle into their resting poses: of basic families, and of the others. They are
-fixed so that a change of mass does not move resting poses by rounding errors."""
+"""Ranges in kilograms to which the mass is clipped while an object settles into its resting poses: of basic families,
+and of the others. They are fixed so that a change of `MASS_RANGE` does not move resting poses by rounding errors."""
 _SIZE_RANGE, _HOUSEHOLD_SIZE_RANGE = (0.03, 0.25), (0.03, 0.3)
 _LEAST_SHARE = 0.1
 _ATTEMPTS = 100

@@ -75,7 +75,7 @@ class PolicySpec:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def require(self, spec: "PolicySpec", source: str) -> None:
-        """Raises a `CongraspError` unless `spec`, that of `source`, equals this one."""
+        """Raises a `CongraspError` unless `spec`, that of `source`, has the schema of this one."""
         if spec.schema != self.schema:
             raise CongraspError(
                 f"The policy {source} is for hand '{spec.hand_name}' (schema {spec.schema}), not for hand "
@@ -244,9 +244,20 @@ def sample_action(
     return action, network.log_probability(mean, log_std, action)
 
 
-def act_by_mean(layout: Layout, parameters: InferenceParameters, observation: Array, key: Array) -> tuple[Array, Array]:
+def _act_by_mean(
+    layout: Layout, parameters: InferenceParameters, observation: Array, key: Array
+) -> tuple[Array, Array]:
     """`mean_action` with the signature of `sample_action`: the key is ignored, and the log probability is 0."""
     return mean_action(layout, parameters, observation), jnp.zeros(observation.shape[:-1])
+
+
+@functools.cache
+def acting(layout: Layout, *, mean: bool) -> Any:
+    """The action of policies with this layout, by their mean or sampled, as a function for rollouts.
+
+    The same layout gives the same object, so that rollouts of different policies share compiled programs.
+    """
+    return functools.partial(_act_by_mean if mean else sample_action, layout)
 
 
 def _dataclass(cls: type, fields: Any) -> Any:

@@ -21,7 +21,7 @@ class Engine(NamedTuple):
     automatic: Callable[[str], bool] = lambda backend: False
     """JAX backend -> True if `auto` may select this engine there; the first such engine is used."""
     missing: Callable[[str], CongraspError | None] = lambda backend: None
-    """JAX backend -> what this machine lacks for the engine, or an empty string."""
+    """JAX backend -> error that names what this machine lacks for the engine; None if it lacks nothing."""
     on_device: bool = False
     """True if rollouts stay on the learner's device, so that by default one actor runs in the learner's process."""
     title: str = ""

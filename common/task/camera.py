@@ -18,8 +18,12 @@ from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import known
+from congrasp.common.task.normals import estimated_normals
 from congrasp.common.task.sensing import Sensors, arrival
 from congrasp.common.task.types import Array, Goal, Surface
+
+_TOGETHER = 512
+"""Clouds whose normals are estimated together."""
 
 
 class Camera(NamedTuple):
@@ -33,7 +37,7 @@ class Camera(NamedTuple):
     goal: Goal
     """Goal of the episode, with the constant error."""
     cloud: Surface
-    """Latest cloud, N points with labels."""
+    """Latest cloud, N points with labels, and normals estimated from them if the policy observes normals."""
 
 
 class Capsules(NamedTuple):
@@ -60,6 +64,8 @@ def begin(task: TaskConfig, sensors: Sensors, steps: int, pose: Array, surface: 
     position = origin + sensors.position_bias
     quaternion = rotations.multiply(rotations.from_rotation_vector(sensors.rotation_bias), pose[:, 3:])
     empty = Surface(jnp.broadcast_to(position[:, None], surface.points.shape), jnp.zeros_like(surface.avoid))
+    if surface.normals is not None:
+        empty = empty._replace(normals=jnp.zeros_like(surface.normals))
     poses = jnp.broadcast_to(pose[:, None], (len(pose), steps, 7))
     camera = Camera(sensors, origin, poses, goal_in_world(task, goal, position, quaternion), empty)
     return _image(camera, jnp.zeros(len(pose), jnp.int32), jnp.ones(len(pose), bool), pose, surface, None)
@@ -121,11 +127,30 @@ def _image(camera: Camera, time: Array, due: Array, pose: Array, surface: Surfac
     measured = rotations.transform(camera.origin + sensors.position_bias, turn, measured - camera.origin[:, None])
     index = _filled(visible)
     fresh = (due & jnp.any(visible, -1))[:, None]
+    points = jnp.take_along_axis(measured, index[..., None], 1)
     cloud = Surface(
-        jnp.where(fresh[..., None], jnp.take_along_axis(measured, index[..., None], 1), camera.cloud.points),
+        jnp.where(fresh[..., None], points, camera.cloud.points),
         jnp.where(fresh, jnp.take_along_axis(surface.avoid, index, 1), camera.cloud.avoid),
     )
+    if camera.cloud.normals is not None:
+        shown = rotations.transform(camera.origin + sensors.position_bias, turn, sensors.eye[:, None])[:, 0]
+        normals = _normals(points, shown)
+        cloud = cloud._replace(normals=jnp.where(fresh[..., None], normals, camera.cloud.normals))
     return camera._replace(cloud=cloud)
+
+
+def _normals(points: Array, eye: Array) -> Array:
+    """Normals (B, N, 3) of clouds toward cameras, a few hundred environments at a time for the sake of memory."""
+    batch = points.shape[0]
+    if batch <= _TOGETHER:
+        return estimated_normals(points, eye)
+
+    def parts(array: Array) -> Array:
+        filled = jnp.pad(array, ((0, -batch % _TOGETHER), *[(0, 0)] * (array.ndim - 1)))
+        return filled.reshape(-1, _TOGETHER, *array.shape[1:])
+
+    found = jax.lax.map(lambda part: estimated_normals(*part), (parts(points), parts(eye)))
+    return found.reshape(-1, *points.shape[1:])[:batch]
 
 
 def facing(eye: Array, points: Array) -> Array:

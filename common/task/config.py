@@ -73,12 +73,12 @@ class ControlConfig:
     """Inverse time constant (1/s) of the observer of the wrist's load. Its estimate is added to the wrist's targets
     after the table is removed, so that the limits on acceleration do not limit weight. 0: no compensation."""
     lookahead: int = 1
-    """Waypoints between the nearest one and the guidance (0 is the paper's ablation without feed-forward)."""
+    """Number of waypoints from the nearest one to the guidance (0 is the paper's ablation without feed-forward)."""
     follow_object: bool = False
     """Guides relative to the object's current pose instead of its pose at the start of the episode."""
     finger_guidance: float = 0.0
-    """rad per control step by which finger targets close from the middle of the approach on, once the wrist has
-    arrived; 0 leaves the fingers to the action (the paper's method)."""
+    """Angle by which finger targets close in each control step from the middle of the approach on, rad; 0 leaves the
+    fingers to the action (the paper's method)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,6 +172,10 @@ class TaskConfig(_Shares):
     """Distance by which the fingers are opened wider than the object in training, m, drawn uniformly at every reset."""
     surface_points: int = 256
     """Surface points of an object that the policy observes (at most 512)."""
+    surface_normals: bool = False
+    """Adds to the observation the surface's normal at each keypoint's nearest surface point, and the keypoint's height
+    above the tangent plane there: points alone lie up to 2 cm apart. Requests may contain normals
+    (`common.task.normals` estimates missing ones)."""
     trajectory_points: int = 15
     """K, waypoints of a wrist trajectory."""
     constraints: tuple[str, ...] = OURS
@@ -207,7 +211,7 @@ class TaskConfig(_Shares):
     """The tracker or camera. A policy that observes the full state also gets the object's pose from the tracker, unless
     it is perfect."""
     drop_height: float = 0.05
-    """Distance below the object's height at the table's removal at which it counts as fallen, m."""
+    """Distance below the object's height at the start, or at the table's removal, at which it counts as fallen, m."""
     control: ControlConfig = ControlConfig()
     """Mapping from actions to joint targets."""
     reward: RewardWeights = RewardWeights()

@@ -132,7 +132,7 @@ def wrist_lead(hand: Hand, control: ControlConfig, given: Guided, residual: Arra
 
 
 def carried_lead(hand: Hand, state: SceneState) -> Array:
-    """(B, 6) by which the wrist's target leads so that its servos carry the load, once the table is gone."""
+    """(B, 6) by which the wrist's target leads so that its servos carry the load, after the table is removed."""
     stiffness, _ = hand.wrist_servos
     return jnp.where(state.table[..., None], 0.0, -state.wrist_load / stiffness)
 

@@ -37,6 +37,10 @@ class Features(NamedTuple):
     an active choice of fingers allows."""
     nearest: Array
     """(B, P, 3) d: from each keypoint to the nearest surface point."""
+    normal: Array | None
+    """(B, P, 3) n: outward unit normal at the nearest surface point; None if the surface has no normals."""
+    height: Array | None
+    """(B, P) -n . d: signed height of each keypoint above the tangent plane there, m; None without normals."""
     force: Array
     """(B, L, 3) f: net contact force on each link, N."""
     touching: Array
@@ -84,6 +88,12 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
     points = len(hand.keypoints)
     nearest = jnp.take_along_axis(surface.points, index[..., :points, None], -2) - local
 
+    normal = height = None
+    if surface.normals is not None:
+        normal = jnp.take_along_axis(surface.normals, index[..., :points, None], -2)
+        height = -jnp.sum(normal * nearest, -1)
+        normal = rotations.apply(rotations.to_matrix(object_quaternion), normal)
+
     found = state.contact_found
     assert contact_shape[-2] == len(hand.links), "contact arrays do not belong to this hand"
     force = jnp.where(found[..., None], state.contact_force, 0.0).reshape(contacts.shape)
@@ -98,6 +108,8 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
         keypoints=keypoints,
         center=hand_center(hand, fingers, chosen_fingers(task.constraints, goal)),
         nearest=rotations.apply(rotations.to_matrix(object_quaternion), nearest),
+        normal=normal,
+        height=height,
         force=jnp.sum(forces, -2),
         touching=jnp.any(found, -1),
         of={},

@@ -57,7 +57,7 @@ def _single_stage(run: RunConfig) -> RunConfig:
 METHODS = {
     "ours": Method("one policy for every combination of constraints, objects free from the start, weights ramped"),
     "pd": Method(
-        "no learning: the wrist follows its guidance, then the fingers close, to the reference pose if there is one",
+        "no learning: the wrist follows its guidance, then the fingers close from their initial angles to a fist",
         control={
             "finger_scale": 0.0,
             "wrist_position_scale": 0.0,

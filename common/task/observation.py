@@ -30,7 +30,7 @@ def fields(hand: Hand, task: TaskConfig) -> dict[str, tuple[ObservationField, ..
     meaning = "m, points of the camera's cloud, wrist frame, each with 1 if an active affordance avoids it, else 0"
     cloud = (ObservationField("cloud", 4 * task.surface_points, meaning),)
     return {
-        "state": tuple(field for field in (*_state_fields(hand), *past) if _is_seen(task, field)),
+        "state": tuple(field for field in (*_state_fields(hand, task), *past) if _is_seen(task, field)),
         **({"cloud": cloud} if task.observation == "camera" else {}),
         **{
             block: tuple(field for field in content if _is_seen(task, field))
@@ -50,9 +50,13 @@ def _is_seen(task: TaskConfig, field: ObservationField) -> bool:
     return task.observation == "full" or not field.privileged
 
 
-def _state_fields(hand: Hand) -> tuple[ObservationField, ...]:
+def _state_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
     """Fields of the state of hand and object in the current control step."""
     f, n, p = len(hand.joints), len(hand.links), len(hand.keypoints)
+    normals: tuple[tuple[Any, ...], ...] = (
+        ("normal", 3 * p, "outward unit normal at each of these surface points, wrist frame"),
+        ("height", p, "m, signed height of each keypoint above the tangent plane at its surface point"),
+    )
     state: tuple[tuple[Any, ...], ...] = (
         ("q", f, "rad, finger joints in the order of 'joints'"),
         ("u", 6, "m and rad, wrist joints in the order of 'wrist_joints', relative to the wrist's initial pose"),
@@ -63,6 +67,7 @@ def _state_fields(hand: Hand) -> tuple[ObservationField, ...]:
         ("touching", n, "1 if a link, in the order of 'links', touches the object, else 0", True),
         ("force", 3 * n, "f / (|f| + force_scale) for the object's net force f on each link, N, wrist frame", True),
         ("nearest", 3 * p, "m, from each keypoint to the nearest surface point, wrist frame"),
+        *(normals if task.surface_normals else ()),
         ("object_velocity", 3, "m/s of the centre of mass, wrist frame", True),
         ("object_angular_velocity", 3, "rad/s, wrist frame", True),
         ("object_displacement", 3, "m since the start, wrist frame"),
@@ -73,6 +78,14 @@ def _state_fields(hand: Hand) -> tuple[ObservationField, ...]:
         ("table", 1, "1 while the table is present"),
     )
     return tuple(ObservationField(*field) for field in state)
+
+
+def _normals(scene: Scene) -> list[Array]:
+    """Arrays (B, ...) of the fields of `TaskConfig.surface_normals`."""
+    if not scene.task.surface_normals:
+        return []
+    assert scene.features.normal is not None and scene.features.height is not None, "the surface has no normals"
+    return [flat(scene.features.normal), scene.features.height]
 
 
 def _past_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
@@ -139,6 +152,7 @@ def observe(scene: Scene) -> Array:
         features.touching.astype(jnp.float32),
         flat(squash(features.force)),
         flat(features.nearest),
+        *_normals(scene),
         rotations.rotate(to_wrist, state.object_velocity),
         rotations.rotate(to_wrist, state.object_angular_velocity),
         rotations.rotate(to_wrist, state.object_position - state.object_position_initial),
@@ -146,7 +160,7 @@ def observe(scene: Scene) -> Array:
         jnp.minimum(state.time / horizon, 1.0)[:, None],
         state.table.astype(jnp.float32)[:, None],
     ]
-    parts = _seen(task, values, _state_fields(hand))
+    parts = _seen(task, values, _state_fields(hand, task))
     if task.observation != "full":
         parts += _seen(task, _past(scene), _past_fields(hand, task))
     if task.observation == "camera":

@@ -26,7 +26,7 @@ from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.types import Array
 
 CLEAN_MM = {"hand_hand_mm": 2.0, "hand_table_mm": 2.0, "hand_object_mm": 3.0, "hand_mesh_mm": 3.0}
-"""Greatest penetrations of a clean episode; `hand_mesh_mm` is only measured for hands with meshes."""
+"""Exclusive bounds of a clean episode's penetrations, mm; `hand_mesh_mm` is only measured for hands with meshes."""
 MEASURES = (
     *CLEAN_MM,
     *(f"wrist_{of}{which}" for of in ("speed", "acceleration") for which in ("", "_mean", "_p95")),
@@ -85,7 +85,7 @@ def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
     transforms = kinematics.link_transforms(hand, state.q)
     wrist = features.wrist_position, features.wrist_quaternion
     seen = features.object_position, features.object_quaternion, index, field
-    half = jnp.float16  # unit of what is averaged
+    half = jnp.float16  # precision of the quantities that are averaged
     return Sample(
         hand_hand=hand_hand(hand, transforms),
         hand_table=jnp.where(state.table, hand_table(hand, transforms, *wrist), 0.0),
@@ -222,7 +222,7 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
         `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over the episode's
         steps. `finger_jerk`: root mean square over joints and steps, rad/s^3. `link_force_peak` (N): that of the link
         with the highest force; `link_force`: the mean over touching links (0 if none touches). `torque_share` and
-        `torque_share_peak`: mean and peak over joints and steps.
+        `torque_share_peak`: mean and peak over motors and steps.
     """
     wrist, fingers = (np.asarray(x, np.float32) for x in (samples.wrist_velocity, samples.finger_velocity))
     force, torque = (np.asarray(x, np.float32) for x in (samples.link_force, samples.torque_share))
@@ -245,7 +245,7 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
 
 
 def is_clean(held: np.ndarray, found: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(B,) bool: the object was held for two seconds without the table, and no penetration exceeds `CLEAN_MM`.
+    """(B,) bool: the object was held for two seconds without the table, and every penetration is below `CLEAN_MM`.
 
     Args:
       held: (B,) bool, True if the object was held.

@@ -13,10 +13,10 @@ def resting_mean(
     Args:
       xp: numpy or jax.numpy.
       mean: (..., 7) position, m, and quaternion so far.
-      count: (...) readings in it; 0 once the object has moved, from then on for good.
-      reading: (..., 7) the newest one.
-      table: (...) bool: the table is there.
-      settle: m within which a reading counts.
+      count: (...) number of readings in the mean; 0 for good once the object has moved or the table is removed.
+      reading: (..., 7) newest reading.
+      table: (...) bool: the table is present.
+      settle: largest distance of an included reading from the mean, m.
 
     Returns:
       The mean and the count with the newest reading.

@@ -60,7 +60,7 @@ def _force(scene: Scene, earning: Earning) -> Array:
 
 
 def _force_excess(scene: Scene, earning: Earning) -> Array:
-    """Newtons beyond f_max, wherever they press."""
+    """Newtons beyond f_max, summed over all links, also where a contact earns nothing."""
     total = jnp.linalg.norm(scene.features.force, axis=-1)
     return -jnp.sum(jnp.clip(total - earning.force_max, 0.0, 50.0), -1)
 
@@ -71,7 +71,7 @@ def _object_position(scene: Scene, earning: Earning) -> Array:
 
 
 def _object_rotation(scene: Scene, earning: Earning) -> Array:
-    """Weighted count of the links in contact."""
+    """Squared rotation of the object since the start."""
     turned = rotations.angle(scene.state.object_quaternion, scene.state.object_quaternion_initial)
     return -jnp.minimum(turned**2, 1.0)
 
@@ -85,7 +85,7 @@ GRASP: tuple[Term, ...] = (
     Term(
         "distance",
         0.3,
-        "Weighted forces of the links in contact, as shares of f_max.",
+        "w_dis: per metre of the weighted distance from the hand's keypoints to the object's surface (0.3 m at most).",
         _distance,
     ),
     Term(
@@ -94,7 +94,7 @@ GRASP: tuple[Term, ...] = (
         "w_c: for all links in contact (weighted by the links' contact weights, which sum to one).",
         _contact,
     ),
-    Term("force", 0.5, "Force in newtons beyond f_max, anywhere on the object.", _force),
+    Term("force", 0.5, "w_f: for all links pressing with `force_max` or more.", _force),
     Term("force_max", 5.0, "f_max, N per link: force beyond it earns nothing.", None),
     Term(
         "force_excess",
@@ -117,7 +117,7 @@ GRASP: tuple[Term, ...] = (
     Term(
         "wrist_velocity",
         0.01,
-        "Drop indicator I_drop.",
+        "w_u: per squared velocity of the six wrist joints (m/s and rad/s).",
         lambda scene, earning: -jnp.minimum(square(scene.state.u_velocity), 100.0),
     ),
     Term(

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from congrasp.common import rotations
+from congrasp.common import chance, rotations
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.resting import resting_mean
 from congrasp.common.task.types import Array, SceneState
@@ -57,7 +58,7 @@ class Tracker(NamedTuple):
     first: Array
     """(B, 7) resting pose of the object: the pose shown at the start of the episode, or the mean since then."""
     rested: Array
-    """(B,) number of readings in that mean; 0 once the object has moved."""
+    """(B,) number of readings in that mean; 0 once the object has moved or the table is removed."""
     shown: Array
     """(B, 7) pose shown now."""
 
@@ -88,40 +89,39 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
       key: random key.
       batch: number B of episodes.
     """
-    keys = jax.random.split(key, 7)
-
-    def drawn(number: int, limits: tuple[float, float]) -> Array:
-        return jax.random.uniform(keys[number], (batch,), minval=limits[0], maxval=limits[1])
-
-    def uniform(number: int, limits: tuple[float, float]) -> Array:
-        own = jax.random.fold_in(key, number)
-        return jax.random.uniform(own, (batch,), minval=limits[0], maxval=limits[1])
-
-    def bias(number: int, limits: tuple[float, float]) -> Array:
-        size, direction = jax.random.split(jax.random.fold_in(key, number))
-        deviation = jax.random.uniform(size, (batch, 1), minval=limits[0], maxval=limits[1])
-        return deviation * jax.random.normal(direction, (batch, 3))
-
-    def placed(number: int) -> Array:
-        ranges = jnp.array((config.camera_distance, config.camera_elevation, config.camera_azimuth))
-        share = jax.random.uniform(jax.random.fold_in(key, number), (batch, 3))
-        distance, up, around = jnp.moveaxis(ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0]), -1, 0)
-        level = jnp.cos(up)
-        return distance[:, None] * jnp.stack([level * jnp.cos(around), level * jnp.sin(around), jnp.sin(up)], -1)
-
-    once = jax.random.uniform(jax.random.fold_in(key, 10), (batch,)) < config.single_image
+    ranges = {
+        "period": config.period,
+        "phase": (0.0, 1.0),
+        "delay": config.delay,
+        "position_noise": config.position_noise,
+        "rotation_noise": config.rotation_noise,
+        "dropout": config.dropout,
+        "position_bias": config.position_bias,
+        "rotation_bias": config.rotation_bias,
+        "latency": config.latency,
+        "camera_distance": config.camera_distance,
+        "camera_elevation": config.camera_elevation,
+        "camera_azimuth": config.camera_azimuth,
+        "once": (0.0, 1.0),
+    }
+    numbers = chance.uniforms(key, {"ranges": len(ranges), "biases": 6}, batch)
+    low, high = np.array([*ranges.values()], np.float32).T
+    drawn = dict(zip(ranges, (low + (high - low) * numbers["ranges"]).T, strict=True))
+    position_bias, rotation_bias = jnp.split(chance.normal(numbers["biases"]), 2, -1)
+    once, up, around = drawn["once"] < config.single_image, drawn["camera_elevation"], drawn["camera_azimuth"]
+    way = jnp.stack([jnp.cos(up) * jnp.cos(around), jnp.cos(up) * jnp.sin(around), jnp.sin(up)], -1)
     return Sensors(
-        key=jax.random.key_data(jax.random.split(keys[0], batch)),
-        period=jnp.where(once, NEVER, jnp.maximum(drawn(1, config.period) / control_dt, 1.0)),
-        phase=jnp.where(once, 0.0, drawn(2, (0.0, 1.0))),
-        delay=jnp.round(drawn(3, config.delay) / control_dt).astype(jnp.int32),
-        position_noise=drawn(4, config.position_noise),
-        rotation_noise=drawn(5, config.rotation_noise),
-        dropout=drawn(6, config.dropout),
-        position_bias=bias(7, config.position_bias),
-        rotation_bias=bias(8, config.rotation_bias),
-        latency=jnp.round(uniform(11, config.latency) / control_dt).astype(jnp.int32),
-        eye=placed(9),
+        key=jax.random.key_data(jax.random.split(key, batch)),
+        period=jnp.where(once, NEVER, jnp.maximum(drawn["period"] / control_dt, 1.0)),
+        phase=jnp.where(once, 0.0, drawn["phase"]),
+        delay=jnp.round(drawn["delay"] / control_dt).astype(jnp.int32),
+        position_noise=drawn["position_noise"],
+        rotation_noise=drawn["rotation_noise"],
+        dropout=drawn["dropout"],
+        position_bias=drawn["position_bias"][:, None] * position_bias,
+        rotation_bias=drawn["rotation_bias"][:, None] * rotation_bias,
+        latency=jnp.round(drawn["latency"] / control_dt).astype(jnp.int32),
+        eye=drawn["camera_distance"][:, None] * way,
     )
 
 

@@ -73,6 +73,8 @@ class Surface(NamedTuple):
     """(B, N, 3) in the object frame, m."""
     avoid: Array
     """(B, N) bool, true in the avoid region."""
+    normals: Array | None = None
+    """(B, N, 3) outward unit normals at the points, same frame; None if the policy does not observe them."""
 
 
 @jax.tree_util.register_dataclass

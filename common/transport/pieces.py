@@ -41,7 +41,7 @@ class Pace:
         return _WISH.pack(self._length) if self._length > _FIRST else None
 
     def lost(self) -> None:
-        """Records that a longer first chunk was lost: restarts from the shortest length."""
+        """Records that a longer first chunk was lost: restarts from the default length."""
         self._length = _FIRST
 
     def request(self, token: bytes, offset: int) -> bytes:
@@ -57,7 +57,7 @@ class Pace:
 
 
 class Outbox:
-    """Long replies being fetched: equal replies are stored once, and only the most recently used are kept."""
+    """Long replies being fetched: a payload sent repeatedly is stored once, and only the last used ones are kept."""
 
     def __init__(self, most: int = 8, at_once: int = 2):
         """Keeps `most` replies, and sends at most `at_once` chunks to one account at a time."""

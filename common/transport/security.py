@@ -211,7 +211,7 @@ def secured(endpoint: str, credentials: Credentials | None) -> str:
     """Returns the endpoint to use: with credentials always TLS.
 
     Raises:
-      CongraspError: a TLS endpoint has no credentials, or one without TLS has some.
+      CongraspError: a TLS or QUIC endpoint has no credentials, or one with credentials is neither TCP nor TLS.
     """
     protocol, _, rest = endpoint.partition("/")
     if credentials is None:

@@ -32,13 +32,13 @@ _ATTEMPT = 1.0  # seconds of one attempt to connect; signals are handled between
 _CLOSE = 2.0  # deadline of closing, s; with thousands of tokens on a busy machine it takes more than one
 _REOPEN = 10.0  # deadline of reopening, s
 _ROOM_US: dict[Flow, int] = {"control": 10_000, "bulk": 50_000, "log": 10_000, "policy": 5_000}
-"""Microseconds that an answer waits for room in its reader's link; then all are dropped until there is some."""
-_ROOM_LONG_US = 200_000  # that a piece of a long answer waits in all
-_QUEUE = 8  # batches of 64 KiB that wait for a link: an acknowledgement finds room beside a piece of a long reply
-_ACCEPT_MS = 5000  # that a connection has until it has shown who it is
-_PENDING = 4096  # connections that may be at that, and no more than a quarter of the files that may be open
-_FILES = 16384  # that the process may have open, if the system allows it: each connection is one
-_SESSIONS = 1000  # and no more than a quarter of the files: Zenoh panics where there are none left
+"""Microseconds that a reply waits for room in its reader's link; then replies are dropped until there is room."""
+_ROOM_LONG_US = 200_000  # total wait of a chunk's fragments, microseconds
+_QUEUE = 8  # batches of 64 KiB queued for a link: an acknowledgement fits in addition to a chunk of a long reply
+_ACCEPT_MS = 5000  # deadline of a connection's handshake, ms
+_PENDING = 4096  # most connections in a handshake, but at most a quarter of the open files
+_FILES = 16384  # limit of the process's open files, if the system allows it: each connection is one
+_SESSIONS = 1000  # most connected peers, but at most a quarter of the open files: Zenoh panics if none is left
 _log = logging.getLogger(__name__)
 
 
@@ -100,7 +100,7 @@ def _open_files() -> int:
 
 
 def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
-    """A session that listens; a CongraspError if its port is in use."""
+    """Opens a listening session; raises a CongraspError if it cannot listen, such as on a port in use."""
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

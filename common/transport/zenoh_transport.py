@@ -148,7 +148,7 @@ class ZenohTransport(Transport):
     def _first(self, key: str, payload: bytes, timeout: float) -> _Reply:
         """Queries a reply, or its first chunk; raises like `query`.
 
-        A short query is repeated if a first chunk longer than the shortest does not arrive.
+        A short query is repeated if a first chunk longer than the default does not arrive.
         """
         wish = self._pace.wish() if len(payload) <= _FEW else None
         if wish is not None:

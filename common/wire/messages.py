@@ -53,8 +53,7 @@ ROLLOUT = MessageSpec(
     },
 )
 """Actor to learner: T control steps of B worlds, D observation and A action sizes, P inputs of the critic and S of a
-teacher, E finished episodes. Of the per-step arrays it holds those that the run's algorithm learns from. `run_id` is
-the run's id."""
+teacher, E finished episodes. Of the per-step arrays it holds those that the run's algorithm learns from."""
 
 BUNDLE = MessageSpec(
     "bundle",
@@ -195,7 +194,7 @@ class RolloutHeader(NamedTuple):
     version: int
     """Version of the behaviour policy."""
     run_id: str
-    """Id of the run; the metadata entry `run_id`."""
+    """Id of the run; it changes when training starts from scratch."""
     schema: str
     steps: int
     """T*B."""

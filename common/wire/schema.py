@@ -34,7 +34,7 @@ class ArraySpec:
 
 Schema = Mapping[str, ArraySpec]
 """Arrays by name; their shapes consist of T control steps, B worlds, D observation and A action sizes, P privileged
-inputs of the critic, and S, the size of the full observation."""
+inputs of the critic, and S inputs of a teacher (`common.task.teaching`)."""
 
 F32 = ("float32",)
 _OBSERVATION = ("float16", "float32")

@@ -40,10 +40,10 @@ _SPECS = partition_specs(_SCHEMA)
 _LAST_RATE = 0.02
 """Share of the initial learning rate that remains at the end of the run."""
 _CHECKED = {"imitation_kl": "rollouts", "actor_grad_norm": "optimisation"}
-"""Metrics that must be finite, and their names in errors."""
+"""Metrics that must be finite, and the stage to which an error attributes each."""
 
 Body = tuple[Hand, ControlConfig]
-"""The hand, and how its actions become targets."""
+"""The hand, and the mapping from its actions to joint targets."""
 Learnt = tuple[Params, Any, Array]
 """The actor's parameters, the optimiser's state and the random key."""
 
@@ -64,14 +64,15 @@ class Distillation:
     batch_schema: Schema = _SCHEMA
 
     def __init__(self, spec: PolicySpec, config: RunConfig):
-        """For a student's networks.
+        """Creates the algorithm for a student's networks.
 
         Args:
-          spec: the student's.
-          config: the run, whose `distill` names the teacher.
+          spec: spec of the student.
+          config: the run; its `distill` names the teacher.
 
         Raises:
-          CongraspError: no teacher is named, its file cannot be read, or it does not see and act as this task has it.
+          CongraspError: no teacher is named, its file cannot be read, or its observations or actions differ from this
+            task's.
         """
         teacher = read_teacher(config.distill.teacher)
         _check(teacher, spec, config.task)
@@ -106,12 +107,12 @@ class Distillation:
     ) -> tuple[TrainState, dict[str, float]]:
         """Runs epochs of minibatches over a batch; see `Algorithm.update`.
 
-        The normaliser is frozen during the update and takes the batch in afterwards; only the first batch is also what
-        the first update normalises by.
+        The normaliser is frozen during the update and includes the batch afterwards; the first update already
+        normalises by its batch.
 
         Raises:
-          NonFiniteUpdate: naming the first term that was not finite; the state is that before the update.
-          CongraspError: if there are more minibatches than transitions.
+          NonFiniteUpdate: a term is not finite; the error names the first one and holds the state before the update.
+          CongraspError: there are more minibatches than transitions.
         """
         config = self._config
         transitions = batch["observation"].shape[0] * batch["observation"].shape[1]
@@ -150,7 +151,7 @@ def read_teacher(named: str) -> PolicyBundle:
     """Returns the policy that a run names as its teacher.
 
     Raises:
-      CongraspError: none is named, or there is no such policy.
+      CongraspError: no teacher is named, or there is no such policy.
     """
     if not named:
         raise CongraspError("Distillation needs a teacher.", "Name a hand or a policy file with --teacher.")
@@ -202,7 +203,7 @@ def _optimise(
     config: DistillConfig,
     mesh: Mesh | None,
 ) -> tuple[Learnt, dict[str, Array]]:
-    """Epochs over the batch for a student and a teacher of these layouts; what was learnt, and metrics."""
+    """Runs epochs over the batch for a student and a teacher of these layouts; returns the learnt state and metrics."""
     program = functools.partial(_program, collectives=Collectives(mesh), layouts=layouts, body=body, config=config)
     return shard_map(mesh, program, (REPLICATED, _SPECS, REPLICATED))(learnt, batch, given)
 

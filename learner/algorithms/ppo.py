@@ -136,6 +136,7 @@ class PPO:
             | {
                 "kl_target": config.kl_target_at(state.version, self._updates),
                 "noise_kept": config.noise_kept_at(state.version, self._updates),
+                "least_std": config.least_std_at(state.version, self._updates),
             },
         )
         learnt, returns, failure, scalars = _optimise(
@@ -428,13 +429,15 @@ def _first_failure(failure: Array, offset: int, *terms: Array) -> Array:
 
 
 def _settle(params: Params, log_std_before: Array, hyper: dict[str, Any]) -> Params:
-    """Caps log std of the parameters at log f + k max(log std_0 - log f, 0).
+    """Bounds log std of the parameters: at least log l, at most log f + k max(log std_0 - log f, 0).
 
-    f is `PPOConfig.final_std`, k `PPOConfig.noise_kept_at` and std_0 the deviation before the update.
+    l is `PPOConfig.least_std_at`, f `PPOConfig.final_std`, k `PPOConfig.noise_kept_at` and std_0 the deviation before
+    the update. Only one of the two bounds is set at a time.
     """
     final, kept, log_std = jnp.log(hyper["final_std"]), hyper["noise_kept"], params["actor"]["log_std"]
     ceiling = final + kept * jnp.maximum(log_std_before - final, 0.0)
     log_std = jnp.where(kept <= 1.0, jnp.minimum(log_std, ceiling), log_std)
+    log_std = jnp.maximum(log_std, jnp.log(hyper["least_std"]))  # log 0 is no floor
     return {**params, "actor": {**params["actor"], "log_std": log_std}}
 
 

@@ -1,9 +1,9 @@
 """Ranks: the learner processes of one run, their agreement in rounds, and the mesh of their devices.
 
-Arrays are reduced by XLA (`collectives`) between one device of each rank. In addition the ranks talk over plain TCP
-with rank 0 in the middle: an update begins when all of them have a batch, they end together, they see each other's
-metrics, and a rank that dies or falls silent ends the others with one line, also those that sit in a collective. The
-two ports of the coordinator have no authentication, as JAX's own has none: keep them inside the cluster.
+Arrays are reduced by XLA (`collectives`) between one device of each rank. In addition the ranks exchange messages over
+plain TCP through rank 0: an update begins when all of them have a batch, they end together, and they receive each
+other's metrics. A rank that dies or stops responding ends the others with one line, even inside a collective. The two
+ports of the coordinator have no authentication, like JAX's own: keep them inside the cluster.
 """
 
 import collections
@@ -33,7 +33,7 @@ ROUND_SECONDS = 300.0
 """Deadline of an update, or of an exchange between live ranks, in seconds."""
 _SILENCE_SECONDS = 20.0
 _HEARTBEAT_SECONDS = 2.0
-_RELAY_SECONDS = 2.0  # that rank 0 lives on, so that JAX does not abort the others before they have printed why
+_RELAY_SECONDS = 2.0  # time that rank 0 stays alive, so that JAX does not abort the others before they print the reason
 _LENGTH = struct.Struct("!Q")
 _META = "meta"
 
@@ -41,9 +41,9 @@ _META = "meta"
 def end_process(text: str, code: int = TransportError.exit_code) -> NoReturn:
     """Prints the reason in one line and ends the process at once.
 
-    Its main thread may wait for a rank that will never come, and so would JAX at an orderly exit, only to abort then.
+    The main thread may wait for a lost rank, and so would JAX at an orderly exit before it aborts.
     """
-    with contextlib.suppress(OSError):  # the disk that they are written to may be full
+    with contextlib.suppress(OSError):  # the output may be on a full disk
         sys.stdout.flush()
         print(f"congrasp: error: {text}", file=sys.stderr, flush=True)
     os._exit(code)
@@ -126,11 +126,11 @@ class Ranks:
           rank: number of this process.
           count: number of ranks.
           coordinator: `host:port` of rank 0, which listens there (JAX) and at the next port (the ranks).
-          on_lost: given the reason when another rank is lost; it should not return.
+          on_lost: called with the reason when another rank is lost; it should not return.
 
         Raises:
-          CongraspError: the numbers or the address make no sense, or the port is in use.
-          TransportError: not all ranks came in time.
+          CongraspError: the rank, the count or the address is invalid, or the port is in use.
+          TransportError: not all ranks joined in time.
         """
         if not 0 <= rank < count:
             raise CongraspError(f"There is no rank {rank} of {count}.", "Ranks are numbered from 0.")
@@ -139,7 +139,7 @@ class Ranks:
         host, _, port = coordinator.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) < 65535:
             raise CongraspError(f"'{coordinator}' is no address of rank 0.", "Give --coordinator HOST:PORT.")
-        # All interfaces unless it is the loopback: rank 0 may not know itself by the name that others know it by.
+        # All interfaces unless it is the loopback: rank 0 may not resolve the name by which others reach it.
         bind = host if host in ("localhost", "127.0.0.1") else ""
         deadline = time.monotonic() + JOIN_SECONDS
         if rank == 0:
@@ -148,7 +148,7 @@ class Ranks:
             links = {0: _reach(rank, count, host, int(port) + 1, deadline)}
         ranks = cls(rank, count, links, on_lost)
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        jax.config.update("jax_enable_preemption_service", False)  # it would take SIGTERM for itself
+        jax.config.update("jax_enable_preemption_service", False)  # it would intercept SIGTERM
         jax.distributed.initialize(
             f"127.0.0.1:{relay(host, int(port))}" if rank else coordinator,
             count,

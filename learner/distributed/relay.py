@@ -13,11 +13,11 @@ _PAUSE = 0.1  # s, between two attempts to reach the coordinator
 
 
 def relay(host: str, port: int) -> int:
-    """Forwards what connects to a free port of the loopback interface, for as long as the process lives.
+    """Forwards connections to a free port of the loopback interface, for as long as the process lives.
 
     Args:
-      host: of the coordinator.
-      port: of the coordinator, which need not listen yet.
+      host: host of the coordinator.
+      port: port of the coordinator, which need not listen yet.
 
     Returns:
       The free port.
@@ -28,7 +28,7 @@ def relay(host: str, port: int) -> int:
 
 
 def _accept(server: socket.socket, address: tuple[str, int]) -> None:
-    """Takes connections."""
+    """Accepts connections."""
     while True:
         near, _ = server.accept()
         threading.Thread(target=_forward, args=(near, address), daemon=True, name="relay-out").start()
@@ -49,7 +49,7 @@ def _forward(near: socket.socket, address: tuple[str, int]) -> None:
 
 
 def _backward(far: socket.socket, near: socket.socket) -> None:
-    """Forwards what the coordinator sends."""
+    """Forwards the data of the coordinator."""
     with contextlib.suppress(OSError):
         while data := far.recv(1 << 16):
             near.sendall(data)

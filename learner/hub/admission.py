@@ -15,10 +15,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.rate_limit import PutOff
 
-_DENSITY = (
-    -100.0,
-    10.0,
-)  # log probability of each action in nats; reached at 14 standard deviations, or by one of 2e-5
+_DENSITY = (-100.0, 10.0)
+"""Bounds of the log probability of each action, nats: the lower is reached 14 standard deviations from the mean, the
+upper at the mean with a standard deviation of 2e-5."""
 _ACTIONS = 256  # used if a rollout has a log probability but no action
 _ROWS = 128
 _NAMES = 1024  # actors for which refused rollouts are counted

@@ -11,7 +11,7 @@ from congrasp.learner.hub.staleness import Owner
 
 _INCARNATIONS = 1024  # incarnations whose sequences are kept
 _WINDOW = 64  # sequence numbers by which an actor's rollouts may overtake one another
-_FAR = 1 << 10  # sequence numbers between the first that waits for an update and the next, of which a checkpoint tells
+_FAR = 1 << 10  # most sequence numbers below `next` that a checkpoint lists one by one, from the first queued one on
 
 
 @dataclasses.dataclass
@@ -23,9 +23,9 @@ class Sequences:
     refused: set[int] = dataclasses.field(default_factory=set)
     """Refused ones among them, if recent; the others were accepted."""
     skipped: int = 0
-    """Sequence numbers below `next` that never came, as far as they can have been made."""
+    """Number of sequence numbers below `next` that never arrived, limited by tickets."""
     granted: int = 0
-    """Tickets that it was given: it has made no more rollouts than these, and those of sessions before."""
+    """Number of its tickets, which bounds its rollouts apart from those of earlier sessions."""
     rollouts: int = 0
     """Number of accepted rollouts."""
     version: int = -1
@@ -58,7 +58,7 @@ class Sequences:
         return self.skipped + self._made(ahead)
 
     def _made(self, gap: int) -> int:
-        """Sequence numbers of a gap that can be of rollouts, limited by tickets: an actor may invent numbers."""
+        """Size of a gap in the sequence numbers, limited by tickets, since an actor may invent numbers."""
         return max(0, min(gap, self.granted + _WINDOW - self.skipped))
 
 

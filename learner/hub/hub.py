@@ -39,7 +39,7 @@ from congrasp.learner.hub.write_ahead import Identity, Recovered, WriteAheadLog
 _RETRY_SECONDS = 0.25
 _RATE_SECONDS = 10.0
 _EVENT_SECONDS = 1.0  # seconds between two events of one kind
-_PIECES = 40.0  # limit of the weights for the owners of one certificate, at most four mebibytes, per second
+_PIECES = 40.0  # chunks of weights, of at most four mebibytes, per second for the owners of one certificate
 
 
 class LearnerHub:
@@ -71,7 +71,7 @@ class LearnerHub:
           config_json: configuration of the run, for actors that connect.
           run_id: identifies this training; it changes on a start from scratch, not on a resume.
           schema: required policy schema of rollouts.
-          form: required arrays and sizes of rollouts; only actors that differ are refused.
+          form: required arrays and sizes of rollouts; only rollouts that differ are refused.
           staleness: staleness manager in its initial state.
           queue_limit: most rollouts queued for an update.
           name: name of the learner, for logs.
@@ -143,6 +143,9 @@ class LearnerHub:
         Args:
           bundle: a policy bundle of this run and schema.
           version: version of the bundle; one more than the last, except after a resume.
+
+        Raises:
+          CongraspError: the bundle is invalid, or has another schema, version or run id.
         """
         validate_bundle(bundle, schema=self._schema)
         if (bundle.meta["version"], bundle.meta["run_id"]) != (version, self.run_id):

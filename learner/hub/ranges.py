@@ -127,7 +127,10 @@ def _extremes(hand: Hand, task: TaskConfig) -> tuple[SceneState, Surface, Goal, 
         time=rng.integers(0, task.approach_steps + task.hold_steps_max + 1, _STATES).astype(np.float32),
         table=rng.random(_STATES) < 0.5,
     )
-    surface = Surface(within(task.surface_points, 3, most=0.1), rng.random((_STATES, task.surface_points)) < 0.5)
+    count = task.surface_points
+    surface = Surface(within(count, 3, most=0.1), rng.random((_STATES, count)) < 0.5)
+    if task.surface_normals:
+        surface = surface._replace(normals=unit(count, 3))
     goal = _goal(hand, task, rng)
     others = rng.integers(0, _STATES, (_STATES, task.history))
     others[:, 0] = np.arange(_STATES)

@@ -13,8 +13,8 @@ A ticket ends when its rollout arrives, when its owner dies, and when its deadli
 the time for which it holds a place also depend on the owner's earlier rollouts (`learner.hub.tickets`).
 
 The lag of a rollout is the number of updates between its policy and the current one. A learner that resumes from a
-checkpoint gives its policy a new version; earlier versions are measured from the checkpoint's:
-rollouts of that policy keep their lag, those of policies lost with the killed learner do not.
+checkpoint gives its policy a new version; earlier versions are measured from the checkpoint's: rollouts of that policy
+keep their lag, those of policies lost with the killed learner do not.
 """
 
 import collections

@@ -1,8 +1,8 @@
 """The learner's journal: rollouts used by updates, dropped, and undone by resumes.
 
-Every session of the learner begins with a line that gives the checkpoint's version. Rollouts used by updates of that
-version or later ones before were lost with the process: they are undone. The next line lists which of these, and of the
-queued ones, the session recovers.
+Every session of the learner begins with a line that gives the checkpoint's version. Earlier updates of that version or
+later ones were lost with their process: the rollouts that they used are undone. The next line lists which of these, and
+of the queued ones, the session recovers.
 """
 
 import pathlib
@@ -102,7 +102,7 @@ def _is_entry(entry: dict[str, Any]) -> bool:
 
 
 def journalled_version(run_dir: pathlib.Path) -> int:
-    """Newest version in a run's journals, at least; -1 if there are none. A use may have led to one more version."""
+    """Newest version that a run may have published, by its journals; -1 if there are none. A use leads to one more."""
     versions = [-1]
     for path in sorted((run_dir / AUDIT).glob("learner-*.jsonl")):
         versions += [e["version"] + ("used" in e) for e in read_uses(path).intact if "version" in e]

@@ -77,6 +77,7 @@ class WriteAheadLog:
           version: version of the checkpoint from which the learner resumes, 0 without one.
           run_id: id of the run.
           form: see `validate_rollout`.
+          schema: see `validate_rollout`.
 
         Raises:
           CongraspError: a damaged file cannot be renamed.

@@ -80,10 +80,11 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
     Args:
       path: MJCF or URDF.
       flange: site or body that carries the hand; detected if empty.
-      speed: speed limits of the joints, one or N numbers; those of the file if empty.
+      speed: speed limits of the joints, one or N numbers; those of a URDF, or `SPEED`, if empty.
 
     Raises:
-      CongraspError: the file cannot be read, or has no such flange, or joints that are neither hinges nor slides.
+      CongraspError: the file cannot be read, has no such flange, or joints that are neither hinges nor slides, or the
+        speed limits are invalid.
     """
     spec = robot_spec(path, [])
     for i, body in enumerate(spec.bodies):

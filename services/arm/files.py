@@ -23,7 +23,7 @@ CSV, TRAJECTORY, PICTURE = "arm.csv", "arm_trajectory.json", "arm.png"
 _SIZE = (1280, 960)  # pixels
 _AHEAD = np.array([0.35, -1.0, 0.45])  # from the robot to the camera, in the frame of the base
 _GREY = (0.75, 0.76, 0.78)
-_EDGE, _UNDER = 0.6, 0.001  # table beyond arm and object, and below the grasp's own table, m
+_EDGE, _UNDER = 0.6, 0.001  # margin of the table around arm and object, and its depth below height zero, m
 
 
 def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) -> None:
@@ -100,5 +100,5 @@ def _robot_shapes(arm: MovedArm, episode: Message, step: int) -> list[Shape]:
 
 
 def _grasp_shapes(episode: Message, step: int) -> list[Shape]:
-    """Returns hand and object without the table of the hand alone."""
+    """Returns hand and object, without the table of `episode_shapes`."""
     return [shape for shape in episode_shapes(episode, step, overlays=False) if shape.kind != "table"]

@@ -13,7 +13,8 @@ class ArmOptions:
     base: str = "-0.7 0 0 0"
     """X Y Z YAW of the arm's base: metres from the object on the table, degrees."""
     flange: str = ""
-    """Site or body of the arm that carries the hand; by default attachment_site, or the last body."""
+    """Site or body of the arm that carries the hand; by default the site attachment_site, flange, tool0 or ee_site, or
+    the last body."""
     mount: str = ""
     """X Y Z ROLL PITCH YAW from the flange to the hand's wrist frame: metres, degrees about the flange's axes."""
     arm_speed: str = ""

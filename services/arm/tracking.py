@@ -48,7 +48,7 @@ class Track:
     """Joints of an arm along a path."""
 
     q: np.ndarray
-    """(T, N) rad."""
+    """(T, N) rad (m of slides)."""
     position_error: float
     """m, greatest distance of the wrist from its path."""
     rotation_error: float
@@ -56,11 +56,11 @@ class Track:
     speed: np.ndarray
     """(N,) greatest speed of each joint as a share of its limit."""
     acceleration: np.ndarray
-    """(N,) greatest acceleration, rad/s^2."""
+    """(N,) greatest acceleration of each joint, rad/s^2 (m/s^2 of slides)."""
 
 
 def follow(robot: Robot, path: Path, rng: np.random.Generator) -> Track:
-    """Computes the joints along a path, from the start with the greatest distance to the joint limits.
+    """Computes the joints along a path, from the first start that reaches its end; those far from joint limits first.
 
     Args:
       robot: arm, hand and scene.

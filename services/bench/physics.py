@@ -1,4 +1,4 @@
-"""Actors' control steps a second beside the bare engine's, measured in turns."""
+"""Control steps per second of actors and of the bare engine, measured alternately."""
 
 import concurrent.futures
 import functools
@@ -17,19 +17,19 @@ from rich.table import Table
 from congrasp.actors.physics import make_physics, resolve_physics
 from congrasp.actors.physics.engine import Physics, PhysicsState
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.pool import load_pool, scale_objects
-from congrasp.common.policy.bundle import PolicyBundle, sample_action
+from congrasp.common.policy.bundle import PolicyBundle, acting
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
 
 _STEPS = 75
-"""One whole episode: every repeat begins with fresh episodes and ends with their reset."""
+"""Control steps of one whole episode: every repeat begins with new episodes and ends with their reset."""
 _DEFINITION = (
     "Actor: policy, observation, physics, reward and reset of whole episodes. Engine alone: for native, mj_step on "
     "the same models, start states and control targets, hence the same contacts, with as many threads; for others, "
@@ -40,7 +40,7 @@ _DEFINITION = (
 
 
 def engines() -> list[PhysicsName]:
-    """Engines to compare on this machine: all of them, but on a CPU the one that it is best at."""
+    """Engines to compare on this machine: all of them, on a CPU the fastest one alone."""
     return [resolve_physics("auto")] if jax.default_backend() == "cpu" else list(ENGINES)
 
 
@@ -49,22 +49,22 @@ Rolled = Callable[[], np.ndarray]
 
 
 class Recorder(NativePhysics):
-    """A native engine that keeps its commands, so that another can go through the same states."""
+    """A native engine that records its commands, so that another one can repeat its states."""
 
     def __init__(self, *args: Any, **kwargs: Any):
-        """As `NativePhysics`."""
+        """Takes the arguments of `NativePhysics`."""
         super().__init__(*args, **kwargs)
         self.commands: list[tuple[np.ndarray, np.ndarray]] = []
         """Targets (B, 6 + F) and tables (B,) of every control step."""
 
     def step(self, state: Any, target: Any, table: Any, force: Any | None = None) -> tuple[NativePhysics, PhysicsState]:
-        """One control step, written down."""
+        """Does one control step, and records it."""
         self.commands.append((np.array(target), np.array(table)))
         return super().step(state, target, table, force)
 
 
 def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> None:
-    """Goes through recorded control steps with nothing but `mj_step`; threads share the worlds and never wait."""
+    """Repeats recorded control steps by `mj_step` alone; threads share the worlds and wait only where tables change."""
 
     def run(environments: np.ndarray, targets: Sequence[np.ndarray]) -> None:
         for target in targets:
@@ -82,7 +82,7 @@ def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarr
 
 
 def rolled(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> Rolled:
-    """Recorded control steps as calls of `mujoco.rollout`, laid out before: it has threads and the loop in C.
+    """Prepares recorded control steps as calls of `mujoco.rollout`, which has its threads and the loop in C.
 
     One call for each object, because it takes models of one size; so no policy could act between its steps at once in
     all environments.
@@ -121,7 +121,7 @@ def rolled(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarr
 
 
 def bench_physics(environments: int, threads: int, repeats: int, names: list[PhysicsName]) -> None:
-    """Control steps a second of actors (policy, observation, reward, reset) beside engines that only step."""
+    """Prints control steps per second of actors (policy, observation, reward, reset) and of engines that only step."""
     console = Console()
     config = get_preset("quickstart")
     hand = get_hand(config.task.hand)
@@ -141,7 +141,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
             config.task,
             physics,
             bank,
-            functools.partial(sample_action, policy.spec.layout),
+            acting(policy.spec.layout, mean=False),
             batch=environments,
             seed=0,
             half_precision=True,
@@ -176,7 +176,7 @@ def bench_physics(environments: int, threads: int, repeats: int, names: list[Phy
 
 
 def _row(steps: int, actor: np.ndarray, bare: np.ndarray) -> list[str]:
-    """The table's cells, from seconds of every repeat."""
+    """Cells of the table, from the seconds of every repeat."""
     a, b = np.median(actor), np.median(bare)
     return [f"{steps / a:,.0f}", f"{steps / b:,.0f}", f"{b / a:.2f}", f"{bare.min() / actor.min():.2f}"]
 
@@ -189,13 +189,13 @@ def _timed(run: Callable[[], object]) -> float:
 
 
 def _collect(worker: RolloutWorker, policy: PolicyBundle) -> None:
-    """One episode of every environment."""
+    """Collects one episode of every environment."""
     jax.block_until_ready(worker.collect(policy.inference_parameters, _STEPS).reward)
 
 
 @functools.lru_cache(maxsize=1)
 def _compiled_loop(worker: RolloutWorker, hand: Hand) -> Callable[[], object]:
-    """Control steps with nothing but the engine, compiled."""
+    """Compiled control steps of the engine alone."""
     physics = worker.physics
 
     def loop(state: object, target: jax.Array, table: jax.Array) -> object:

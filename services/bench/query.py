@@ -1,4 +1,4 @@
-"""Latency of a policy server in a process of its own."""
+"""Latency of a policy server in a separate process."""
 
 import pathlib
 import tempfile
@@ -11,12 +11,12 @@ from congrasp.services.train.presets import get_preset
 
 
 def bench_query(repeat: int, concurrency: int, states: int) -> None:
-    """Prints latencies and rates of queries of an untrained policy, and the server's processor time for an answer.
+    """Prints latencies and rates of queries of an untrained policy, and the server's processor time per answer.
 
     Args:
-      repeat: queries in all.
-      concurrency: clients at the same time.
-      states: states in one query.
+      repeat: total number of queries.
+      concurrency: number of concurrent clients.
+      states: number of states in one query.
     """
     with tempfile.TemporaryDirectory() as folder:
         policy = pathlib.Path(folder, "policy.safetensors")

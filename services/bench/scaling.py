@@ -1,4 +1,4 @@
-"""Weak scaling: trained steps a second of 1, 2, … learner ranks, each a process of its own on a GPU of its own."""
+"""Weak scaling: trained steps per second of 1, 2, … learner ranks, each a separate process with a separate GPU."""
 
 import dataclasses
 import json
@@ -22,7 +22,7 @@ from congrasp.learner.run_directory import create_run
 from congrasp.services.train.processes import engine_of, leave_gpus_to, train
 
 _WARM_UPDATES = 5
-"""Updates before the measurement: the first ones compile, and begin with fresh episodes everywhere."""
+"""Updates before the measurement: the first ones compile, and all environments begin with new episodes."""
 _LEAST_UPDATES = 3
 
 
@@ -32,23 +32,23 @@ class Stage:
 
     ranks: int
     updates: int
-    """Updates measured."""
+    """Number of measured updates."""
     seconds: float
-    """From the end of the first to the end of the last of them."""
+    """Their duration, from the end of the update before them."""
     steps_per_second: float
-    """Environment steps of all ranks that updates consumed, by rank 0's clock."""
+    """Environment steps of all ranks consumed by updates, by the clock of rank 0."""
     efficiency: float
     """Steps per second and rank over those of the first stage."""
     wait_seconds: float
-    """Mean time from one update to the next batch of all ranks: rollouts, and the slowest rank's at that."""
+    """Mean time from one update to the next batch of all ranks, which waits for the rollouts of the slowest one."""
     update_seconds: float
     """Mean time of an update with its collectives."""
     start_seconds: float
-    """From the start of the processes to the end of the first update: imports, compiling, connections."""
+    """Time from the start of the processes to the end of the first update: imports, compilation, connections."""
 
 
 class _Meter:
-    """Watches a run's metrics, and stops it when enough was seen."""
+    """Collects a run's metrics, and stops it after `seconds` of measurement, or at the deadline."""
 
     def __init__(self, seconds: float, deadline: float, stop: threading.Event, notify: Callable[[str], None]):
         self.metrics: list[dict[str, Any]] = []
@@ -59,7 +59,7 @@ class _Meter:
         self.start_seconds = float("nan")
 
     def show(self, status: dict[str, Any]) -> None:
-        """Takes the newest metrics, if there are any."""
+        """Stores the newest metrics, if there are any."""
         now = time.monotonic()
         if "values" in status:
             if not self.metrics and status["update"] == 1:
@@ -77,7 +77,7 @@ class _Meter:
             self._notify(f"{now - self._began:.0f} s, " + (f"measured {span:.0f} s" if span else "starting"))
 
     def stage(self, ranks: int, first: Stage | None) -> Stage:
-        """The result."""
+        """Result of the measurement; `first` is that of the first number of ranks."""
         begin, end = self.metrics[0], self.metrics[-1]
         seconds = end["time"] - begin["time"]
         rate = (end["values"]["transitions"] - begin["values"]["transitions"]) / seconds
@@ -107,15 +107,15 @@ def bench_scaling(
     """Measures every number of ranks in turn, prints a table, and writes JSON after each of them.
 
     Args:
-      config: the run of every rank; it learns for real, but is thrown away.
-      ranks: numbers of ranks; efficiency is against the first.
-      seconds: of measurement, for each.
-      actors: actor processes of each rank; by default none where there are GPUs (one inside each rank), otherwise one.
-      deadline: seconds that one number of ranks may take in all.
-      out: file of the results.
+      config: the run of every rank; it really learns, and is deleted afterwards.
+      ranks: numbers of ranks; efficiency is relative to the first.
+      seconds: duration of each measurement.
+      actors: actor processes of each rank; by default none on GPUs (one runs inside each rank), otherwise one.
+      deadline: total time of one number of ranks, s.
+      out: file for the results.
 
     Raises:
-      CongraspError: the machine has too few GPUs, a process failed for good, or a deadline passed.
+      CongraspError: the machine has too few GPUs, a process failed permanently, or a deadline passed.
     """
     if not ranks or min(ranks) < 1:
         raise CongraspError("Name numbers of ranks from 1 on.", "For example --ranks 1 2 4.")
@@ -150,7 +150,7 @@ def _measure(
     first: Stage | None,
     console: Console,
 ) -> Stage:
-    """Trains with one number of ranks until enough was measured."""
+    """Trains with one number of ranks until the measurement is complete."""
     run_dir = pathlib.Path(tempfile.mkdtemp(prefix=f"congrasp-scaling-{ranks}-"))
     stop = threading.Event()
     meter = _Meter(seconds, deadline, stop, lambda text: console.print(f"  {text}"))
@@ -170,7 +170,7 @@ def _measure(
         if len(meter.metrics) <= _LEAST_UPDATES:
             raise TransportError(
                 f"{ranks} rank(s) made {len(meter.metrics)} update(s) to measure within {deadline:.0f} s.",
-                f"Look at {run_dir}/logs, or give them longer with --deadline.",
+                f"See {run_dir}/logs, or set a longer --deadline.",
             )
     except CongraspError:
         for log in sorted((run_dir / "logs").glob("*.log")):
@@ -183,7 +183,7 @@ def _measure(
 
 
 def _print(console: Console, config: RunConfig, stages: Sequence[Stage]) -> None:
-    """The table so far."""
+    """Prints the table of the completed stages."""
     steps = config.environments * config.rollout_steps * config.ppo.rollouts_per_update
     table = Table(title=f"{config.environments} environments, {steps} steps an update of each rank, '{config.physics}'")
     for column in ("ranks", "steps/s", "efficiency", "wait, s", "update, s", "updates", "start, s"):

@@ -1,4 +1,4 @@
-"""Seconds from the start of a process to its first update, and what they consist of: with empty caches, and again."""
+"""Seconds from the start of a process to its first update, by stage: with empty caches, and with full ones."""
 
 import collections
 import json
@@ -30,9 +30,12 @@ def bench_startup(config: RunConfig, physics: PhysicsName, deadline: float) -> N
     """Prints the stages of two starts of a training in one process, the second with the caches of the first.
 
     Args:
-      config: of the run.
+      config: configuration of the run.
       physics: engine.
-      deadline: seconds that a start may take.
+      deadline: deadline of one start, s.
+
+    Raises:
+      CongraspError: a start missed the deadline, or its process ended.
     """
     with tempfile.TemporaryDirectory() as folder:
         caches = {"XDG_CACHE_HOME": folder, "JAX_COMPILATION_CACHE_DIR": f"{folder}/jax"}
@@ -47,13 +50,13 @@ def bench_startup(config: RunConfig, physics: PhysicsName, deadline: float) -> N
     console = Console()
     console.print(table)
     console.print(
-        "Stages overlap where threads do. Warp's kernels are in a cache of their own, which is used as it is; "
+        "Stages of different threads overlap. Warp's kernels are in a separate cache, which is used unchanged; "
         "'congrasp warmup' fills it."
     )
 
 
 def _start(config: RunConfig, physics: PhysicsName, caches: dict[str, str], deadline: float) -> dict[str, str]:
-    """The rows of one start, in a process of its own."""
+    """The rows of one start, in a separate process."""
     here, there = multiprocessing.Pipe()
     before = {name: os.environ.get(name) for name in caches}
     os.environ.update(caches)
@@ -64,18 +67,18 @@ def _start(config: RunConfig, physics: PhysicsName, caches: dict[str, str], dead
     try:
         there.close()
         if not here.poll(deadline):
-            raise CongraspError(f"There was no first update in {deadline:.0f} s.", "Name a longer --deadline.")
+            raise CongraspError(f"There was no first update in {deadline:.0f} s.", "Set a longer --deadline.")
         rows: dict[str, str] = json.loads(here.recv_bytes())
         process.join(_STOPPED_SECONDS)
     except EOFError:
-        raise CongraspError("The training ended before its first update.", "What it said is above.") from None
+        raise CongraspError("The training ended before its first update.", "See its output above.") from None
     finally:
         process.kill()
     return rows
 
 
 def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) -> None:
-    """Trains until the first update, and sends what the start consisted of."""
+    """Trains until the first update, and sends the stages of the start."""
     imported()
     seconds, programs = collections.defaultdict[str, float](float), collections.Counter[str]()
 

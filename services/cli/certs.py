@@ -65,7 +65,7 @@ def issue(
 
     Examples:
       congrasp certs issue certs --role actor
-      congrasp certs issue certs --role client --host 10.0.0.6
+      congrasp certs issue certs --role server --host 10.0.0.6
     """
     from congrasp.common.transport.security import CERTIFICATE_FILE
     from congrasp.services.ops.certificates import issue, read

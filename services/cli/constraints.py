@@ -42,7 +42,7 @@ def generate(
     Args:
       objects: Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7.
       count: Number of additional procedural objects.
-      families: Their families, in turn, or groups of them: basic (if none is named), household, all.
+      families: Their families, in turn, or groups of them: basic (if none is named), household, all, scans.
       first_seed: Seed of the first of them; the others follow.
       hand: Name of the hand, or its file.
       references: closed: poses that close the hand around the object; policy: final states of a policy's grasps under

@@ -32,28 +32,28 @@ def dataset(
     """Make a dataset of verified grasps: Parquet shards with a schema, and a card with counts and rates.
 
     Every episode is simulated to its end: held for two seconds without the table, lifted by 15 cm, pushed. A second run
-    of the same command makes the shards that are missing. The same policy, objects, seed, engine and batch give the
-    same shards.
+    of the same command makes the missing shards. The same policy, objects, seed, engine and batch give the same shards.
 
     Args:
       objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, names in --folder, or objects of the
         generator as FAMILY:FIRST-LAST (mug:0-99, all:0-9999).
       out: Folder of the dataset.
-      per_object: Episodes of each object, evenly over the constraints; what an object does not allow is left out.
-      constraints: Sets of constraints that are sampled, with + between those of a set, such as: heading
-        pose+trajectory. By default every one that the policy knows, and the paper's compositions.
-      keep: Which episodes are written: those with all of these outcomes (all keeps every one).
+      per_object: Episodes of each object, evenly over the constraints; those that an object does not allow are left
+        out.
+      constraints: Sampled sets of constraints, with + between those of a set, such as: heading pose+trajectory. By
+        default every constraint of the policy, and the paper's compositions.
+      keep: Outcomes that an episode needs to be written; all writes every episode.
       part: K/N makes every N-th shard from the K-th on. Different parts may run anywhere: copy their shards together,
         and run the command once more for the card.
-      shard: Objects of a shard, at most; 0 chooses by --per-object.
-      policy: A policy file; by default the hand's that comes with the package.
-      hand: Hand whose pretrained policy is taken.
+      shard: Largest number of objects in a shard; 0 chooses by --per-object.
+      policy: A policy file; by default the pretrained one of the hand.
+      hand: Hand of the pretrained policy.
       physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
-      batch: Worlds that run side by side; 0 chooses by the engine.
+      batch: Number of parallel worlds; 0 uses the engine's default.
       seed: Seed of constraints and episodes.
-      licence: Of the data, for the card (an SPDX name).
-      folder: Folder of objects, whose names can stand for files.
-      mesh: How meshes become objects.
+      licence: Licence of the data, for the card (an SPDX name).
+      folder: Folder of objects, which can be named in place of files.
+      mesh: Conversion of meshes to objects.
 
     Examples:
       congrasp dataset meshes/ --out grasps --per-object 100

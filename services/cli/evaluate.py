@@ -61,10 +61,10 @@ def evaluate(
         single constraints for all hands with a pretrained policy, or those of --policy; ablation: the full system and
         variants without one of its parts, if --policy has policies of them; objects: the heading alone on any number of
         objects, by size, mass and family; noise: poses and trajectories with errors like captured ones; sensing: the
-        heading alone with a tracker's object poses, by their noise, delay, rate and losses, by friction and by errors
-        of gains, a student and the pretrained policy; payload: the heading alone by the objects' mass, from 0.05 to 2
-        kg; peers: the heading alone at the masses and frictions of RobustDexGrasp and of Isaac Lab's dexsuite; all:
-        every table of one policy. Several may be named.
+        heading alone with a tracker's object poses, by their noise, delay, rate and losses, by friction, by errors of
+        gains and by late targets, a student and the pretrained policy; payload: the heading alone by the objects' mass,
+        from 0.05 to 2 kg; peers: the heading alone at the masses and frictions of RobustDexGrasp and of Isaac Lab's
+        dexsuite; all: every table of one policy. Several may be named.
       exam: Procedural objects of all families: figures has seeds from 2,000,000, to be used only for published figures;
         development has seeds from 1,000,000. Training uses neither.
       objects: Objects to grasp instead: a folder accepted or created by 'congrasp objects import'.
@@ -83,7 +83,7 @@ def evaluate(
       pictures: Also draw failures, with their causes, and successes of every constraint into this folder.
       hand: Hand of the pretrained policy.
       method: ours, pd (no learning: PD control along the guidance), graspxl, dgrasp, no-dynamic-center, no-feedforward,
-        two-phase, single-stage or student. A policy of another method is refused; by default that of the policy.
+        two-phase, single-stage, student or camera. A policy of another method is refused; default: that of the policy.
       by: object: also print the rates of each object; --json always has them.
       friction: Sliding friction between hand and object. The published code of the paper's predecessor (GraspXL)
         simulates 3.

@@ -59,36 +59,37 @@ def grasp(
     mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
     arm: Annotated[ArmOptions, tyro.conf.OmitArgPrefixes] = ArmOptions(),  # noqa: B008
 ) -> int:
-    """Make grasp motions for objects of your own.
+    """Make grasp motions for custom objects.
 
-    Every object gets a folder in --out: grasp.npz (arrays that say what they mean), grasp.mcap (Foxglove, Rerun),
-    grasp.png, portrait.png, object.png (before and after its import, beside a hand at true scale) and result.json.
+    Every object gets a folder in --out: grasp.npz (self-describing arrays), grasp.mcap (Foxglove, Rerun), grasp.png,
+    portrait.png, object.png (before and after its import, with a hand at true scale) and result.json.
 
-    Several attempts are simulated at once, and the best is kept: first one that holds the object for two seconds
-    without the table, then small errors, a quiet object and gentle forces. Interrupted runs resume where they stopped.
+    Several attempts are simulated in parallel, and the best is kept: first by a hold of two seconds without the table
+    (or after the lift), then by small errors, a still object and low forces. Repeat the command to resume an
+    interrupted one.
 
     Args:
       objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, FAMILY:SEED of the generator (mug:7), or
         names in --folder.
       out: Folder for the results.
-      constraint: What the grasp must keep to.
+      constraint: Constraints of the grasp.
       video: Also write grasp.mp4, in real time.
       size: Width and height of the video, pixels.
-      fps: Frames a second of the video.
-      overlays: Draw constraints and contacts into the video; grasp.png shows them in any case.
-      camera: Where pictures and video are seen from, in degrees around the table and above it: --camera "120 25"; by
-        default where fingers, contacts and object are seen best.
+      fps: Frames per second of the video.
+      overlays: Draw constraints and contacts into the video; grasp.png always shows them.
+      camera: Viewpoint of pictures and video, in degrees around the table and above it: --camera "120 25"; by default
+        the one that shows fingers, contacts and object best.
       pictures: Write pictures.
-      policy: A policy file, or 'allegro-student'; by default the hand's that comes with the package.
-      hand: Hand whose pretrained policy is taken; human:left takes its mirror image.
-      attempts: How many are simulated side by side, 1024 at most.
-      seed: Draws what is attempted.
+      policy: A policy file, or 'allegro-student'; by default the pretrained one of the hand.
+      hand: Hand of the pretrained policy; human:left takes its mirror image.
+      attempts: Number of attempts simulated in parallel, at most 1024.
+      seed: Seed of the attempts.
       approach: Seconds in which the hand first comes from beside the table; longer where an arm needs it (1 m/s).
-      lift: Metres by which the hand then lifts the object, which stands on the table until then; 0 removes the table.
-      rest: How the object lies on the table: upright, or a number from 1 on (congrasp objects rests shows them).
-      folder: Folder of objects, whose names can stand for files.
-      again: Also redo finished objects.
-      mesh: How meshes become objects.
+      lift: Metres by which the hand lifts the object off the table, which then stays; 0 removes the table.
+      rest: Resting pose on the table: upright, or a number from 1 on (congrasp objects rests shows them).
+      folder: Folder of objects, which can be named in place of files.
+      again: Repeat finished objects.
+      mesh: Conversion of meshes to objects.
       arm: The arm that carries the hand.
 
     Examples:
@@ -108,7 +109,7 @@ def grasp(
     from congrasp.services.viz.views import view_of
 
     if not objects:
-        raise CongraspError("There is nothing to grasp.", "Name mesh files or folders: congrasp grasp mug.obj")
+        raise CongraspError("There is nothing to grasp.", "Pass mesh files or folders: congrasp grasp mug.obj")
     at_least(1, attempts=attempts)
     at_most(_MOST_ATTEMPTS, "side by side", attempts=attempts)
     at_most(10.0, "seconds", approach=approach)
@@ -116,7 +117,7 @@ def grasp(
     at_least(1.0, fps=fps)
     at_most(120.0, "frames a second", fps=fps)
     if out.exists() and not out.is_dir():
-        raise CongraspError(f"--out is the file {out}.", "Name a folder; it is made if it is not there.")
+        raise CongraspError(f"--out is the file {out}.", "Pass a folder; it is created if it does not exist.")
     right, left = right_name(hand)
     if left and arm.arm:
         raise CongraspError("An arm carries right hands alone.", "Leave out --arm or :left.")
@@ -158,7 +159,7 @@ def grasp(
 
 
 def _show(result: "Result") -> None:
-    """Prints the outcome for one object, and what its user should know of it."""
+    """Prints the outcome for one object, and its notes."""
     if result.error:
         print(f"congrasp: error: {result.error}", file=sys.stderr)
         return
@@ -169,7 +170,7 @@ def _show(result: "Result") -> None:
 
 
 def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
-    """Prints where everything is; returns the exit code."""
+    """Prints a summary and the location of the results; returns the exit code."""
     from congrasp.services.grasp.jobs import SHEET
 
     held = sum(result.held for result in results)

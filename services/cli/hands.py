@@ -54,7 +54,7 @@ def sheet(
 
     Args:
       hands: Names of hands, or hand files.
-      out: The PNG file to write; several hands are drawn in a row.
+      out: The PNG file to write, with a row for each hand.
 
     Examples:
       congrasp hands sheet human

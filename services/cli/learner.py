@@ -63,7 +63,7 @@ def learner(
       coordinator: Host and port of rank 0; this port and the next must be free there.
       inside: Also run an actor in this process, so that its rollouts never leave the device.
       metric_writers: Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there,
-        for `wandb sync`), wandb (needs an account); none by default.
+        for `wandb sync`), wandb (needs an account); without a name, none.
       watch: Monitoring.
 
     Examples:

@@ -23,25 +23,25 @@ from congrasp.services.ops.shutdown import SIGNALS, follow_parent, on_signal
 
 COMMANDS = {
     "train": "train a policy: a learner and its actors on this machine",
-    "warmup": "compile what a training needs, ahead of it",
+    "warmup": "compile the programs of a training in advance",
     "learner": "the learner alone; actors connect to it, from this machine or others",
-    "actor": "one actor that works for a learner elsewhere",
+    "actor": "one actor for a learner on this or another machine",
     "serve": "answer live queries with a run's newest policy or a policy file",
-    "grasp": "a grasp motion for an object of your own, under constraints",
+    "grasp": "a grasp motion for a custom object, under constraints",
     "dataset": "verified grasps of many objects, in shards, with a card",
     "evaluate": "measure a policy by the paper's protocol",
     "reproduce": "the paper's tables: train what is missing, evaluate, compare",
-    "query": "ask a policy server for one action, or measure its latency",
+    "query": "query a policy server for one action, or measure its latency",
     "objects": "generate, import, list and show objects",
-    "hands": "list, draw and check hands; from the URDF of your own to its policy",
-    "constraints": "make the constraint sets of objects, and look at them",
+    "hands": "list, draw, check and import hands; from a URDF to its policy",
+    "constraints": "make and show the constraint sets of objects",
     "record": "record a run to MCAP, from this machine or another",
     "plot": "draw a run's learning curves and reward terms",
     "report": "one HTML file about a policy: results, pictures, curves, model card",
     "export": "a policy as ONNX or StableHLO, a motion as GLB, USD, BVH, ROS 2 or LeRobot",
     "render": "draw the hand, or an episode of a run",
-    "view": "the constraint studio and a window on a training, in the browser",
-    "status": "who works on a run, and how it goes",
+    "view": "the constraint studio and the state of a training, in the browser",
+    "status": "processes, state and counters of a live run",
     "audit": "the outcome of every rollout of a run",
     "bench": "benchmarks, as ratios against a reference",
     "certs": "certificates for mutual TLS between the processes of a run",
@@ -50,12 +50,12 @@ COMMANDS = {
 """Commands in the order of the help; `services.cli.<name>` is the module."""
 
 _READ = {".obj", ".stl", ".ply", ".glb", ".npz", ".csv", ".bvh", ".mcap", ".safetensors", ".urdf", ".xml"}
-"""Endings of files that commands read."""
+"""Suffixes of files that commands read."""
 _WRITTEN = ("--out", "--json", "--png", "--video", "--pictures", "--references")
-"""Options that name what a command writes, or creates if it is absent."""
+"""Options for files and folders that a command writes, or creates if they are absent."""
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
-"""Raised when the reader of the output is gone, as with `congrasp … | head`."""
+"""Exit code if the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PATH = (
@@ -151,7 +151,7 @@ def _late_threads() -> bool:
 
 
 def _check_files(arguments: Sequence[str]) -> None:
-    """Raises a CongraspError for a file to read that is not there, before anything that takes long is imported."""
+    """Raises a CongraspError for a missing input file, before the slow imports."""
     option = ""
     for argument in arguments:
         if argument.startswith("-"):
@@ -168,7 +168,7 @@ def _check_files(arguments: Sequence[str]) -> None:
 
 
 def _is_there(path: pathlib.Path) -> bool:
-    """Returns whether a path exists; an OSError for one that cannot be used."""
+    """Returns True if a path exists; raises an OSError for one that cannot be used."""
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError):

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-_FRAMED = 10  # steps from one that the camera of a robot must hold to the next
+_FRAMED = 10  # control steps between the frames that the camera of a robot must contain
 
 
 def hand(hand: str = "human", out: pathlib.Path = pathlib.Path("hand.png")) -> int:

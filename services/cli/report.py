@@ -41,7 +41,7 @@ def report(
       seed: Seed of constraints and episodes.
       hand: Hand of the pretrained policy.
       json: Also write the rows to this file.
-      check: A file of 'congrasp hands check --json', with its picture, to include in the report.
+      check: A file of 'congrasp hands check --json' to include in the report, with its --png of the same name.
 
     Examples:
       congrasp report runs/mine --episodes 16

@@ -1,4 +1,4 @@
-"""`congrasp reproduce`: from nothing to the paper's tables."""
+"""`congrasp reproduce`: the paper's tables, from training to comparison."""
 
 import pathlib
 import shlex
@@ -16,7 +16,7 @@ _OUT = "reproduction"
 _QUICK, _FULL = (48, 24), (1000, 64)
 """Episodes of a row, and procedural objects."""
 _MANY = {True: 2, False: 50}
-"""Episodes of the table of many objects for each episode of a row: quick, and in full."""
+"""Episodes of the table of many objects per episode of a row, by --quick."""
 
 
 def reproduce(
@@ -44,19 +44,19 @@ def reproduce(
     Args:
       out: Folder for reproduction.html, reproduction.json and tables.tex, and for runs, rows and pictures.
       quick: Take the pretrained policies, train nothing, and evaluate 48 episodes a row: minutes on two CPU cores.
-      hands: Whose full system is evaluated, the first one's under everything else too; by default all with a pretrained
+      hands: Hands whose full system is evaluated; the other tables use the first one. By default all with a pretrained
         policy.
-      methods: Which methods stand beside it: pd, graspxl, dgrasp, no-dynamic-center, no-feedforward, two-phase,
+      methods: Methods to compare with it: pd, graspxl, dgrasp, no-dynamic-center, no-feedforward, two-phase,
         single-stage; by default all.
-      policy: Policies that need no training, as 'congrasp evaluate' takes them.
+      policy: Policies that need no training, in the form of 'congrasp evaluate --policy'.
       captured: Folders of captured data sets, each with the folders 'objects' and 'constraints' that 'congrasp
-        constraints import' makes; most of the paper's tables are of such.
+        constraints import' makes; most of the paper's tables need them.
       episodes: Episodes of a row; 0 takes 1,000, with --quick 48.
       pool: Procedural objects of a row; 0 takes 64, with --quick 24.
       physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
       seed: Seed of constraints and episodes.
       training: Further options of every 'congrasp train', as one text.
-      patience: Minutes after which a training is ended, to be resumed by the next 'congrasp reproduce'.
+      patience: Minutes after which a training is stopped, to be resumed by the next 'congrasp reproduce'.
 
     Examples:
       congrasp reproduce --quick
@@ -73,7 +73,7 @@ def reproduce(
     at_least(0, episodes=episodes, pool=pool)
     at_least(1, patience=patience)
     if out.exists() and not out.is_dir():
-        raise CongraspError(f"--out is the file {out}.", "Name a folder.")
+        raise CongraspError(f"--out is the file {out}.", "Pass a folder.")
     options: dict[str, Any] = {"quick": quick, "hands": hands, "methods": methods, "policy": policy}
     options |= {"captured": captured, "episodes": episodes, "pool": pool, "seed": seed, "training": training}
     options |= {"physics": "" if physics == "auto" else physics, "out": "" if str(out) == _OUT else out}
@@ -98,12 +98,12 @@ def reproduce(
         numbers = Numbers(episodes, pool, _MANY[quick] * episodes, physics, seed, NOMINAL_FRICTION)
         account = reproduce(request, numbers, track, lambda text: print(text, flush=True))
     print(summary(account.cells))
-    print(f"The page is {out / PAGE}; beside it are {JSON} and {LATEX}.")
+    print(f"The page is {out / PAGE}, next to {JSON} and {LATEX}.")
     return 1 if account.failures else 0
 
 
 def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
-    """Raises a CongraspError for a hand or a method that is not there."""
+    """Raises a CongraspError for an unknown hand or method."""
     from congrasp.common.hands import get_hand
     from congrasp.services.reproduce.plan import BASELINES
 
@@ -115,7 +115,7 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
 
 
 def _given(texts: tuple[str, ...], needed: "list[RequiredPolicy]") -> "dict[RequiredPolicy, Entrant]":
-    """Policies by what they are; a CongraspError for one that nothing needs."""
+    """Policies by hand and method; raises a CongraspError for one that no table needs."""
     from congrasp.services.evaluate.lineup import read_entrants
     from congrasp.services.reproduce.plan import RequiredPolicy
 
@@ -130,7 +130,7 @@ def _given(texts: tuple[str, ...], needed: "list[RequiredPolicy]") -> "dict[Requ
 
 
 def _check_device(wanted: list[str]) -> None:
-    """Raises a CongraspError if something has to be trained where there is no GPU."""
+    """Raises a CongraspError if policies must be trained and there is no GPU."""
     from congrasp.services.train.processes import accelerators
 
     if wanted and accelerators()[0] == "cpu":
@@ -141,7 +141,7 @@ def _check_device(wanted: list[str]) -> None:
 
 
 def _command(options: dict[str, Any]) -> str:
-    """The command line, with what is not empty."""
+    """The command line, with the options that are set."""
     words = ["congrasp", "reproduce"]
     for name, value in options.items():
         if value:

@@ -20,14 +20,14 @@ def serve(
     """Answer live queries with a policy file, or with the newest policy of a run while it trains.
 
     Args:
-      policy: A policy file, read again whenever it changes, or 'allegro-student', which needs no more than a robot has;
-        by default the policy that comes with congrasp.
-      hand: Hand of the policy that comes with congrasp.
+      policy: A policy file, reread whenever it changes, or 'allegro-student', whose inputs a robot can measure; by
+        default the pretrained policy of the hand.
+      hand: Hand of the pretrained policy.
       connect: A learner's endpoint to follow instead of a file.
       run: Name of the run to follow.
       listen: Endpoint for the clients.
       name: Name under which the policy is served.
-      watch: How it is watched.
+      watch: Monitoring.
       certs: Folder of a server's certificate (congrasp certs), for its clients and for the learner.
       insecure: Listen beyond loopback without certificates.
 

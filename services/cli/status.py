@@ -21,14 +21,14 @@ def status(
 ) -> int:
     """Show the processes and the state of a run: versions, lag, rates, and the outcomes of tickets and rollouts.
 
-    The exit code is 1 where the counters do not add up.
+    The exit code is 1 if counters are inconsistent.
 
     Args:
       run_dir: Folder of a run whose learner runs on this machine, in place of --connect and --run.
       connect: The learner's endpoint.
       run: Name of the run.
       watch: Continue until Ctrl-C, also while the learner is disconnected.
-      every: Seconds between two looks with --watch.
+      every: Seconds between two queries with --watch.
       certs: Folder of an observer's certificate (congrasp certs).
       json: Print JSON instead of tables; with --watch one object a line, and null while the learner is disconnected.
 
@@ -53,7 +53,9 @@ def status(
             )
         connect, run = learner_url(run_dir), open_run(run_dir).name
         if not connect:
-            raise CongraspError(f"No learner is running in {run_dir}.", f"What it recorded: congrasp plot {run_dir}")
+            raise CongraspError(
+                f"No learner is running in {run_dir}.", f"Draw its recordings with 'congrasp plot {run_dir}'."
+            )
     with urls.connect(connect, "observer", certs=certs, run=run) as transport:
         found = ask(transport, run)
         if not watch:

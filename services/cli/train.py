@@ -38,7 +38,7 @@ def train(
     metric_writers: tuple[MetricWriter, ...] = ("tensorboard",),
     metrics_port: int = 0,
 ) -> int:
-    """Trains a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
+    """Train a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
 
     Starts from a preset; every field of the run can be set on the command line. `--preset full --hand HAND` is the full
     task for any hand, by the recipe for all of them; human, allegro and sharpa are presets that mean the same.
@@ -46,33 +46,32 @@ def train(
     Args:
       config: The run.
       preset: Named configuration to start from: quickstart, full, human, allegro or sharpa.
-      method: What of it is trained: ours, a baseline or ablation of the paper (graspxl, dgrasp, no-dynamic-center,
-        no-feedforward, two-phase, single-stage), or what a robot can use (student, with a tracker; camera, with a
-        depth camera), whose settings then hold. By default the preset's, ours.
+      method: Method whose settings are used: ours, a baseline or ablation of the paper (graspxl, dgrasp,
+        no-dynamic-center, no-feedforward, two-phase, single-stage), or a policy for robots (student, with a tracker;
+        camera, with a depth camera). By default that of the preset, ours.
       hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by default the
         preset's.
-      run_dir: Where the run is kept; runs/NAME-DATE by default.
-      actors: Actor processes. By default two; on a GPU none: a single actor then lives in the learner's process, and
+      run_dir: Folder of the run; runs/NAME-DATE by default.
+      actors: Actor processes. By default two; on a GPU none: a single actor then runs in the learner's process, and
         rollouts never leave the device.
-      ranks: Learners that train together, data parallel; each has a GPU of its own where there are GPUs, and --actors
-        actors. The batch grows with them.
+      ranks: Learners that train together, data parallel; each has --actors actors, and a separate GPU if there are
+        GPUs. The batch grows with them.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
       teacher: A policy file, or the hand of a pretrained policy, to distil into a policy for robots, which sees the
         joints, the wrist and a tracker's object poses, no forces and no velocities (docs/students.md), or with
         `--method camera` a partial point cloud (docs/camera.md). The task is the teacher's, the algorithm `distill`.
       constraints: Folder of constraint sets to learn from, such as captured ones ('congrasp constraints import'); their
-        objects are those of --objects.folder, and --objects.procedural puts others beside them.
-      split: Of these sets the part for training (the default), what is held out, or all.
-      resume: Resume from the newest intact checkpoint in --run-dir, with the run's own configuration; what the learner
-        alone uses, such as --updates and --ppo.…, may be changed.
-      listen: Endpoint where actors of other machines may join, such as tls/0.0.0.0:7447; on this machine alone by
-        default.
+        objects are those of --objects.folder, and --objects.procedural adds others.
+      split: Split of these sets: training (the default), held out, or all.
+      resume: Resume from the newest intact checkpoint in --run-dir, with the configuration of the run; options that
+        only the learner uses, such as --updates and --ppo.…, may be changed.
+      listen: Endpoint for actors of other machines, such as tls/0.0.0.0:7447; by default only this machine can join.
       certs: The authority's folder (congrasp certs), for mutual TLS.
       insecure: Listen beyond loopback without certificates.
       evaluation: Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out. By
         default 64, and before training for the quickstart preset alone.
-      metric_writers: Where the learner's metrics are written, too: tensorboard (files in the run's folder),
-        wandb-offline (files there, for `wandb sync`), wandb (needs an account); with no name none.
+      metric_writers: Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there,
+        for `wandb sync`), wandb (needs an account); without a name, none.
       metrics_port: Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none.
 
     Examples:
@@ -107,7 +106,7 @@ def train(
 def defaults(arguments: list[str]) -> dict[str, Any]:
     """Defaults that depend on a command line: the preset, and its configuration for the given hand and teacher.
 
-    With --resume the configuration is the run's own; a preset for another hand is refused.
+    With --resume the configuration is that of the run, and a preset for another hand is rejected.
     """
     named, hand = _value("--preset", arguments), _value("--hand", arguments) or None
     preset, run_dir = named or "quickstart", _value("--run-dir", arguments)
@@ -127,7 +126,7 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
 
 
 def _value(option: str, arguments: list[str]) -> str:
-    """The value of an option on a command line, or nothing."""
+    """The value of an option on a command line; empty if it is absent."""
     for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
         if word.partition("=")[0] == option:
             return word.partition("=")[2] or following

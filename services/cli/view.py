@@ -1,4 +1,4 @@
-"""`congrasp view`: the constraint studio, and the window on a training, in a browser."""
+"""`congrasp view`: the constraint studio, and the training window, in a browser."""
 
 import pathlib
 from typing import Annotated
@@ -20,23 +20,25 @@ def view(
     insecure: bool = False,
     certs: pathlib.Path | None = None,
 ) -> int:
-    """Request a grasp in the browser and watch it: set the heading, paint the avoid region, draw the wrist's path.
+    """Request a grasp in the browser and play it: set the heading, paint the avoid region, draw the wrist's path.
 
-    With a run's folder, or with --connect, it takes the newest weights of a run that is being trained and shows the
-    run: its curves, its actors and their episodes. With --recordings a click on a curve finds the episodes of that
-    time; a folder brings those, too.
+    With a run's folder, or with --connect, it uses the newest weights of a run in training and shows the run: its
+    curves, its actors and their episodes. With a run's folder, or with --recordings, a click on a curve finds the
+    episodes of that time.
 
     Args:
-      run_dir: Folder of a run of this machine, live or over, in place of --connect, --run, --recordings and --policy.
-      objects: Your own objects: a mesh, a folder of meshes, or what 'congrasp objects import' made.
-      policy: A policy file, read again when it changes; by default the pretrained ones.
-      connect: A learner's endpoint, such as tcp/10.0.0.5:7447, to attach to.
-      run: Name of the run that is attached to.
-      recordings: Folder of a run's recordings (*.mcap), of a live run or of one that is over.
+      run_dir: Folder of a run on this machine, live or finished, in place of --connect, --run, --recordings and
+        --policy.
+      objects: Custom objects: a mesh, a folder of meshes, or a folder of 'congrasp objects import'.
+      policy: A policy file, reread whenever it changes; by default the pretrained ones.
+      connect: Endpoint of a learner to follow, such as tcp/10.0.0.5:7447.
+      run: Name of the run to follow.
+      recordings: Folder of the recordings (*.mcap) of a live or finished run.
       host: Interface of the page. There is no password: every client that reaches it can use it.
       port: Port of the page; 0 takes a free one.
       insecure: Offer the page beyond loopback.
-      certs: Folder of an observer's certificate (congrasp certs), for --connect.
+      certs: Folder of certificates (congrasp certs), for --connect: an observer's, and a server's to grasp with the
+        weights of the run.
 
     Examples:
       congrasp view runs/mine
@@ -92,7 +94,7 @@ def _of_folder(run_dir: pathlib.Path, certs: pathlib.Path | None) -> tuple[str, 
             urls.connect(connect, "observer", certs=certs).close()
             return connect, run, None, run_dir
     except TransportError:
-        print(f"No response from the learner of {run_dir}: what it left is shown.")
+        print(f"No response from the learner of {run_dir}: the page shows its files.")
     policy = run_dir / POLICY_FILE
     return "", run, policy if policy.is_file() else None, run_dir
 

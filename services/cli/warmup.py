@@ -13,13 +13,13 @@ def warmup(
     environments: int = 0,
     rollout_steps: int = 0,
 ) -> int:
-    """Compiles what `congrasp train` needs on this machine, and keeps it: kernels, programs, the constraint bank.
+    """Compile the programs of `congrasp train` on this machine in advance: kernels, programs, the constraint bank.
 
-    Makes the first update of such a training and throws it away. What it leaves are the caches in
-    JAX_COMPILATION_CACHE_DIR (compiled programs; by default congrasp/jax in the user's cache folder), WARP_CACHE_PATH
-    (GPU kernels; warp there) and congrasp/banks in the user's cache folder (XDG_CACHE_HOME). They may be made where a
+    Makes the first update of such a training and discards it. It fills the caches in JAX_COMPILATION_CACHE_DIR
+    (compiled programs; by default congrasp/jax in the user's cache folder), WARP_CACHE_PATH (GPU kernels; by default
+    warp in that folder) and congrasp/banks in the user's cache folder (XDG_CACHE_HOME). They can be filled while a
     container image is built, and copied to machines with the same kind of GPU and the same versions. Other numbers of
-    environments or steps are other programs. On several GPUs, run it before `congrasp train --ranks`: otherwise each
+    environments or steps need other programs. On several GPUs, run it before `congrasp train --ranks`: otherwise each
     rank compiles.
 
     Args:

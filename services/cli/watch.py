@@ -1,4 +1,4 @@
-"""Options of every role by which others watch it: the form of its log, and its metrics."""
+"""Monitoring options of every role: the format of its log, and its metrics."""
 
 import contextlib
 import dataclasses
@@ -23,7 +23,7 @@ class Watch:
 
     @contextlib.contextmanager
     def watched(self, role: str, id: str, run: str, collector: Any = None) -> Iterator[None]:
-        """Logs and, if a port is named, offers the collector's metrics while the block runs."""
+        """Logs and, if a port is set, serves the collector's metrics while the block runs."""
         with contextlib.ExitStack() as stack:
             stack.enter_context(logging_as(self.log_format, role=role, id=id, run=run))
             if self.metrics_port and collector is not None:

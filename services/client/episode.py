@@ -1,4 +1,4 @@
-"""A policy's memory of one episode, and the queries that it makes of it; needs nothing but numpy."""
+"""A policy's memory of one episode, and its queries; needs only NumPy."""
 
 import math
 import time
@@ -18,8 +18,9 @@ _WITH_CAMERA = ("cloud", "q", "wrist")
 _MEASURED = ("q", "u", "object_position", "object_quaternion")
 _FIRST = ("object_position_initial", "object_quaternion_initial")
 _READ = (*_MEASURED, "q_target", "u_target")
-_POINTS = ("surface_points", "cloud", "surface_avoid")
-_LONGEST = 64  # control steps that a policy may look back
+_POINTS = ("surface_points", "cloud", "surface_avoid", "surface_normals")
+_NORMALS = ("surface_normals", "camera_position")
+_LONGEST = 64  # largest history of a policy, control steps
 
 
 class EpisodePolicy(Policy):
@@ -30,8 +31,8 @@ class EpisodePolicy(Policy):
         self._constraints: list[str] = []
         self._time = 0
         self._packer: _Packer | None = None
-        self._rested = np.asarray(1)  # readings in the mean of the object's pose; 0 once it has moved
-        self._past: list[Mapping[str, np.ndarray]] = []  # readings of the control steps before this one, newest first
+        self._rested = np.asarray(1)  # number of readings in the mean of the object's pose; 0 once it has moved
+        self._past: list[Mapping[str, np.ndarray]] = []  # readings of earlier control steps, newest first
 
     def _query(self, query: Message) -> Message:
         """The reply to a query.
@@ -80,7 +81,7 @@ class EpisodePolicy(Policy):
         mean = np.concatenate([episode[name] for name in _FIRST])
         reading = np.concatenate([_numbers(name, state[name]) for name in _MEASURED[2:]], axis=None)
         if reading.shape != mean.shape or not np.isfinite(reading).all():
-            return {}, self._rested  # the query is refused
+            return {}, self._rested  # the policy rejects the query
         table = np.all(state.get("table", True))
         mean, rested = resting_mean(np, mean, self._rested, reading, table, settle)
         return dict(zip(_FIRST, np.split(mean.astype(np.float32), [3]), strict=True)), rested
@@ -94,12 +95,13 @@ class EpisodePolicy(Policy):
     def _ask(self, episode: Mapping[str, np.ndarray], states: Sequence[State]) -> list[Answer]:
         """Returns the answers to one query, which is repeated if the layout of packed ones has changed."""
         began = time.perf_counter()
+        states = [_with_own_normals(state, episode) for state in states]
         try:
             reply, parts = self._exchange(episode, states)
         except LayoutError:
             if self._packer is None:
                 raise
-            self._packer = None  # another server has taken the place of the one that this layout was of
+            self._packer = None  # another server has replaced the one with this layout
             reply, parts = self._exchange(episode, states)
         version, server_ms = int(reply.meta["version"]), float(reply.meta["total_ms"])
         spent = 1e3 * (time.perf_counter() - began)
@@ -133,9 +135,9 @@ class _Packer:
     """Queries as vectors, most of which stays the same for an episode.
 
     Attributes:
-      most: states that the policy takes in one query.
-      settle: m, see `SensingConfig`; 0 where the object's first pose is that of the request.
-      looks_back: whether it sees control steps before the present one.
+      most: largest number of states in one query.
+      settle: m, see `SensingConfig`; 0 if the object's first pose is that of the request.
+      looks_back: True if the policy observes earlier control steps.
     """
 
     def __init__(self, layout: Mapping[str, Any], episode: Mapping[str, np.ndarray], fingers: int):
@@ -151,7 +153,10 @@ class _Packer:
     def pack(self, states: Sequence[State], past: Sequence[State], meta: Mapping[str, Any]) -> Message:
         """The episode's query in each of several states, after the control steps of `past`, newest first.
 
-        Where a policy looks back beyond the episode's begin, all was as at the begin.
+        The oldest step is repeated where the history reaches back beyond the start of the episode.
+
+        Raises:
+          RefusedError: a state lacks a measured field.
         """
         vectors = np.tile(self._episode, (len(states), 1))
         for vector, state in zip(vectors, states, strict=True):
@@ -165,11 +170,13 @@ class _Packer:
         return Message({"packed": vectors}, {**meta, "layout": self._digest})
 
     def unpack(self, reply: Message) -> list[np.ndarray]:
-        """Action, finger targets and wrist targets, of each state."""
+        """Actions, finger targets and wrist targets, with a row for each state."""
         return np.split(reply.arrays["packed"], [-self._fingers - 6, -6], 1)
 
     def _write(self, vector: np.ndarray, name: str, value: np.ndarray) -> None:
-        """Puts a field's numbers into their place in a vector."""
+        """Writes a field's numbers to their place in a vector."""
+        if name not in self._fields and name in _NORMALS:  # the policy does not observe normals
+            return
         if name not in self._fields:
             raise RefusedError(f"The query has an unknown field '{name}'.", f"Known: {', '.join(self._fields)}.")
         offset, *shape = self._fields[name]
@@ -181,11 +188,11 @@ class _Packer:
 
 
 def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
-    """The fields of a query that stay the same for an episode, and the first targets."""
+    """The constant fields of an episode's queries, and the first targets."""
     required = _REQUIRED if request.cloud is None else _WITH_CAMERA
     lacking = [f"'{name}'" for name in required if getattr(request, name) is None]
     if lacking or request.wrist is None:
-        raise RefusedError(f"The request lacks {' and '.join(lacking)}.", "A control loop begins from where all is.")
+        raise RefusedError(f"The request lacks {' and '.join(lacking)}.", "A control loop starts from measured poses.")
     if request.above:
         raise RefusedError("The request is for a hand from above.", "Give the heading's direction to a control loop.")
     given: dict[str, Any] = {
@@ -197,13 +204,23 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
         **({} if request.object_pose is None else dict(zip(_FIRST, request.object_pose, strict=True))),
         **{name: x for name, x in (("cloud", request.cloud), ("surface_points", request.surface)) if x is not None},
         **({} if request.avoid is None else {"surface_avoid": request.avoid}),
+        **({} if request.normals is None else {"surface_normals": request.normals}),
+        **({} if request.camera is None else {"camera_position": request.camera}),
         **{f"{name}_{field}": value for name, own in request.constraints.items() for field, value in own.items()},
     }
     return {name: _numbers(name, value) for name, value in given.items()}
 
 
+def _with_own_normals(state: State, episode: Mapping[str, np.ndarray]) -> State:
+    """Returns a state whose new points do not get the normals of the episode's first ones: zeros are estimated."""
+    new = [state[name] for name in ("cloud", "surface_points") if name in state]
+    if not new or "surface_normals" in state or "surface_normals" not in episode:
+        return state
+    return {**state, "surface_normals": np.zeros(np.shape(new[0]), np.float32)}
+
+
 def _numbers(name: str, value: Any) -> np.ndarray:
-    """A field's value as bool where it is that, else as float32."""
+    """A field's value, unchanged if it is bool, else as float32."""
     try:
         array = np.asarray(value)
         return array if array.dtype == bool else array.astype(np.float32)

@@ -1,4 +1,4 @@
-"""The plane that a hand's palm stays above; needs nothing but numpy."""
+"""A plane below the palm of a hand; needs only NumPy."""
 
 import math
 
@@ -10,10 +10,10 @@ from congrasp.services.client.limits import as_numbers
 
 
 class Floor:
-    """A plane that the palm stays above, in the joints of a wrist."""
+    """Clearance of the palm above a plane, as a function of the wrist joints."""
 
     def __init__(self, plane: np.ndarray, wrist: Pose, palm: np.ndarray):
-        """For an episode.
+        """Takes the poses of an episode.
 
         Args:
           plane: (4,) a, b, c, d, world frame: points with a x + b y + c z >= d are above; (a, b, c) of length 1.
@@ -27,7 +27,7 @@ class Floor:
         if not abs(np.linalg.norm(plane[:3]) - 1.0) < 1e-3 or not abs(np.linalg.norm(quaternion) - 1.0) < 0.02:
             raise CongraspError("The table's normal and the wrist's quaternion must have the length 1.")
         self.normal = _matrix(quaternion).T @ plane[:3]
-        """(3,) frame of the base."""
+        """(3,) normal of the plane in the frame of the base."""
         self._offset, self._palm = plane[3] - plane[:3] @ position, palm
         if not math.isfinite(self._offset):
             raise CongraspError("The table's height and the wrist's position must be finite.")

@@ -1,6 +1,6 @@
-"""Guard between a policy and a robot: a command every tick, whatever the policy does.
+"""Guard between a policy and a robot: a command every tick, even if the policy fails.
 
-The policy is asked in a thread of its own, so that no network holds the control loop up. Needs nothing but numpy.
+A separate thread queries the policy, so that the network does not block the control loop. Needs only NumPy.
 """
 
 import dataclasses
@@ -20,8 +20,8 @@ from congrasp.services.client.policy import Answer, Policy, State
 
 Fallback = Literal["freeze", "open"]
 Mode = Literal["follow", "hold", "freeze", "open"]
-_END = 2.0  # seconds that the asking thread has to end
-_LIFTED = 0.02  # m above its first height from which on an object counts as held
+_END = 2.0  # deadline for the end of the querying thread, s
+_LIFTED = 0.02  # m above its first height at which an object counts as held
 _OBJECT = {"object_position": 3, "object_quaternion": 4}  # measurements by a tracker and their sizes
 
 
@@ -32,33 +32,33 @@ class Counters:
     steps: int = 0
     """Commands."""
     follow: int = 0
-    """Commands that followed an answer that was fresh."""
+    """Commands that followed a fresh answer."""
     hold: int = 0
-    """Commands that held the last target, for want of one."""
+    """Commands that held the last target without a fresh answer."""
     fallback: int = 0
     """Commands of the fallback."""
     answers: int = 0
-    """Answers that were taken."""
+    """Accepted answers."""
     late: int = 0
-    """Steps in which no answer came, neither of this one's state nor of an earlier one's."""
+    """Steps without an answer, to their own state or an earlier one."""
     stale: int = 0
-    """Answers that were thrown away because their state was too old."""
+    """Answers discarded because their state was too old."""
     invalid: int = 0
-    """Answers that were thrown away because they were not finite or misshapen."""
+    """Answers discarded because they were not finite, or had a wrong shape."""
     lost: int = 0
     """Queries without an answer."""
     refused: int = 0
-    """Queries that the policy refused."""
+    """Queries that the policy rejected."""
     not_finite: int = 0
-    """Commands with a measurement or target that was not finite or misshapen."""
+    """Commands with a measurement or target that was not finite, or had a wrong shape."""
     torque: int = 0
-    """Commands that the limits of torque drew back."""
+    """Commands changed by the torque limits."""
     acceleration: int = 0
-    """Commands that the limits of acceleration held back."""
+    """Commands changed by the acceleration limits."""
     speed: int = 0
-    """Commands that the limits of speed held back."""
+    """Commands changed by the speed limits."""
     position: int = 0
-    """Commands that the limits of position held back."""
+    """Commands changed by the position limits."""
     table: int = 0
     """Commands that kept the palm above the table."""
 
@@ -71,22 +71,22 @@ class Command(NamedTuple):
     u_target: np.ndarray
     """(6,) wrist targets relative to the base: x, y, z in m, intrinsic x-y-z angles in rad."""
     q_torque: np.ndarray
-    """(F,) the same as torques, for a torque-controlled robot, N.m."""
+    """(F,) finger joint torques that correspond to the targets, for a torque-controlled robot, N.m."""
     u_torque: np.ndarray
-    """(6,) N and N.m, likewise."""
+    """(6,) wrist forces and torques, likewise, N and N.m."""
     mode: Mode
-    """`follow`: the policy's; `hold`: the last targets, until the policy answers again; `freeze` and `open`: the
-    fallback, until `reset`."""
+    """`follow`: targets of the policy; `hold`: the last targets, until the policy answers again; `freeze` and `open`:
+    the fallback, until `reset`."""
     answer: Answer | None
-    """The answer that it follows."""
+    """The answer that it follows; None in the other modes."""
 
 
 class Guard:
     """A policy whose answers reach a robot only within limits and while they are fresh.
 
-    An answer is fresh when the state that it was asked with is at most `stale` old. While there is none, the last
-    targets are held; after `hold` seconds without one, the fallback is taken and kept until the next `reset`: `freeze`
-    keeps the targets and their torques, `open` opens the fingers as fast as the limits allow and keeps the wrist.
+    An answer is fresh if the state of its query is at most `stale` seconds old. While there is none, the last targets
+    are held; after `hold` seconds without one, the fallback applies until the next `reset`: `freeze` keeps the targets
+    and their torques, `open` opens the fingers as fast as the limits allow and keeps the wrist.
     `open` becomes `freeze` if the object may be held or a measurement is missing; `open()` opens in any case. The
     policy continues from the commanded targets, not from those that it requested.
 
@@ -94,7 +94,7 @@ class Guard:
     `reset`; a policy with a camera has no height, so that only `table` counts.
 
     Attributes:
-      counters: what has happened.
+      counters: counters of commands and answers.
       trouble: cause of the last query without an answer; empty while there are answers, also during a fallback.
     """
 
@@ -112,23 +112,24 @@ class Guard:
         table: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 0.0),
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Starts the thread that asks the policy; nothing else may ask it from now on.
+        """Starts the thread that queries the policy, which then belongs to the guard alone.
 
         Args:
           policy: the policy.
-          limits: of the F finger joints, each of which has a motor, then the six wrist joints; by default those of the
-            policy's `metadata`.
-          open_pose: (F,) rad: what `open` opens to; likewise.
+          limits: limits of the F finger joints, each of which has a motor, then the six wrist joints; by default those
+            of the policy's `metadata`.
+          open_pose: (F,) rad, finger angles of `open`; by default those of the metadata.
           period: seconds between two steps.
-          wait: seconds of it that a step waits for its answer; the answer may also come in one of the next.
-          stale: seconds.
-          hold: seconds.
-          fallback: what follows.
+          wait: seconds that a step waits for its answer, which may also arrive in a later step.
+          stale: largest age of the state of a fresh answer, s.
+          hold: seconds without a fresh answer until the fallback.
+          fallback: `freeze` or `open`.
           table: a, b, c, d in the world frame: the palm stays where a x + b y + c z >= d; (a, b, c) of length 1.
-          clock: seconds, as `time.monotonic`.
+          clock: clock in seconds, such as `time.monotonic`.
 
         Raises:
-          CongraspError: the limits and the open pose do not belong together, or a time is not positive.
+          CongraspError: limits and open pose do not match, the times are not 0 <= wait < period and 0 < stale <= hold,
+            or there is no such fallback.
           TransportError: the policy's metadata is needed, and there is no response.
         """
         if limits is None or open_pose is None:
@@ -182,7 +183,7 @@ class Guard:
         self._asker.begin(request)
 
     def open(self) -> None:
-        """Opens the fingers from the next step on, until `reset`, whatever they hold."""
+        """Opens the fingers from the next step on, until `reset` or `freeze`, even if they hold an object."""
         self._latched = "open"
 
     def freeze(self) -> None:
@@ -190,11 +191,11 @@ class Guard:
         self._latched = "freeze"
 
     def step(self, state: State) -> Command:
-        """The next command; returns after `wait` seconds at most, and raises nothing for what is wrong with a state.
+        """The next command; returns after at most `wait` seconds, and accepts invalid states.
 
         Args:
-          state: see `Policy.act`; what it lacks counts as not measured. Joint velocities that it lacks are
-            estimated from successive positions, for the limits and for the policy.
+          state: see `Policy.act`; missing fields count as not measured. Missing joint velocities are estimated from
+            successive positions, for the limits and for the policy.
 
         Raises:
           RefusedError: there is no episode yet.
@@ -220,7 +221,7 @@ class Guard:
         return Command(q_target, u_target, q_torque, u_torque, mode, answer)
 
     def close(self) -> None:
-        """Ends the asking thread, and closes the policy."""
+        """Ends the querying thread, and closes the policy."""
         self._asker.close()
 
     def __enter__(self) -> Self:
@@ -230,7 +231,7 @@ class Guard:
         self.close()
 
     def _take(self, outcome: "_Outcome | None") -> None:
-        """Takes an answer over if it is fresh and finite, and counts it otherwise."""
+        """Accepts an answer if it is fresh and finite, and counts the outcome."""
         if outcome is None:
             self.counters.late += 1
             return
@@ -274,7 +275,7 @@ class Guard:
 def _described(
     policy: Policy, limits: JointLimits | None, open_pose: np.ndarray | None
 ) -> tuple[JointLimits, np.ndarray]:
-    """Limits and open pose, from the policy's metadata what is not given."""
+    """Limits and open pose, by default those of the policy's metadata."""
     described = policy.metadata()
     if limits is None and described["limits"] is None:
         raise CongraspError(
@@ -286,11 +287,11 @@ def _described(
 
 
 _Outcome = tuple[Answer | TransportError, float]
-"""An answer or why there is none, and when its state was taken."""
+"""An answer or its error, and the time of its state."""
 
 
 class _Asker:
-    """Asks a policy in a thread: one query at a time, and of an older episode nothing comes back."""
+    """Queries a policy in a thread: one query at a time, without outcomes of earlier episodes."""
 
     def __init__(self, policy: Policy):
         self._policy = policy
@@ -310,15 +311,15 @@ class _Asker:
             self._request, self._question, self._outcome = request, None, None
 
     def exchange(self, state: State, now: float, timeout: float) -> _Outcome | None:
-        """Asks with a state, unless a query is under way, and gives the newest outcome that is known in time.
+        """Queries with a state, unless a query is pending, and returns the newest outcome within the timeout.
 
         Args:
           state: the state.
-          now: when it was taken.
+          now: time of the state.
           timeout: seconds to wait.
 
         Returns:
-          An outcome that was not given before, of this state or of an earlier one.
+          An outcome that was not returned before, of this state or of an earlier one; None without one.
         """
         with self._changed:
             earlier, self._outcome = self._outcome, None
@@ -330,7 +331,7 @@ class _Asker:
             return outcome
 
     def close(self) -> None:
-        """Ends the thread, unless a query holds it up, and closes the policy."""
+        """Ends the thread, unless a query blocks it, and closes the policy."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -338,7 +339,7 @@ class _Asker:
         self._policy.close()
 
     def _work(self) -> None:
-        """Asks what there is to ask, until closed."""
+        """Answers queries until closed; runs in the thread."""
         begun = 0  # the last episode with an answer
         while True:
             with self._changed:
@@ -356,7 +357,7 @@ class _Asker:
                 self._changed.notify_all()
 
     def _answer(self, request: GraspRequest | None, state: State) -> Answer | TransportError:
-        """The policy's answer; whatever goes wrong with it is an error like any other."""
+        """The policy's answer, or a TransportError for any failure."""
         try:
             if request is not None:
                 self._policy.reset(request)

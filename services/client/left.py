@@ -1,4 +1,4 @@
-"""The policy of a right hand, for the left one; needs nothing but numpy."""
+"""The policy of a right hand, for the left one; needs only NumPy."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ class LeftPolicy(Policy):
     """A `Policy` for the left hand, whose states and targets are mirrored for a policy of the right one."""
 
     def __init__(self, right: Policy):
-        """Takes over the connection.
+        """Wraps a policy, and takes over its connection.
 
         Args:
           right: the policy, in this process or of a server.
@@ -55,6 +55,7 @@ def mirrored_request(request: GraspRequest) -> GraspRequest:
         request,
         constraints={name: mirror.fields(own) for name, own in request.constraints.items()},
         surface=None if request.surface is None else mirror.vector(request.surface),
+        normals=None if request.normals is None else mirror.vector(request.normals),
         wrist=request.wrist and _pose(request.wrist),
         object_pose=request.object_pose and _pose(request.object_pose),
     )

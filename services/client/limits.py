@@ -1,7 +1,6 @@
 """Limits of commands to a robot for any input; needs NumPy only.
 
-Every comparison is written so that what is not a number fails it: a target that is NaN, infinite or of the wrong shape
-holds the joint at its last target.
+NaN fails every comparison: a target that is NaN, infinite or of the wrong shape holds the joint at its last target.
 """
 
 import dataclasses
@@ -18,15 +17,15 @@ if TYPE_CHECKING:
     from congrasp.services.client.floor import Floor
 
 _EQUAL = 1e-12
-"""m or rad by which targets count as the same: norms are subject to rounding."""
+"""Tolerance of equal targets, m or rad: norms are subject to rounding."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class JointLimits:
     """Limits and servo gains of F finger joints, then the wrist's three slides and three hinges: J = F + 6.
 
-    SI units: N and m for slides, N.m and rad for hinges and fingers. Speed, acceleration and torque of the slides are
-    limited by the norm of the three, to the least of their numbers; likewise the hinges'.
+    SI units: N and m for slides, N.m and rad for hinges and fingers. For the slides, the norm of speed, acceleration
+    and torque is limited, to the least of the three limits; likewise for the hinges.
     """
 
     lower: np.ndarray
@@ -38,11 +37,11 @@ class JointLimits:
     torque: np.ndarray
     """(J,) greatest torque."""
     kp: np.ndarray
-    """(J,) of the servo: torque = kp (target - position) - kv velocity."""
+    """(J,) stiffness of the servo: torque = kp (target - position) - kv velocity."""
     kv: np.ndarray
-    """(J,)."""
+    """(J,) damping of the servo."""
     acceleration: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
-    """(J,) greatest acceleration of a target; 0: any, the default of all joints."""
+    """(J,) greatest acceleration of a target; 0, the default, for no limit."""
     palm: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((1, 4)))
     """(K, 4) m: centres in the wrist frame and radii of spheres that must stay above the table (`Guard`)."""
 
@@ -79,20 +78,21 @@ class JointLimits:
     ) -> Self:
         """Limits of the fingers' motors, then of the six wrist joints, with gains and torques of the hand's model.
 
-        The wrist's targets have the task's limits of acceleration (`ControlConfig`), and its force and torque are those
-        that give the hand's inertia as much. Most hands have a motor for each finger joint; see `common.hands.motors`
-        for others.
+        The wrist's targets have the task's acceleration limits (`ControlConfig`); its force and torque are limited to
+        those that accelerate the hand's inertia as much. Most hands have a motor for each finger joint; see
+        `common.hands.motors` for others.
 
         Args:
           hand: the hand (`common.hands.get_hand`).
-          control: the control that the policy learnt with; the default one if absent.
-          finger_speed: rad/s.
-          wrist_speed: m/s.
-          wrist_angular_speed: rad/s.
-          reach: m that the wrist may be from where it was at the episode's begin, along each axis.
-          turn: rad, likewise.
-          margin: rad that finger targets keep from the ends of their joints; narrow joints stay in their middle.
-          grip: N that a straight finger presses with at its tip; a bent one presses harder, as its lever is shorter.
+          control: the control of the policy's training; the default one if absent.
+          finger_speed: speed limit of the fingers, rad/s.
+          wrist_speed: speed limit of the wrist, m/s.
+          wrist_angular_speed: angular speed limit of the wrist, rad/s.
+          reach: largest displacement of the wrist since the start of the episode, along each axis, m.
+          turn: largest rotation, likewise, rad.
+          margin: distance of finger targets from the ends of their joints, rad; narrow joints stay in their middle.
+          grip: limit of the force of a straight finger at its tip, N; that of a bent one is larger, as its lever is
+            shorter.
         """
         from congrasp.common.hands.motors import motor_limits
         from congrasp.common.task.config import ControlConfig
@@ -140,8 +140,8 @@ class Limited(NamedTuple):
     target: np.ndarray
     """(J,) positions, within the limits of position and speed."""
     torque: np.ndarray
-    """(J,) what the servos give at that target, within the limits; where a measurement is not finite, at the position
-    that was measured last."""
+    """(J,) torques of the servos at that target, within the limits; at the last measured position if a measurement is
+    not finite."""
     by: tuple[str, ...]
     """Limits that were applied to a target: of `not_finite`, `torque`, `acceleration`, `speed`, `position`, `table`."""
 
@@ -153,8 +153,8 @@ class Speeds:
         """Starts without a measurement.
 
         Args:
-          most: (J,) largest speed that is believed, rad/s or m/s.
-          lasting: seconds after a change of the position for which its speed counts; measurements may arrive at a lower
+          most: (J,) largest plausible speed, rad/s or m/s.
+          lasting: seconds for which a speed counts after the change of the position; measurements may arrive at a lower
             rate than steps.
         """
         self._most, self._lasting = most, lasting
@@ -162,10 +162,10 @@ class Speeds:
         self._speed = np.zeros(len(most))
 
     def of(self, position: np.ndarray, now: float) -> np.ndarray:
-        """Speeds (J,) at a measurement: each joint's way since its last change over the time; zero before two.
+        """Speeds (J,) at a measurement: each joint's displacement since its last change over the time; zero at first.
 
         Args:
-          position: (J,) measured; the last three are angles of which only the rest by full turns matters.
+          position: (J,) measured; the last three are angles modulo full turns.
           now: s.
         """
         elapsed, way = now - self._when, position - self._position
@@ -183,23 +183,23 @@ class Speeds:
 class Limiter:
     """Targets within limits.
 
-    A target moves no faster than the limits allow, never leaves them, and is drawn back to where the servo's torque is
-    within its limit as far as that does not make it too fast. So a joint that something holds is not wound up, and
-    a measurement that jumps moves a target no faster than any other. Limits of acceleration give way to those of
-    position and to the table, where a target stops at once.
+    A target stays within the limits of position and speed. Within those of speed, it is moved to where the servo's
+    torque is within its limit, so that a blocked joint is not wound up, and a jump of a measurement moves no target
+    faster than usual. Limits of position and the table have priority over those of acceleration: a target stops there
+    at once.
 
     Attributes:
-      target: (J,) the last one.
+      target: (J,) the last target.
     """
 
     def __init__(self, limits: JointLimits, start: np.ndarray, *, period: float = 0.01, floor: "Floor | None" = None):
-        """Starts from a position that is brought within the limits.
+        """Starts from a position, clipped to the limits.
 
         Args:
           limits: the limits.
           start: (J,) current targets of the joints.
           period: seconds from one target to the next.
-          floor: plane below the palm; a palm that starts below it moves no deeper.
+          floor: plane below the palm; a palm that starts below it does not move deeper.
 
         Raises:
           CongraspError: the start is not a finite number for each joint, or the period not positive.
@@ -212,13 +212,13 @@ class Limiter:
         self._position, self._speed = self.target, np.zeros(len(first))
 
     def limit(self, target: Any, position: Any, velocity: Any, now: float) -> Limited:
-        """The target and torque that the limits allow.
+        """Returns target and torque within the limits.
 
         Args:
           target: (J,) requested targets.
           position: (J,) measured.
           velocity: (J,) measured.
-          now: s; a clock that goes back stops the targets until it has caught up.
+          now: s; if the clock is set back, the targets stop until it has caught up.
         """
         limits, last, elapsed = self._limits, self.target, self._elapsed(now)
         given, q, v = (as_numbers(value, len(last)) for value in (target, position, velocity))
@@ -274,7 +274,7 @@ class Limiter:
         return raised if inside else np.append(target[:-6], last[-6:])
 
     def _elapsed(self, now: float) -> float:
-        """Seconds since the last target, at most a period, so that no pause is caught up; 0 if time did not pass."""
+        """Seconds since the last target, at most a period, so that targets do not catch up after a pause."""
         if not math.isfinite(now):
             return 0.0
         spent = now - self._latest
@@ -283,7 +283,7 @@ class Limiter:
 
 
 def _bounded(values: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """(J,) values of at most a size: each finger's by itself, the wrist's slides and hinges by their norms."""
+    """(J,) values clipped to limits: those of fingers separately, those of the wrist's slides and hinges by norm."""
     bounded = np.clip(values, -most, most)
     for three in (slice(-6, -3), slice(-3, None)):
         length, longest = np.linalg.norm(values[three]), most[three].min()
@@ -293,7 +293,7 @@ def _bounded(values: np.ndarray, most: np.ndarray) -> np.ndarray:
 
 
 def as_numbers(value: Any, size: int) -> np.ndarray:
-    """(size,) float64; NaN throughout for what is no such array."""
+    """(size,) float64; all NaN if `value` is no such array."""
     try:
         array = np.asarray(value, float)
     except (TypeError, ValueError, OverflowError):

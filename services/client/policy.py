@@ -1,4 +1,4 @@
-"""Interface of policies for control loops, local or remote; needs nothing but numpy."""
+"""Interface of policies for control loops, local or remote; needs only NumPy."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, Self
@@ -8,7 +8,7 @@ import numpy as np
 from congrasp.common.request import GraspRequest
 
 State = Mapping[str, np.ndarray]
-"""Hand and object now, by field; see `Policy.act`."""
+"""Current state of hand and object, by field; see `Policy.act`."""
 
 
 class Answer(NamedTuple):
@@ -25,18 +25,18 @@ class Answer(NamedTuple):
     active: tuple[str, ...]
     """Active constraints and the reasons, in sentences."""
     round_trip_ms: float
-    """From asking to the answer."""
+    """Time from the query to the answer."""
     server_ms: float
-    """The share of it that checking and inference took, where the policy is."""
+    """Part of it that the policy's process took: checks, queue and inference."""
 
 
 class Policy(Protocol):
     """Joint targets for one hand and object, one control step after the other.
 
-    It remembers what an episode started from and the previous targets. `PolicyClient` queries a server, `LocalPolicy`
+    It remembers the start of the episode and the previous targets. `PolicyClient` queries a server, `LocalPolicy`
     computes in this process; checks, messages and answers are the same.
 
-    Frames: everything in the world frame but `u` (relative to the base, which is the wrist's pose at `reset`) and the
+    Frames: the world frame, except for `u` (relative to the base, which is the wrist's pose at `reset`) and for
     constraints and surface points (object frame). Metres, radians, newtons; quaternions (w, x, y, z).
     """
 
@@ -49,22 +49,23 @@ class Policy(Protocol):
             `surface` and `object_pose`, and constraints in the world frame.
 
         Raises:
-          RefusedError: the request lacks one of them, or holds what is no array of numbers.
+          RefusedError: the request lacks one of them, or a value is no array of numbers.
         """
         ...
 
     def act(self, state: State) -> Answer:
-        """Joint targets for the present state.
+        """Joint targets for the current state.
 
         Args:
-          state: `q`, `u`, `object_position`, `object_quaternion`, `table`; where there are sensors also `q_velocity`,
-            `u_velocity`, `object_velocity`, `object_angular_velocity`, `contact_force`, `contact_position` and
-            `contact_found`, by the names and shapes of `common.task.types.SceneState` without the batch axis. A policy
-            with a camera takes no pose of the object but, from a newer image, `cloud` (N, 3) in the world frame.
+          state: `q`, `u`, `object_position`, `object_quaternion`; optionally `table` (True by default) and, from
+            sensors, `q_velocity`, `u_velocity`, `object_velocity`, `object_angular_velocity`, `contact_force`,
+            `contact_position`, `contact_found` and `wrist_load`, by the names and shapes of
+            `common.task.types.SceneState` without the batch axis. A policy with a camera takes no pose of the object
+            but, from a newer image, `cloud` (N, 3) in the world frame.
 
         Raises:
-          RefusedError: the request or the state is bad. Its subclasses in `common.errors` tell what a program can act
-            on: an unknown constraint, a contradiction, an overloaded server, a deadline that passed there.
+          RefusedError: the request or the state is invalid. Its subclasses in `common.errors` are errors that a program
+            can handle: an unknown constraint, a contradiction, an overloaded server, a deadline missed there.
           TransportError: there is no response from the server.
         """
         ...
@@ -72,14 +73,14 @@ class Policy(Protocol):
     def act_each(self, states: Sequence[State]) -> list[Answer]:
         """Joint targets for each of several states, as `act` would return them now; the episode does not advance.
 
-        For planners that weigh candidates: one query for all of them costs a small part of one for each.
+        For planners that compare candidates: one query for all of them is much cheaper than one for each.
 
         Args:
-          states: see `act`; 1 to 64. One may also have its own `time` in control steps, and `q_target` and `u_target`,
+          states: see `act`; 1 to 64. A state may also have `time` in control steps, and `q_target` and `u_target`,
             from which its targets continue.
 
         Raises:
-          TransportError: see `act`; if one state is bad, none gets an answer.
+          TransportError: see `act`; if one state is invalid, none gets an answer.
         """
         ...
 
@@ -89,11 +90,11 @@ class Policy(Protocol):
         Returns:
           `hand`, its `joints` (F names in the order of `q`), `open_pose` (F,) rad; `limits`, the fields of
           `JointLimits`, or None for a hand whose joints share motors; `period`, seconds of a control step;
-          `approach_steps`, control steps before the table is taken away in training; `observation` (`full`,
+          `approach_steps`, control steps before the table is removed in training; `observation` (`full`,
           `tracked` or `camera`), `constraints`, `surface_points`, `trajectory_points`.
 
         Raises:
-          TransportError: there is no response from the server.
+          TransportError: there is no response from the server, or it serves another hand.
         """
         ...
 

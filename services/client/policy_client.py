@@ -1,4 +1,4 @@
-"""The client of a policy server, for a robot's control loop: needs nothing but numpy and zenoh."""
+"""The client of a policy server, for a robot's control loop: needs only NumPy and Zenoh."""
 
 import os
 import secrets
@@ -11,7 +11,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.episode import EpisodePolicy
 
-_AGAIN = 0.2  # seconds until a server that does not answer is asked again
+_AGAIN = 0.2  # seconds between two queries of a server that does not respond
 
 
 class PolicyClient(EpisodePolicy):
@@ -27,15 +27,15 @@ class PolicyClient(EpisodePolicy):
         wait: float = 10.0,
         certs: str | os.PathLike[str] | None = None,
     ):
-        """Connects; when the server goes away and comes back, so does the connection.
+        """Connects, and reconnects if the server restarts.
 
         Args:
           connect: the server's endpoint, such as tcp/10.0.0.7:7457.
-          run: name under which the server serves.
-          hand: name of the hand that is to be controlled; a server with another hand's policy refuses.
-          timeout: seconds that one call may take.
+          run: name under which the policy is served.
+          hand: name of the controlled hand; a server with another hand's policy rejects the queries.
+          timeout: deadline of one call, s.
           wait: seconds to wait for the server to appear.
-          certs: folder of a client's certificate, for a server that asks for one.
+          certs: folder of a client's certificate, for a server that requires one.
 
         Raises:
           TransportError: there is no response.
@@ -50,7 +50,7 @@ class PolicyClient(EpisodePolicy):
         return dict(self._transport.query(self._keys.health, Message({}, {}), timeout=self._timeout).meta)
 
     def metadata(self) -> dict[str, Any]:
-        """See `Policy.metadata`; waits for a server that is being started."""
+        """See `Policy.metadata`; waits for a server that is starting."""
         deadline = time.monotonic() + self._wait
         while True:
             try:

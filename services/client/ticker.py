@@ -1,4 +1,4 @@
-"""The clock of a control loop: ticks at a rate, with what became late counted; needs nothing but numpy."""
+"""The clock of a control loop: ticks at a rate, with counters of late ones; needs only NumPy."""
 
 import collections
 import time
@@ -13,18 +13,17 @@ _KEPT = 6000  # ticks whose jitter is kept: a minute at 100 Hz
 class Ticker:
     """Ticks at multiples of a period.
 
-    A tick that is late by a period or more has missed its deadline: those that were missed are left out, so that they
-    do not come in a burst.
+    A tick that is late by a period or more has missed its deadline. Missed ticks are skipped to avoid a burst.
 
     Attributes:
       period: s.
-      ticks: how many there were.
-      missed: how many were left out.
-      longest_ms: greatest lateness of a tick.
+      ticks: number of ticks.
+      missed: number of skipped ticks.
+      longest_ms: greatest delay of a tick.
     """
 
     def __init__(self, rate: float):
-        """The first tick is due at once.
+        """Begins with a tick that is due at once.
 
         Args:
           rate: Hz, at most 100: the policies act every 10 ms.
@@ -38,7 +37,7 @@ class Ticker:
         self._late: collections.deque[float] = collections.deque(maxlen=_KEPT)
 
     def wait(self) -> float:
-        """Waits until the next tick; returns the time of `time.monotonic` then."""
+        """Waits until the next tick; returns its time, of `time.monotonic`."""
         while (rest := self._due - time.monotonic()) > 0:
             time.sleep(rest)
         now = time.monotonic()
@@ -52,5 +51,5 @@ class Ticker:
         return now
 
     def jitter_ms(self, percentile: float) -> float:
-        """A percentile of how late the last minute's ticks were, ms."""
+        """A percentile of the delays of the last `_KEPT` ticks, ms."""
         return float(np.percentile(self._late, percentile)) if self._late else 0.0

@@ -15,12 +15,15 @@ CARD, README = "card.json", "README.md"
 
 
 def write_card(shards: Shards, about: Mapping[str, Any], facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Writes the card of the shards that are in a folder, and returns it.
+    """Writes the card of the shards in a folder, and returns it.
 
     Args:
-      shards: their places.
-      about: contents of the dataset, as its shards say (`services.dataset.make.Recipe.about`).
-      facts: what else the card says: command, licence, machine.
+      shards: locations of the shards.
+      about: description of the dataset in its shards (`services.dataset.make.Recipe.about`).
+      facts: further entries of the card: command, licence, machine.
+
+    Raises:
+      CongraspError: see `Shards.finished`.
     """
     found = shards.finished(about)
     counts: dict[str, collections.Counter[str]] = {}
@@ -54,7 +57,7 @@ def _columns(shards: Shards, kind: str, found: Mapping[int, Any]) -> dict[str, d
 
 
 def _readme(card: Mapping[str, Any]) -> str:
-    """The card for people, with the header by which Hugging Face shows the tables."""
+    """The card as Markdown, with the header for Hugging Face's viewer."""
     rows = [
         f"| {asked} | {own['episodes']:,} | {own['kept']:,} | "
         + " | ".join(f"{100 * own[name] / own['episodes']:.1f} %" for name in VERDICTS)
@@ -96,5 +99,5 @@ Columns, with shapes, units and frames, are in `card.json` and in the schema of 
 
 
 def _kept(keep: list[str]) -> str:
-    """Sentence on the episodes that are in the files."""
+    """Sentence on the episodes in the files."""
     return f"The files hold those that are {' and '.join(keep)}." if keep else "The files hold all of them."

@@ -1,7 +1,7 @@
 """Columns of a dataset, with units and frames, and the Parquet tables that hold them.
 
-Arrays are lists of one length in row-major order; their shape, unit and frame are in the schema. NaN stands where a
-constraint was not requested. Poses are position (m) and quaternion (w, x, y, z).
+Arrays are lists of one length in row-major order; their shape, unit and frame are in the schema. Values of constraints
+that were not requested are NaN. Poses are position (m) and quaternion (w, x, y, z).
 """
 
 import json
@@ -44,7 +44,7 @@ class Column(NamedTuple):
     name: str
     meaning: str
     shape: tuple[int, ...] = ()
-    """Of a row's array."""
+    """Shape of a row's array."""
     kind: type = np.float32
     """`np.float32`, `bool`, `np.int32` or `str`."""
 
@@ -101,7 +101,7 @@ def object_columns() -> list[Column]:
 def grasp_rows(
     hand: Hand, task: TaskConfig, asked: str, conditions: InitialConditions, batch: Batch
 ) -> dict[str, np.ndarray]:
-    """Columns (B, ...) of a batch of episodes under the constraints `asked`, but for object and number."""
+    """Columns (B, ...) of a batch of episodes under the constraints `asked`, without those of object and episode."""
     start, state, features = conditions.reset_state, *batch.final
     values, names = batch.sample.values, asked.removesuffix(ALIGNED).split("+")
     rows: dict[str, Any] = {
@@ -161,7 +161,7 @@ def table(columns: Sequence[Column], rows: Mapping[str, np.ndarray], about: Mapp
 
 
 def _array(column: Column, values: np.ndarray) -> pa.Array:
-    """A column (B, ...) as Arrow keeps it."""
+    """A column (B, ...) as an Arrow array."""
     if column.kind is str:
         return pa.array(values.tolist(), pa.string())
     flat: np.ndarray = np.asarray(values, column.kind).ravel()
@@ -175,5 +175,5 @@ def _pose(position: Any, quaternion: Any) -> np.ndarray:
 
 
 def _in_object(position: Any, quaternion: Any, wrist_position: Any, wrist_quaternion: Any) -> np.ndarray:
-    """(B, 7) wrist poses in the frames of objects, of poses in the world."""
+    """(B, 7) wrist poses in the object frames, from poses of objects and wrists in the world frame."""
     return _pose(*rotations.relative_pose(position, quaternion, wrist_position, wrist_quaternion))

@@ -1,7 +1,7 @@
 """Makes a dataset, shard by shard: each is a pool of objects with all their episodes.
 
-A shard depends on the policy, the objects, the seed and the engine, never on the shards before it, so that any number
-of processes can make different ones, and a stopped process resumes with the first that is missing.
+A shard depends on the policy, the objects, the seed, the engine and the batch, never on other shards. Any number of
+processes can therefore make different ones, and a stopped process resumes with the missing ones.
 """
 
 import collections
@@ -45,7 +45,7 @@ from congrasp.services.evaluate.protocol import protocol, two_seconds
 
 FORMAT = 1
 _EPISODES, _OBJECTS = 8192, 128
-"""Episodes and objects of a shard, at most, where no number is given."""
+"""Limits of a shard's episodes and objects, for the default number of objects."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,28 +54,28 @@ class Recipe:
 
     policy: PolicyBundle
     policy_sha256: str
-    """Of its file."""
+    """SHA-256 of the policy's file."""
     objects: Sequence[ObjectAt]
-    """Of different names."""
+    """Objects with different names."""
     options: ImportOptions
     """Options of the import of meshes."""
     per_object: int
     """Episodes of each object, evenly over the constraints."""
     constraints: tuple[str, ...]
-    """Each a set of constraints with `+` between them."""
+    """Sets of constraints, each with `+` between them."""
     keep: tuple[str, ...]
-    """Names of `VERDICTS` that kept episodes have; empty keeps all."""
+    """Names of `VERDICTS` that an episode needs to be kept; empty keeps all."""
     shard: int
-    """Objects of a shard, at most."""
+    """Largest number of objects in a shard."""
     physics: PhysicsName
-    """Not `auto`."""
+    """Engine, except `auto`."""
     seed: int
     batch: int = 0
-    """Worlds side by side, at most; 0 chooses by the engine. Rounding differs between batches, so it counts."""
+    """Largest number of parallel worlds; 0 uses the engine's default. It changes the results by rounding."""
 
     @property
     def worlds(self) -> int:
-        """Worlds side by side."""
+        """Number of parallel worlds."""
         objects = min(self.shard, len(self.objects))
         return batch_of(self.shares[0] * objects, self.batch or ENGINES[self.physics].batch)
 
@@ -109,7 +109,7 @@ class Recipe:
 
 
 def shard_objects(per_object: int) -> int:
-    """Objects of a shard, at most, where no number is given; the same for every engine and batch."""
+    """Default of the largest number of objects in a shard; the same for every engine and batch."""
     return max(1, min(_EPISODES // per_object, _OBJECTS))
 
 
@@ -128,11 +128,11 @@ def make(
     """Makes and writes shards.
 
     Args:
-      recipe: contents.
-      shards: where they go.
-      pools: `pools_of` the recipe.
-      wanted: numbers of the shards.
-      progress: receives the number of finished episodes.
+      recipe: contents of the dataset.
+      shards: locations of the shards.
+      pools: result of `pools_of` for the recipe.
+      wanted: numbers of the shards to make.
+      progress: called with the number of finished episodes.
     """
     policy, hand = recipe.policy, get_hand(recipe.policy.spec.hand)
     hold = two_seconds(policy.task)
@@ -163,7 +163,7 @@ def make(
 
 
 def _plans(recipe: Recipe, task: TaskConfig, pool: Pool) -> Iterator[tuple[str, ConstraintBank, RowPlan]]:
-    """Constraints that some object of a pool allows, what they are drawn from, and their episodes."""
+    """Yields the sets of constraints that some object of a pool allows, with their bank and their planned episodes."""
     assert pool.bank is not None
     bank = pool.bank
     if any(map(from_references, recipe.constraints)):
@@ -187,7 +187,7 @@ def _episodes(
     plan: RowPlan,
     pool: Pool,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Columns of a plan's episodes on the pool's own objects, batch by batch."""
+    """Yields the columns of a plan's episodes on the real objects of the pool, batch by batch."""
     names, first = np.array([obj.name for obj in pool.objects]), 0
     for conditions, count in batches(hand, task, bank, plan, seed, running.batch):
         batch = running.run(conditions, stressed=True)
@@ -201,7 +201,7 @@ def _episodes(
 def _counted(
     rows: Mapping[str, np.ndarray], keep: Sequence[str], counts: collections.Counter[str]
 ) -> dict[str, np.ndarray]:
-    """The rows that are kept; all of them are counted, by their outcomes."""
+    """Counts all rows by their outcomes; returns those to keep."""
     kept = np.all([np.ones(len(rows["episode"]), bool), *(rows[name] for name in keep)], 0)
     counts.update(episodes=len(kept), kept=int(kept.sum()), **{name: int(rows[name].sum()) for name in VERDICTS})
     return {name: column[kept] for name, column in rows.items()}

@@ -1,4 +1,4 @@
-"""Shards of a dataset: files of grasps and of the objects they are of, each written whole or not at all."""
+"""Shards of a dataset: files of grasps and of their objects, each written atomically."""
 
 import io
 import json
@@ -14,18 +14,18 @@ from congrasp.common.io.files import write_atomically
 
 
 class Shards(NamedTuple):
-    """Places of the shards of one dataset."""
+    """Files of the shards of one dataset."""
 
     folder: pathlib.Path
     total: int
-    """N, of the whole dataset, whichever of them are here."""
+    """Number of shards of the whole dataset, including missing ones."""
 
     def file(self, kind: str, number: int) -> pathlib.Path:
-        """Place of a shard of `grasps` or of `objects`."""
+        """File of a shard of `grasps` or of `objects`."""
         return self.folder / kind / f"{number:05d}-of-{self.total:05d}.parquet"
 
     def write(self, number: int, grasps: pa.Table, objects: pa.Table) -> None:
-        """Writes a shard; that of the grasps comes last, so that where it is everything is."""
+        """Writes a shard; the grasps come last, so that their file means that the shard is complete."""
         for kind, table in (("objects", objects), ("grasps", grasps)):
             buffer = io.BytesIO()
             pq.write_table(table, buffer, compression="zstd")
@@ -44,7 +44,7 @@ class Shards(NamedTuple):
                 if said.get(name) != value:
                     raise CongraspError(
                         f"{path} is of another dataset: its {name} is {said.get(name)}, not {value}.",
-                        "Name another --out, or give the options that it was begun with (card.json has the command).",
+                        "Pass another --out, or the options of the first command (in card.json).",
                     )
             found[int(said["shard"])] = said
         return found
@@ -56,6 +56,6 @@ def _said(path: pathlib.Path) -> dict[str, Any]:
         said = json.loads(pq.read_schema(path).metadata[b"congrasp"])
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise CongraspError(
-            f"{path} is no shard of a dataset ({str(error)[:100]}).", "Remove it; it is made again."
+            f"{path} is no shard of a dataset ({str(error)[:100]}).", "Remove it, and repeat the command."
         ) from None
     return dict(said)

@@ -1,6 +1,5 @@
 """Parallel episodes under a policy's mean action, for evaluations and reference grasps."""
 
-import functools
 import math
 import zlib
 from collections.abc import Callable, Sequence
@@ -16,16 +15,17 @@ from congrasp.actors.episode import episode_message
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics import make_physics
-from congrasp.actors.rollout import RolloutWorker, Trace, finished_episodes
+from congrasp.actors.rollout import Trace, finished_episodes
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.distance import DistanceField
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.policy.bundle import PolicyBundle, act_by_mean
+from congrasp.common.policy.bundle import PolicyBundle, acting
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint
-from congrasp.common.task.types import Array, Goal, Surface
+from congrasp.common.task.types import Array, Goal
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.protocol import two_seconds
 from congrasp.services.evaluate.scores import Sample
@@ -78,12 +78,12 @@ class Episodes:
             task,
             make_physics(physics, self._hand, task, objects, threads=threads),
             None,
-            functools.partial(act_by_mean, bundle.spec.layout),
+            acting(bundle.spec.layout, mean=True),
             batch=batch,
             seed=0,
             half_precision=False,
             probe=plausibility.sample if self._measured else _effort,
-            traced=slice(None) if traced else slice(0),
+            traced="all" if traced else "none",
         )
         self.stressable = self._measured and hold == two_seconds(task)
         """True if episodes can continue after the hold: the stress test begins after two seconds."""
@@ -172,7 +172,7 @@ class Episodes:
             self._task,
             trace,
             begun.goal.row(episode),
-            Surface(*(np.asarray(field)[episode] for field in begun.surface)),
+            jax.tree.map(lambda array: np.asarray(array)[episode], begun.surface),
             self._objects[int(np.asarray(begun.reset_state.object_index)[episode])],
             {
                 "version": self._bundle.version,

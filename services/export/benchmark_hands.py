@@ -1,8 +1,8 @@
 """Hands of DexGraspBench, and the correspondence between their joints and those of this project's hands.
 
 The benchmark takes them from MuJoCo Menagerie (Allegro V3: SimLab, BSD-2; Shadow: Shadow Robot Company, Apache-2.0).
-Here are their names and kinematics as facts, in the frame of the palm's body with every joint at zero. A hand is
-recognised by these, not by names: it is the benchmark's if its joints are at the same places.
+This module has their names and kinematics, in the frame of the palm's body with every joint at zero. A hand is
+recognised by its kinematics, not by names: it is the benchmark's if its joints are at the same positions.
 """
 
 import dataclasses
@@ -46,19 +46,19 @@ class BenchmarkHand:
     """A hand of F joints in the benchmark's order."""
 
     fingers: dict[str, tuple[Row, ...]]
-    """The joints of each finger from the palm on; the key with a number is a joint's name."""
+    """Joints of each finger from the palm on, by the finger; its name and a number are the name of a joint."""
     from_tip: bool
     """True if they are numbered from the tip, from 1 on, instead of from the palm, from 0 on."""
     position: tuple[float, float, float]
-    """m, of the palm in the frame of the root, which is what the benchmark places."""
+    """Position of the palm in the frame of the root, whose pose the benchmark stores, m."""
     quaternion: tuple[float, float, float, float]
     """(w, x, y, z) palm to root."""
     kp: float
-    """N.m/rad of every motor."""
+    """Stiffness of every motor, N.m/rad."""
     damping: float
-    """N.m.s/rad of every joint."""
+    """Damping of every joint, N.m.s/rad."""
     torque_limit: float
-    """N.m of every motor."""
+    """Limit of every motor, N.m."""
     shapes: tuple[Shape, ...] = ()
     """Collision shapes; empty if those are meshes."""
 
@@ -81,23 +81,23 @@ BENCHMARK_HANDS = {
     name: dacite.from_dict(BenchmarkHand, fields, dacite.Config(cast=[tuple]))
     for name, fields in json.loads(pathlib.Path(__file__).with_suffix(".json").read_text()).items()
 }
-"""The benchmark's hands by its names for them."""
+"""The benchmark's hands, by its names."""
 
 
 class Match(NamedTuple):
     """Assignment of a hand of this project to the benchmark's."""
 
     name: str
-    """Of the benchmark's hand."""
+    """Name of the benchmark's hand."""
     hand: BenchmarkHand
     order: np.ndarray
     """(F,) index of this project's joint for each of the benchmark's."""
     sign: np.ndarray
-    """(F,) 1 or -1 where it turns the other way."""
+    """(F,) 1, or -1 for joints that turn the other way."""
     position: np.ndarray
-    """(3,) m, of the wrist frame in the root's."""
+    """(3,) position of the wrist frame in the root's, m."""
     rotation: Rotation
-    """From the wrist frame to the root's."""
+    """Rotation from the wrist frame to the root's."""
 
     def qpos(self, position: np.ndarray, rotation: Rotation, q: np.ndarray) -> np.ndarray:
         """Position and quaternion (w, x, y, z) of the root in the world and joints (7 + F,), as the benchmark stores
@@ -113,7 +113,7 @@ class Match(NamedTuple):
         return np.concatenate([position - turn.apply(self.position), quaternion, self.sign * q[self.order]])
 
     def solids(self, link_of: np.ndarray) -> dict[int, tuple[Solid, ...]]:
-        """The benchmark's collision shapes in the wrist frame at zero, by links; none where they are meshes.
+        """The benchmark's collision shapes in the wrist frame at zero, by links; empty if they are meshes.
 
         Args:
           link_of: (F,) index of the link that each of this project's joints moves.
@@ -136,8 +136,8 @@ class Match(NamedTuple):
           qpos: (7 + F,), see `qpos`.
 
         Returns:
-          (F, 3) m, the joints' anchors in the world; and the turn of what follows each from this project's zero pose to
-          the world.
+          (F, 3) m, the joints' anchors in the world frame; and the rotation of the link after each joint, from this
+          project's zero pose to the world frame.
         """
         root = Rotation.from_quat(qpos[3:7], scalar_first=True)
         palm = root * Rotation.from_quat(self.hand.quaternion, scalar_first=True)
@@ -158,7 +158,7 @@ class Match(NamedTuple):
 
 
 def match_hand(motion: GraspMotion) -> Match:
-    """Returns the benchmark's hand for a motion's hand, whatever the names of its joints.
+    """Returns the benchmark's hand for a motion's hand, independent of the names of its joints.
 
     Every assignment of fingers is aligned with the benchmark's (Kabsch); the best must match to `PLACES_MM`.
 

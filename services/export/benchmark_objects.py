@@ -22,8 +22,8 @@ from congrasp.services.assets.objects.pieces import simplify
 from congrasp.services.export.motion_file import GraspMotion
 
 _DENSITY = 500.0  # kg/m^3
-_SECONDS = 60.0  # for the convex decomposition of a body
-_MOST_FILES = 1024  # bodies whose pieces are kept
+_SECONDS = 60.0  # deadline of the convex decomposition of a body
+_MOST_FILES = 1024  # bodies whose pieces are cached
 
 
 def convex_object(motion: GraspMotion) -> GraspObject:
@@ -71,7 +71,7 @@ def write_object(folder: pathlib.Path, obj: GraspObject, origin: np.ndarray, sca
 
 
 def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
-    """Convex pieces of one body; none of a flat one.
+    """Convex pieces of one body; empty for a flat one.
 
     Results of CoACD are cached in the user's cache folder until the code of the decomposition changes. Substitutes
     after a timeout of CoACD are not cached.

@@ -19,7 +19,7 @@ from congrasp.services.viz.shapes import arm_shapes, fit, object_shape, skin_sha
 SIZE = (320, 240)
 """Width and height in pixels."""
 _DIRECTION = np.array([0.8, -1.0, 0.7])  # from the table's middle to the camera
-_STEP = 10  # frames from one that the camera is fitted to, to the next
+_STEP = 10  # frames between those that the camera must contain
 
 
 def camera_for(motions: Sequence[GraspMotion]) -> Camera:
@@ -48,7 +48,7 @@ def pictures(motion: GraspMotion, camera: Camera) -> Iterator[np.ndarray]:
 
 
 def calibration(camera: Camera) -> dict[str, Any]:
-    """The pinhole camera in the terms of computer vision: x right, y down, z forward."""
+    """Parameters of the pinhole camera in the convention of computer vision: x right, y down, z forward."""
     right, up, forward = camera.axes()
     focal = SIZE[1] / 2 / np.tan(np.radians(camera.field_of_view) / 2)
     return {

@@ -1,7 +1,7 @@
 """Grasps for DexGraspBench: pregrasp, grasp and squeeze of motions, with the objects in the benchmark's layout.
 
-The benchmark's files are pickles, which this project neither writes nor reads: here they are NPZ files with the same
-names and shapes, of which `examples/dexgraspbench.py` makes the benchmark's in its own environment.
+The benchmark's files are pickles, which this project neither writes nor reads. It writes NPZ files with the same names
+and shapes, which `examples/dexgraspbench.py` converts in the benchmark's environment.
 """
 
 import io
@@ -38,9 +38,9 @@ CLEARANCE = 0.006
 """Metres between hand and object in the pregrasp."""
 STATES = ("pregrasp", "grasp", "squeeze")
 GRASPS, OBJECTS = "graspdata", "object"
-"""Folders of what is written."""
+"""Folders of the output."""
 _MOTION = "grasp.npz"  # of `congrasp grasp`, in an object's folder
-_STEADY = 10  # frames whose mean torque is squeezed with
+_STEADY = 10  # frames of the mean torque of the squeeze
 _LEVER = 0.05  # m; points this far from a joint show its rotation
 
 
@@ -48,9 +48,9 @@ class State(NamedTuple):
     """A hand relative to the object at the grasp."""
 
     position: np.ndarray
-    """(3,) m, of the wrist in the world."""
+    """(3,) position of the wrist in the world frame, m."""
     rotation: Rotation
-    """From the wrist frame to the world."""
+    """Rotation from the wrist frame to the world frame."""
     q: np.ndarray
     """(F,) rad, finger joints in this project's order."""
 
@@ -72,9 +72,9 @@ class Grasp(NamedTuple):
     scale: float
     """m per unit of the object's file."""
     states: dict[str, State]
-    """By `STATES`."""
+    """States of the hand, by `STATES`."""
     clearance: float
-    """m, between hand and object in the pregrasp: less than `CLEARANCE` where the motion begins nearer."""
+    """Distance of hand and object in the pregrasp, m; less than `CLEARANCE` if the motion begins nearer."""
 
 
 def export_grasps(
@@ -221,11 +221,10 @@ def arrays_of(grasp: Grasp) -> dict[str, np.ndarray]:
 
 
 def write_grasp(grasp: Grasp, folder: pathlib.Path) -> float:
-    """Writes a grasp, reads it back, and writes its object; nothing is left of one that is off.
+    """Writes a grasp, reads it back, and writes its object; removes it if its error is above `TOLERANCE_MM`.
 
     Returns:
-      The largest distance in mm between where the joints and points 5 cm from them are and where the benchmark's
-      kinematics has them; one of more than `TOLERANCE_MM` is off.
+      The largest error in mm, see `error_mm`.
 
     Raises:
       CongraspError: the folder cannot be written.
@@ -244,7 +243,7 @@ def write_grasp(grasp: Grasp, folder: pathlib.Path) -> float:
 
 
 def error_mm(grasp: Grasp, arrays: dict[str, np.ndarray]) -> float:
-    """Largest distance in mm of joints, and of points 5 cm from them, in a file from where the hand has them."""
+    """Largest distance in mm of joints, and of points 5 cm from them, between a file and the hand's kinematics."""
     levers = np.concatenate([np.zeros((1, 3)), _LEVER * np.eye(3)])
     worst = 0.0
     for name in ("pregrasp", "grasp"):
@@ -271,7 +270,7 @@ def _hand_of(motion: GraspMotion) -> Hand:
 
 
 def _rotation(quaternion: np.ndarray) -> Rotation:
-    """Of (4,) w x y z."""
+    """Rotation of a quaternion (4,) w x y z."""
     return Rotation.from_quat(quaternion.astype(float), scalar_first=True)
 
 
@@ -290,7 +289,7 @@ def _carried(motion: GraspMotion, t: int, last: int) -> State:
 
 
 def _last_clear(hand: Hand, obj: GraspObject, motion: GraspMotion, last: int) -> tuple[int, float]:
-    """The last frame up to `last` in which hand and object are `CLEARANCE` apart, or else the one where they are most.
+    """The last frame up to `last` in which hand and object are `CLEARANCE` apart, else that of the largest distance.
 
     Returns:
       The frame, and the distance in m between the hand's shapes and the object's pieces there.

@@ -25,7 +25,7 @@ SKIN = "skin"
 NOT_LINKS = (OBJECT, SKIN, "world")
 """Names that links of arms must not have."""
 COLOURS = {**palette.MATERIALS, OBJECT: palette.OBJECT}
-"""Of the materials of hands, and of the object."""
+"""Colours of the materials of hands, and of the object."""
 TOLERANCE_MM = 0.1
 """Largest error of the kinematics of a file that is kept, mm."""
 _LEVER = 0.1  # m; a point this far from a frame's origin shows its rotation
@@ -35,9 +35,9 @@ _STILL = 1e-6  # m; a link whose origin moves less than this in its parent's fra
 
 
 FROM_Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
-"""(4, 4) a world whose y axis points up to one whose z axis does: y to z, z to -y."""
+"""(4, 4) transform from a world frame with the y axis up to one with the z axis up: y to z, z to -y."""
 TO_Y_UP = Rotation.from_matrix(FROM_Y_UP[:3, :3].T)
-"""The inverse's rotation."""
+"""Rotation of its inverse."""
 
 
 class Track(NamedTuple):
@@ -48,7 +48,7 @@ class Track(NamedTuple):
     poses: dict[str, np.ndarray]
     """(T, 4, 4) frame to world of every link and the object; metres, z up."""
     triangles: dict[str, np.ndarray] | None = None
-    """(E, 3, 3) corners of the meshes of object and arm links in their frames, where the format has meshes."""
+    """(E, 3, 3) corners of the meshes of object and arm links in their frames; None if the format has no meshes."""
 
 
 class Body(NamedTuple):
@@ -58,7 +58,7 @@ class Body(NamedTuple):
     parent: int
     """Index of the body that carries it, -1 for the world."""
     translation: np.ndarray
-    """(T, 3) m, or (1, 3) where it stays the same."""
+    """(T, 3) m, or (1, 3) if it is constant."""
     rotation: Rotation
     """T rotations."""
 
@@ -67,15 +67,15 @@ class Capsule(NamedTuple):
     """A capsule of a link, along the z axis of its own frame."""
 
     number: int
-    """Among all capsules of the hand."""
+    """Index among all capsules of the hand."""
     length: float
-    """m, between the centres of its caps."""
+    """Distance between the centres of its caps, m."""
     radius: float
     """m."""
     middle: np.ndarray
     """(3,) m, in the link's frame."""
     turn: Rotation
-    """From its frame to the link's."""
+    """Rotation from its frame to the link's."""
 
 
 def capsules(motion: GraspMotion, link: int) -> Iterator[Capsule]:
@@ -88,7 +88,7 @@ def capsules(motion: GraspMotion, link: int) -> Iterator[Capsule]:
 
 
 def object_mesh(motion: GraspMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """The object's mesh (V, 3), (F, 3) and the sRGB (V, 3) in [0, 1] of its points; it is cut finer for these."""
+    """The object's mesh (V, 3), (F, 3), and the sRGB (V, 3) in [0, 1] of its points, for which it is refined."""
     if motion.colours is None:
         return motion.object_vertices, motion.object_faces, None
     vertices, faces, colours = painted(motion.object_vertices, motion.object_faces, motion.colours)
@@ -245,7 +245,7 @@ def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dic
 
 
 def identifiers(names: Sequence[str]) -> list[str]:
-    """The names with what is no letter, digit or underscore replaced, all different."""
+    """The names as distinct identifiers, with underscores in place of other characters than letters and digits."""
     plain: list[str] = []
     for name in names:
         word = re.sub(r"\W", "_", name, flags=re.ASCII)

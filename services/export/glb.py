@@ -1,4 +1,4 @@
-"""Binary glTF 2.0 with an animation; written by pygltflib, read back as the standard says and, its meshes, by trimesh.
+"""Binary glTF 2.0 with an animation; written by pygltflib, read back by the standard's layout, its meshes by trimesh.
 
 One node a link, nested as hand and arm are, with translation and rotation (glTF forbids matrices on animated nodes).
 The hand's are the joints of a skin, by which its surface follows them; the arm's have meshes. glTF is y-up: a root node
@@ -71,7 +71,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
             grasp.samplers.append(gltf.AnimationSampler(input=time, output=_add(file, data, values)))
     _add_skin(file, data, skin)
     file.animations = [grasp]
-    # A skinned mesh follows its joints alone: its own node stands at the root.
+    # A skinned mesh follows its joints alone, so that its node is at the root.
     file.scene, file.scenes = 0, [gltf.Scene(name=motion.object, nodes=[0, len(file.nodes) - 1])]
     file.buffers = [gltf.Buffer(byteLength=len(data))]
     file.set_binary_blob(bytes(data))
@@ -109,7 +109,7 @@ def _add(
 def _primitive(
     file: gltf.GLTF2, data: bytearray, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None
 ) -> gltf.Primitive:
-    """The object's mesh with normals and its material, whose colour is white where the points have theirs."""
+    """The object's mesh with normals and its material, which is white if the points have colours."""
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     normals = mesh.vertex_normals
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -129,7 +129,7 @@ def _primitive(
 
 
 def _part(file: gltf.GLTF2, data: bytearray, mesh: Mesh) -> gltf.Primitive:
-    """A mesh of an arm's link, with sharp edges and a material of its own."""
+    """A mesh of an arm's link, with sharp edges and a separate material."""
     corners, (_, normals) = mesh.faces.ravel(), smooth_corners(mesh.vertices, mesh.faces)
     normals = normals.reshape(-1, 3)
     keys = np.column_stack([corners, normals.round(3)])
@@ -146,7 +146,7 @@ def _part(file: gltf.GLTF2, data: bytearray, mesh: Mesh) -> gltf.Primitive:
 
 
 def _add_skin(file: gltf.GLTF2, data: bytearray, skin: Skin) -> None:
-    """Adds the hand's surface as a node of its own, whose skin has the links' nodes (from 1 on) as joints."""
+    """Adds the hand's surface as a separate node, whose skin has the links' nodes (from 1 on) as joints."""
     flat = unwrapped(skin.points, skin.faces)
     own = {name: getattr(skin, name)[flat.source] for name in ("points", "normals", "weights", "material")}
     skin = skin._replace(faces=flat.faces, **own)

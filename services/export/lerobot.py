@@ -1,4 +1,4 @@
-"""A LeRobot dataset, version 3.0: one episode a motion; written with pyarrow, read back by its own layout.
+"""A LeRobot dataset, version 3.0: one episode per motion; written with pyarrow, read back by the layout in its files.
 
 `observation.state` is the proprioception (joints of arm and fingers, then the wrist's pose),
 `observation.environment_state` the object's pose, `action` the arm's joints one step later, the finger targets, and the
@@ -34,12 +34,17 @@ _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _STATE, _OBJECT, _ACTION = "observation.state", "observation.environment_state", "action"
 _CAMERA = "observation.images.front"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-_KEYFRAMES = ("-g", "2")  # training reads frames anywhere
-_COUNTED = 64  # pixels from one that the statistics count, to the next
+_KEYFRAMES = ("-g", "2")  # for random access in training
+_COUNTED = 64  # pixels between those that the statistics count
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = False) -> None:
-    """Writes motions of one hand and one control step as a dataset, which is a folder, with a camera's video or not."""
+    """Writes motions of one hand and one control step as a dataset folder, optionally with a camera's video.
+
+    Raises:
+      CongraspError: the motions differ in robot or control step, or the control step is no whole number of frames a
+        second.
+    """
     first = motions[0]
     fps = round(1 / first.control_dt)
     if abs(fps * first.control_dt - 1) > 1e-6:
@@ -112,7 +117,7 @@ def _film(path: pathlib.Path, motions: Sequence[GraspMotion], fps: int) -> _Film
     camera, pixels = camera_for(motions), list[np.ndarray]()
 
     def frames() -> Iterator[np.ndarray]:
-        """Every frame, while its pixels are counted."""
+        """Yields every frame, and counts its pixels."""
         for motion in motions:
             counted = []
             for picture in pictures(motion, camera):
@@ -125,7 +130,7 @@ def _film(path: pathlib.Path, motions: Sequence[GraspMotion], fps: int) -> _Film
 
 
 def _filmed(pixels: np.ndarray, frames: int, seconds: np.ndarray) -> dict[str, Any]:
-    """Entries of an episode's row for its part of the video, from one second (2,) to another."""
+    """Entries of an episode's row for its part of the video, between two times (2,), s."""
     begin, end = seconds.tolist()
     place = {**_PLACE, "from_timestamp": begin, "to_timestamp": end}
     statistics = _image_statistics(pixels, frames)
@@ -136,13 +141,13 @@ def _filmed(pixels: np.ndarray, frames: int, seconds: np.ndarray) -> dict[str, A
 
 
 def _image_statistics(pixels: np.ndarray, frames: int) -> dict[str, Any]:
-    """Statistics of pixels (n, 3): each has the shape (3, 1, 1), and what is counted are frames."""
+    """Statistics of pixels (n, 3), of shape (3, 1, 1) each; the count is that of frames."""
     found = {name: np.reshape(values, (-1, 1, 1)).tolist() for name, values in _statistics(pixels).items()}
     return found | {"count": [frames]}
 
 
 def _video_feature(fps: int) -> dict[str, Any]:
-    """The camera among the features."""
+    """Description of the camera as a feature."""
     width, height = SIZE
     about = {"height": height, "width": width, "channels": 3, "codec": "h264", "pix_fmt": "yuv420p", "fps": fps}
     about |= {"is_depth_map": False}
@@ -197,7 +202,7 @@ def _column(values: np.ndarray) -> pa.Array:
 
 
 def _tasks_table(tasks: Sequence[str]) -> pa.Table:
-    """Tasks as pandas writes a frame with one column and the tasks as its index: that is how LeRobot finds them."""
+    """Tasks in pandas' format of a frame with one column and the tasks as its index, as LeRobot expects them."""
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
         for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
@@ -263,7 +268,7 @@ def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int)
 
 
 def read(path: pathlib.Path) -> list[Track]:
-    """Every episode as the files describe it: features by name, kinematics by the URDF."""
+    """Reads every episode by the description in the files: features by name, kinematics by the URDF."""
     info = json.loads((path / "meta" / "info.json").read_text())
     (urdf,) = (file.read_text() for file in (path / "meta").glob("*.urdf"))
     about = json.loads((path / "meta" / "congrasp.json").read_text())

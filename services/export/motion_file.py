@@ -30,7 +30,7 @@ from congrasp.services.record.moved_arm import MovedArm
 
 FORMAT = 2
 MAX_BYTES = 256 << 20
-"""Bytes that the arrays of a motion may have together."""
+"""Limit of the total size of a motion's arrays, bytes."""
 _LARGEST = 1e6
 _INDICES = ("object_colour_values", "object_faces", "joint_link", "link_parent", "capsule_link")
 _META = "meta"
@@ -87,11 +87,11 @@ class GraspMotion:
     surface_points: Annotated[np.ndarray, "(N, 3) m, object frame, points of the surface"]
     surface_avoid: Annotated[np.ndarray, "(N,) bool, must not be touched (where affordance is among the constraints)"]
     colours: Colours | None
-    """The object's own, in its frame."""
+    """Colours of the object, in its frame, if it has any."""
     goal: dict[str, np.ndarray]
-    """Goal arrays of the constraints that the policy knows, by constraint and field: `heading_direction`, `pose_q`."""
+    """Goal arrays of the policy's constraints, by constraint and field: `heading_direction`, `pose_q`."""
     arm: MovedArm | None = None
-    """The arm that carries the hand, if there is one. Its wrist is off the hand's by the error of its path."""
+    """The arm that carries the hand, if there is one. Its wrist deviates from the hand's by its tracking error."""
 
 
 _GOALS = {
@@ -99,7 +99,7 @@ _GOALS = {
     for constraint in CONSTRAINTS
     for name, array in constraint.arrays.items()
 }
-"""Meaning of the goal arrays; it begins with the shape, as that of the others does."""
+"""Meaning of the goal arrays; like the others, each begins with the shape."""
 _HINTS = get_type_hints(GraspMotion, include_extras=True)
 _ARRAYS = {name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")}
 _FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name not in ("goal", "colours", "arm"))

@@ -40,7 +40,11 @@ _UNIT = 1e-3
 
 
 def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:
-    """The motion of an NPZ file, or an episode recorded at `path` (see `pick_episode`)."""
+    """The motion of an NPZ file, or an episode recorded at `path` (see `pick_episode`).
+
+    Raises:
+      CongraspError: `path` is missing or holds no motion, or an NPZ file's index is neither -1 nor 0.
+    """
     if not path.exists():
         raise CongraspError(f"There is no {path}.", "Pass a motion (.npz), a recording (.mcap) or a run's folder.")
     if path.suffix == ".npz":

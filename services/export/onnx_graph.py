@@ -14,7 +14,7 @@ from congrasp.common.policy.network import CLOUD, POINT, TRUNK, gated, layer_cou
 from congrasp.common.policy.normalizer import LIMIT
 
 OPSET = 17
-"""Old enough for every runtime in use; the graph needs nothing newer."""
+"""An old version, which every runtime in use supports; the graph needs no newer one."""
 _IR_VERSION = 8
 
 
@@ -54,7 +54,7 @@ def policy_model(bundle: PolicyBundle, meta: Mapping[str, Any]) -> onnx.ModelPro
 
     Args:
       bundle: the policy.
-      meta: what goes into the file, each value as JSON.
+      meta: metadata of the file; each value is stored as JSON.
     """
     layout, layers = bundle.spec.layout, bundle.params["actor"]["network"]
     shift, scale = bundle.inference_parameters.normalization

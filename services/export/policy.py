@@ -77,9 +77,9 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
 
 
 def observation_fields(bundle: PolicyBundle) -> list[dict[str, Any]]:
-    """The observation's numbers in order: block, field, how many, and what they are.
+    """Fields of the observation in order: block, field, size and meaning.
 
-    "wrist" is the wrist frame, in which all vectors are unless something else is said.
+    Vectors are in the wrist frame ("wrist") unless the meaning names another.
     """
     described = observation.fields(get_hand(bundle.spec.hand), bundle.task)
     return [
@@ -104,7 +104,7 @@ def wrist_servos(hand: Hand) -> dict[str, dict[str, Any]]:
 
 
 def motors(hand: Hand) -> list[dict[str, Any]]:
-    """The fingers' motors in the order of their actions: what each pulls and how far, and where it puts joints.
+    """The fingers' motors in the order of their actions, with coefficients, limits and the joints that they move.
 
     A motor's position is the sum of `pulls` times its joints' angles; a joint's target is `ratio` times that of its
     motor, and `rest`. Most hands have a motor for each joint, with ones and zeros.
@@ -126,7 +126,7 @@ def motors(hand: Hand) -> list[dict[str, Any]]:
 
 
 def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
-    """The action's numbers in order: the motor or wrist joint, the scale, and how a target comes of them."""
+    """The action's numbers in order: the motor or wrist joint, the scale, and the formula of its target."""
     control = bundle.task.control
     fingers = [
         {
@@ -152,7 +152,7 @@ def action_meaning(bundle: PolicyBundle) -> list[dict[str, Any]]:
 
 
 def sample_observations(bundle: PolicyBundle, count: int, seed: int = 0) -> np.ndarray:
-    """Observations (count, D) within and beyond the policy's range: three times as spread, with random masks."""
+    """Observations (count, D) within and beyond the policy's range: of three times its spread, with random masks."""
     rng = np.random.default_rng(seed)
     known = bundle.observation
     spread = np.sqrt(np.asarray(known.m2) / max(float(known.count), 1.0)) + 1e-3
@@ -170,7 +170,7 @@ def sample_observations(bundle: PolicyBundle, count: int, seed: int = 0) -> np.n
 
 
 def export_policy(bundle: PolicyBundle, kind: str, path: pathlib.Path) -> float:
-    """Writes a policy and compares what the file says with the Flax policy, on observations drawn at random.
+    """Writes a policy, and compares the file with the Flax policy on random observations.
 
     Args:
       bundle: the policy.

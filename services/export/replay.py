@@ -3,7 +3,7 @@
 An object of 0.1 kg floats without table and gravity, friction 0.6. The hand is at the grasp with its targets at the
 squeeze, or at the pregrasp, from which targets go to the grasp and on to the squeeze, 0.4 s each, open loop. Then the
 object is pushed for two seconds by 1 N along or against an axis of the world, each push from the start. Motors have the
-benchmark's gains and no speed feedback beside the joints' damping, and contacts have the benchmark's stiffness and
+benchmark's gains and no speed feedback except the joints' damping, and contacts have the benchmark's stiffness and
 torsional friction. Collision shapes are the benchmark's boxes for Allegro, and this project's shapes for Shadow.
 """
 
@@ -33,8 +33,8 @@ MASS, FRICTION, TORSION = 0.1, 0.6, 0.02
 _HAND, _OBJECT = ((0.005, 1.0), (0.5, 0.99, 1e-4)), ((0.02, 1.0), (0.9, 0.95, 1e-3))
 """`solref` and the first of `solimp`, of which a contact has the mean."""
 STARTS = ("grasp", "pregrasp")
-_STAGE, _PUSH, _LOOK = 40, 200, 10  # control steps: of a stage, of a push, and from one look at contacts to the next
-_TOGETHER = 32  # grasps side by side
+_STAGE, _PUSH, _LOOK = 40, 200, 10  # control steps: of a stage, of a push, and between two measurements of contacts
+_TOGETHER = 32  # grasps in parallel
 _TASK = TaskConfig()
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
@@ -44,7 +44,7 @@ class Replayed(NamedTuple):
 
     name: str
     from_grasp: bool
-    """It survived all six pushes from the grasp: within 5 cm and 15 degrees of where the object was."""
+    """True if the object stayed within 5 cm and 15 degrees of its pose under all six pushes from the grasp."""
     from_pregrasp: bool
     """The same from the pregrasp."""
     depth_mm: float
@@ -113,7 +113,7 @@ def _pushed(physics: NativePhysics, hand: Hand, grasps: Sequence[Grasp], start: 
 
 
 def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:
-    """Puts six worlds for each grasp to a state, without gravity."""
+    """Sets six worlds for each grasp to a state, without gravity."""
     states = [grasp.states[start] for grasp in grasps]
     objects = [(grasp.object_position, grasp.object_rotation.as_quat(scalar_first=True)) for grasp in grasps]
 
@@ -142,7 +142,7 @@ def _begin(physics: NativePhysics, grasps: Sequence[Grasp], start: str) -> None:
 
 
 def _harden(model: mujoco.MjModel) -> None:
-    """No gravity, and contacts as the benchmark has them."""
+    """Removes gravity, and sets the benchmark's contact parameters."""
     model.opt.gravity[:] = 0.0
     model.opt.noslip_iterations = 2
     mine = model.geom_bodyid == model.body("object").id
@@ -152,7 +152,7 @@ def _harden(model: mujoco.MjModel) -> None:
 
 
 def _script(hand: Hand, grasps: Sequence[Grasp], stages: Sequence[str]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Targets (6 N, 6 + M) and forces (6 N, 3) of each control step: from state to state, then the pushes."""
+    """Yields targets (6 N, 6 + M) and forces (6 N, 3) of each control step: from state to state, then the pushes."""
     pushes = np.tile(PUSH_FORCE * _AXES, (len(grasps), 1))
     # From the grasp the targets are the squeeze at once.
     shares = np.linspace(0.0, 1.0, _STAGE + 1)[1:] if len(stages) > 2 else np.ones(_STAGE)
@@ -167,7 +167,7 @@ def _script(hand: Hand, grasps: Sequence[Grasp], stages: Sequence[str]) -> Itera
 
 
 def _between(hand: Hand, states: Mapping[str, State], names: tuple[str, str, str], share: float) -> np.ndarray:
-    """(6 + M,) targets with the wrist's base at the first of three states, a share of the way between the others."""
+    """(6 + M,) targets at a share between two states, the last of three names; the first is the wrist's base."""
     base, first, second = (states[name] for name in names)
     position = (1 - share) * first.position + share * second.position
     turn = first.rotation * Rotation.from_rotvec(share * (first.rotation.inv() * second.rotation).as_rotvec())

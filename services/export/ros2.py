@@ -21,7 +21,7 @@ from congrasp.services.export.motion_file import GraspMotion, robot_joints
 from congrasp.services.export.urdf import forward_kinematics, robot_urdf
 
 _WORLD = "world"
-_START = 10**9  # ns; TF takes a stamp of zero for "whenever"
+_START = 10**9  # ns; in TF a stamp of zero means any time
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
@@ -44,7 +44,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         bag.set_custom_data("congrasp", json.dumps(about))
 
         def send(topic: str, kind: str, messages: Sequence[Any], *, once: bool = False) -> None:
-            """Writes messages at the motion's times; those that come `once` are kept for late subscribers."""
+            """Writes messages at the motion's times; with `once`, late subscribers receive the last one."""
             qos = [_latched()] if once else []
             channel = bag.add_connection(topic, kind, typestore=store, offered_qos_profiles=qos)
             for stamp, message in zip(stamps, messages, strict=False):
@@ -75,7 +75,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 
 
 def _latched() -> Any:
-    """Quality of service of a topic whose last message late subscribers get."""
+    """Quality of service of a topic whose last message late subscribers receive."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     never = QosTime(0x7FFFFFFF, 0xFFFFFFFF)
@@ -99,7 +99,7 @@ class _Messages:
         return self("std_msgs/Header", stamp=time, frame_id=frame)
 
     def duration(self, ns: int) -> Any:
-        """A duration of so many ns."""
+        """A duration in ns."""
         return self("builtin_interfaces/Duration", sec=ns // 10**9, nanosec=ns % 10**9)
 
     def vector(self, values: np.ndarray, kind: str = "Vector3") -> Any:
@@ -260,7 +260,7 @@ def read(path: pathlib.Path) -> list[Track]:
 
 
 def _poses(transforms: Sequence[Any]) -> np.ndarray:
-    """(T, 4, 4)."""
+    """(T, 4, 4) matrices of T transforms."""
     position = np.array([[t.translation.x, t.translation.y, t.translation.z] for t in transforms])
     turns = Rotation.from_quat([[t.rotation.x, t.rotation.y, t.rotation.z, t.rotation.w] for t in transforms])
     return pose_matrices(position, turns)

@@ -1,4 +1,4 @@
-"""Texture coordinates of a mesh: neighbouring faces towards the same side are a chart; charts lie beside each other."""
+"""Texture coordinates of a mesh: adjacent faces towards the same side are a chart; charts do not overlap."""
 
 from typing import NamedTuple
 
@@ -7,14 +7,14 @@ import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-_MARGIN = 0.004  # between charts, of the root of the surface's area
+_MARGIN = 0.004  # space between charts, as a share of the root of the surface's area
 
 
 class Unwrapped(NamedTuple):
-    """A mesh whose points have texture coordinates; its faces are those given, in the same order."""
+    """A mesh whose points have texture coordinates; its faces are those of the original, in the same order."""
 
     source: np.ndarray
-    """(M,) int, of each point: its number in the given mesh, of which charts at a seam have one point each."""
+    """(M,) int, index of each point in the original mesh; at a seam each chart has a separate point."""
     faces: np.ndarray
     """(F, 3) int."""
     uv: np.ndarray

@@ -14,9 +14,9 @@ from congrasp.services.export.motion_file import GraspMotion, robot_joints
 from congrasp.services.record.moved_arm import UNLIMITED, MovedArm
 
 _MASS, _INERTIA = "0.01", "1e-6"
-"""Of every link: only the kinematics is meant, but some readers refuse a link without."""
+"""Placeholders for every link: only the kinematics is exported, but some readers need them."""
 _SPEED = 20.0
-"""Of the hand's joints, rad/s."""
+"""Speed limit of the hand's joints, rad/s."""
 
 
 class _Joint(NamedTuple):
@@ -32,14 +32,14 @@ class _Joint(NamedTuple):
     limits: np.ndarray
     """(2,) rad or m."""
     speed: float
-    """Largest, rad/s or m/s."""
+    """Largest speed, rad/s or m/s."""
 
 
 def robot_urdf(motion: GraspMotion) -> str:
     """The hand as URDF, whose palm is the root; with an arm the whole robot, whose root is the arm's base.
 
-    Links and joints keep their names and frames. URDF has one joint between two links: a link that several move hangs
-    on links of its name and a number. Efforts are not those of the robot.
+    Links and joints keep their names and frames. URDF has one joint between two links, so that a link with several
+    joints gets intermediate links of its name and a number. Efforts are not those of the robot.
     """
     arm = motion.arm
     robot = ET.Element("robot", name=f"{arm.name}_{motion.hand}" if arm else motion.hand)
@@ -54,7 +54,7 @@ def robot_urdf(motion: GraspMotion) -> str:
 
 
 def _add_hand(robot: ET.Element, motion: GraspMotion) -> None:
-    """Adds the hand's links. With all joints at zero they are turned as the palm."""
+    """Adds the hand's links, which have the palm's orientation with all joints at zero."""
     names = robot_joints(motion)[-len(motion.joint_names) :]
     origins = np.zeros((len(motion.link_names), 3))  # of the links' frames in the wrist frame, all joints at zero
     for i, (name, parent) in enumerate(zip(map(str, motion.link_names), motion.link_parent, strict=True)):
@@ -99,7 +99,7 @@ def _add_arm(robot: ET.Element, arm: MovedArm) -> None:
 def _add_link(
     robot: ET.Element, name: str, carrier: str, place: np.ndarray, turn: Rotation, joints: Sequence[_Joint]
 ) -> None:
-    """Adds the joints between a link and its carrier, in whose frame it is so placed with all joints at zero."""
+    """Adds the joints between a link and its carrier; `place` and `turn` are its pose there with all joints at zero."""
     for number, (joint, kind, axis, anchor, limits, speed) in enumerate(joints):
         ends = number == len(joints) - 1 and np.allclose(anchor, 0, atol=1e-9)
         child = name if ends else f"{name}_{number}"
@@ -137,7 +137,7 @@ def _joint(
 
 
 def _add_capsules(link: ET.Element, motion: GraspMotion, index: int) -> None:
-    """Each capsule as a cylinder and two spheres, which is what URDF has."""
+    """Adds each capsule as a cylinder and two spheres, because URDF has no capsules."""
     for number, length, radius, middle, turn in capsules(motion, index):
         for end in motion.capsule_ends[number]:
             ET.SubElement(_visual(link, end, np.zeros(3)), "sphere", radius=_number(radius))
@@ -154,7 +154,7 @@ def _visual(link: ET.Element, position: np.ndarray, angles: np.ndarray) -> ET.El
 
 
 def _number(value: float) -> str:
-    """Nine digits."""
+    """Formats a number with nine digits."""
     return f"{value:.9g}"
 
 
@@ -166,17 +166,17 @@ def _numbers(values: np.ndarray) -> str:
 def forward_kinematics(
     urdf: str, angles: Mapping[str, np.ndarray], wrist: np.ndarray, palm: str, base: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Poses (T, 4, 4) of all links, worked out by MuJoCo from the file's text.
+    """Poses (T, 4, 4) of all links, computed by MuJoCo from the file's text.
 
     Args:
       urdf: the text.
       angles: (T,) of each joint by name, rad.
-      wrist: (T, 4, 4) poses of the palm, which carries the links below it along.
+      wrist: (T, 4, 4) poses of the palm, with which the links below it move.
       palm: name of the palm.
       base: (T, 4, 4) or (4, 4) pose of the root.
     """
     robot = ET.fromstring(urdf)
-    extension = ET.SubElement(robot, "mujoco")  # else links without joints are merged, and pictures thrown away
+    extension = ET.SubElement(robot, "mujoco")  # keeps links without joints, which would be merged
     ET.SubElement(extension, "compiler", fusestatic="false")
     model = mujoco.MjModel.from_xml_string(ET.tostring(robot, "unicode"))
     data = mujoco.MjData(model)

@@ -77,7 +77,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 
 
 def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link: int) -> None:
-    """The link's capsules in its frame, what physics knows of it; viewers hide guides."""
+    """Adds the link's capsules in its frame, which are its collision shapes; viewers hide guides."""
     for number, length, radius, middle, turn in capsules(motion, link):
         capsule = UsdGeom.Capsule.Define(stage, parent.AppendChild(f"capsule_{number}"))
         capsule.CreatePurposeAttr(UsdGeom.Tokens.guide)
@@ -91,7 +91,7 @@ def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link:
 
 
 def _add_mesh(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion) -> None:
-    """The object's mesh in its frame."""
+    """Adds the object's mesh in its frame."""
     vertices, faces, colours = object_mesh(motion)
     mesh = _new_mesh(stage, parent.AppendChild("mesh"), vertices, faces)
     _add_coordinates(mesh, vertices, faces)
@@ -103,7 +103,7 @@ def _add_mesh(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion) -> None:
 
 
 def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body]) -> None:
-    """The hand's surface, a skeleton of its links, and the animation of these."""
+    """Adds the hand's surface, a skeleton of its links, and their animation."""
     root = UsdSkel.Root.Define(stage, path)
     skeleton = UsdSkel.Skeleton.Define(stage, path.AppendChild("skeleton"))
     animation = UsdSkel.Animation.Define(stage, path.AppendChild("animation"))
@@ -128,7 +128,7 @@ def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body
 
 
 def _add_surface(stage: Usd.Stage, path: Sdf.Path, skin: Skin, skeleton: UsdSkel.Skeleton) -> None:
-    """The hand's surface, bound to a skeleton of its links."""
+    """Adds the hand's surface, bound to a skeleton of its links."""
     mesh = _new_mesh(stage, path, skin.points, skin.faces)
     _add_coordinates(mesh, skin.points, skin.faces)
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(skin.normals))

@@ -17,7 +17,7 @@ from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.sampling.build import clear_of_table
 from congrasp.common.task.sampling.headings import INWARD, above, max_width, sample_headings, within_reach
 
-_ACROSS = 0.02  # m that opposite normals count as: the two sides of a thin wall may belong to different regions
+_ACROSS = 0.02  # m per unit of normal difference: the two sides of a thin wall may belong to different regions
 
 
 def headings(
@@ -26,6 +26,9 @@ def headings(
     """Positions, directions, cross-finger axes (B, 3) and resting poses (B,) of attempts that the table allows.
 
     Likelier resting poses come more often.
+
+    Raises:
+      CongraspError: no approach fits the request.
     """
     direction, position = request.given("heading", "direction"), request.given("heading", "position")
     restricted = request.avoid is not None
@@ -116,7 +119,11 @@ def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def valid_rests(hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Resting poses in which a wrist path (n, 3) with a last orientation (4,) stays over the table, not from below."""
+    """Resting poses in which a wrist path (n, 3) stays over the table and its last orientation (4,) is not from below.
+
+    Raises:
+      CongraspError: there is none.
+    """
     valid = np.flatnonzero(clear_of_table(hand, turn[None], path[None], obj.rest_poses[None])[0])
     if not len(valid):
         raise CongraspError(

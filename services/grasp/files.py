@@ -31,17 +31,17 @@ from congrasp.services.viz.views import View, camera_of, views
 
 MOTION, RECORDING, PICTURE, VIDEO, RESULT = "grasp.npz", "grasp.mcap", "grasp.png", "grasp.mp4", "result.json"
 PORTRAIT = "portrait.png"
-"""Its last frame, 1280 x 720, from two sides."""
-_FORMAT = 4  # of result.json: what was written with another is done anew
+"""The last frame, 1280 x 720, from two sides."""
+_FORMAT = 4  # of result.json: results of another format are repeated
 THUMBNAIL = "thumbnail.png"
-"""A picture of its last frame."""
+"""A small picture of the last frame."""
 OBJECT = "object.png"
 """Pictures of the object before and after its import."""
 
 
 _SMALL = (320, 240)  # pixels
-_HELD = 0.5  # of the hold, in videos, s
-_FRAMED = 10  # steps from one that the video's camera must hold to the next
+_HELD = 0.5  # s of the hold in videos
+_FRAMED = 10  # control steps between the frames that the video's camera must contain
 
 
 def save_grasp(
@@ -53,15 +53,15 @@ def save_grasp(
     about: dict[str, Any],
     view: View | None = None,
 ) -> None:
-    """Writes a grasp; the result comes last, so that where there is one everything is there.
+    """Writes a grasp; the result comes last, so that its presence means that all files are complete.
 
     Args:
       folder: the object's folder.
       found: the grasp.
-      film: how the MP4 is drawn; None writes none.
-      pictures: also writes the contact sheet.
+      film: style of the MP4; None writes none.
+      pictures: also writes the contact sheet, the portrait, the thumbnail and, with an arm, the arm's picture.
       about: further entries of the result.
-      view: where pictures and video are seen from; what shows most of the grasp by default.
+      view: viewpoint of pictures and video; the one that shows most of the grasp by default.
 
     Raises:
       CongraspError: a file cannot be written.
@@ -94,7 +94,7 @@ def save_grasp(
 
 
 def _steps_to_draw(first: int, end: int, last: int) -> list[int]:
-    """Up to eight steps worth seeing: before a grasp begins at `first`, of it, after its `end`, and the last."""
+    """Up to eight steps to draw: before the grasp begins at `first`, during it, after its `end`, and the last one."""
     reach = [0, first / 2] if first else []
     grasp = np.linspace(first, min(end, last), 6 - len(reach))
     return sorted({round(step) for step in [*reach, *grasp, (end + last) / 2, last]})
@@ -116,7 +116,7 @@ def save_recording(path: pathlib.Path, episode: Message) -> None:
 
 
 def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
-    """The result of an object that was grasped before by the same key; None where there is none."""
+    """The stored result of an earlier grasp with the same key; None if there is none."""
     try:
         result = json.loads((folder / RESULT).read_text())
     except (OSError, ValueError):
@@ -125,5 +125,5 @@ def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
 
 
 def key_of(*parts: Any) -> str:
-    """Sixteen hex digits that change when anything that makes a grasp does."""
+    """Sixteen hex digits that change with any input of a grasp."""
     return hashlib.sha256(json.dumps((_FORMAT, *parts), default=str).encode()).hexdigest()[:16]

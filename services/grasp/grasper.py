@@ -44,22 +44,22 @@ if TYPE_CHECKING:
     from congrasp.services.arm.planner import ArmMotion, ArmPlanner
 
 ATTEMPTS = 16
-"""Grasps that are simulated side by side."""
+"""Number of grasps simulated in parallel."""
 ROUNDS = 4
-"""Number of further rounds of attempts while none holds."""
+"""Maximum number of rounds; a round follows another while no attempt holds."""
 _SCALES = {spec.name: spec.scale for constraint in CONSTRAINTS for spec in constraint.errors}
 _SCALES |= {"moved_at_removal": 0.01, "force_link_max": 10.0, "slip": 0.02}
 """Scales that make costs of grasps that hold comparable: errors, displacement of the object before table removal (m),
 force of the strongest link (N), and displacement after removal (m)."""
 _FIRM = ("clean", *SURVIVAL)
-"""Cost of a grasp that lacks it."""
+"""Metrics that add a cost of 1 where they are zero."""
 _UNLIKELY = 0.5
-"""Cost of each resting pose that precedes a grasp's own."""
+"""Cost of each resting pose that is preferred to a grasp's initial one, see `_places`."""
 _TOUCHED = 0.2
-"""Share of touches on what must not be touched from which others are attempted."""
+"""Share of contacts in the avoid region at and above which an attempt does not count as a hold."""
 
 Progress = Callable[[str, int, int], None]
-"""Told what is done, how much of it, and of how much."""
+"""Called with the current activity, the completed steps and the number of steps."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Grasp:
     """The best of some attempts."""
 
     episode: Message
-    """The whole episode, as recordings keep it."""
+    """The whole episode, in the format of recordings."""
     motion: GraspMotion
     """Content of the NPZ."""
     attempts: int
@@ -79,22 +79,22 @@ class Grasp:
     active: tuple[str, ...]
     """Active constraints and the reasons, in sentences."""
     arm: "ArmMotion | None" = None
-    """The same on an arm, if there is one."""
+    """The motion of the arm, if there is one."""
 
     @property
     def success(self) -> bool:
-        """True if this one held the object to the end."""
+        """True if this attempt held the object to the end."""
         return self.motion.metrics["held"] > 0
 
     @property
     def sink(self) -> float:
-        """Metres by which the wrist sinks in the hold at most."""
+        """Largest drop of the wrist during the hold, m."""
         height = self.motion.wrist_position[self.first("hold") :, 2]
         return float(max(height[0] - height.min(), 0.0))
 
     @property
     def shove(self) -> float:
-        """Metres by which the object moves at most before it is lifted, or the table removed."""
+        """Largest displacement of the object before it is lifted or the table is removed, m."""
         phase = "lift" if "lift" in self.motion.about["phases"] else "hold"
         moved = self.motion.object_position[: self.first(phase)] - self.motion.object_position[0]
         return float(np.linalg.norm(moved, axis=-1).max())
@@ -144,13 +144,13 @@ class Grasper:
 
         Args:
           policy: the policy, which names the hand.
-          attempts: grasps side by side.
-          rounds: how often that many others are attempted while none holds.
-          phases: reach, lift and hold.
-          threads: of the physics; 0 takes one a core.
-          seed: draws what is attempted.
-          arm: the arm that must be able to do it.
-          left: the hand is the left one of the policy's: the right one grasps the mirrored object (`common.mirror`).
+          attempts: grasps simulated in parallel, in each round.
+          rounds: maximum number of rounds; a round follows another while no attempt holds.
+          phases: approach, lift and hold.
+          threads: threads of the physics; 0 for one per core.
+          seed: seed of the attempts.
+          arm: the arm that must be able to execute the motion.
+          left: grasps with the left hand; the policy's right hand grasps the mirrored object (`common.mirror`).
         """
         self._arm = arm
         self._hand, self._left = get_hand(policy.spec.hand), left
@@ -167,12 +167,13 @@ class Grasper:
 
         Args:
           obj: the object.
-          request: constraints on it; any grasp by default.
-          progress: told how far it is.
+          request: constraints on the grasp; none by default.
+          progress: called with the progress.
 
         Raises:
           UnknownConstraintError: the policy does not know one of the constraints.
           ContradictionError: two of them exclude each other.
+          NoReachError: without an arm, no planned approach leads to the grasp.
           CongraspError: the table is in the way of all attempts, or the arm can do none that holds the object.
         """
         request = request or GraspRequest()
@@ -197,7 +198,7 @@ class Grasper:
             attempted += different
             holds = outcome.metrics["held"][:different] > 0
             held += int(holds.sum())
-            if request.avoid is not None:  # one that holds it by what must not be touched is not what was asked for
+            if request.avoid is not None:  # a hold by the avoid region does not meet the request
                 holds &= outcome.metrics["affordance_ratio"][:different] < _TOUCHED
             if self._arm:
                 make = functools.partial(self._result, obj, request, outcome, episodes.goal, rests, attempted, held)
@@ -217,7 +218,7 @@ class Grasper:
         return self._result(obj, request, outcome, wanted, rests, attempted, held, index)
 
     def close(self) -> None:
-        """Ends the physics' threads."""
+        """Ends the threads of the physics."""
         self._attempts.close()
 
     def _on_arm(
@@ -314,7 +315,7 @@ def grasp(
     progress: Progress = lambda what, done, total: None,
     **constraints: Any,
 ) -> Grasp:
-    """The best grasp motion of an object under constraints; what is compiled is kept for the next call.
+    """The best grasp motion of an object under constraints; compiled programs are kept for the next call.
 
     Example:
       import congrasp
@@ -324,12 +325,12 @@ def grasp(
 
     Args:
       mesh: a mesh (STL, OBJ, PLY, GLB), an object file, FAMILY:SEED of the generator, or an object.
-      policy: a policy file; the one that comes with the package if none is named.
-      hand: name of the hand whose pretrained policy is taken; `human:left` is its left hand.
-      options: how a mesh becomes an object.
-      attempts: grasps that are simulated side by side.
-      seed: draws what is attempted.
-      progress: told how far it is.
+      policy: a policy file; the pretrained policy of the hand by default.
+      hand: name of the hand; `human:left` is the left one of `human`.
+      options: import options of a mesh.
+      attempts: grasps simulated in parallel.
+      seed: seed of the attempts.
+      progress: called with the progress.
       **constraints: the options of `congrasp grasp`: heading, at, affordance, avoid, pose, trajectory, fingers, …; each
         is the text that the command line takes, or a sequence of its words or numbers.
 
@@ -346,7 +347,7 @@ def grasp(
 
 @functools.lru_cache(maxsize=2)
 def _grasper(file: pathlib.Path, changed: int, attempts: int, seed: int, left: bool) -> Grasper:
-    """The grasper of a policy file as it was when it changed last."""
+    """The grasper of a policy file, by its time of modification `changed`."""
     return Grasper(bundles.load(file), attempts=attempts, seed=seed, left=left)
 
 
@@ -362,9 +363,10 @@ def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspReque
 
 
 def surface_of(task: TaskConfig, obj: GraspObject) -> Surface:
-    """As many labelled points of an object as the policy looks at, without batch axis."""
+    """Labelled points of an object, as many as the policy observes, with their normals if it observes them."""
     points = task.surface_points
-    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points])
+    normals = np.asarray(obj.normals[:points], np.float32) if task.surface_normals else None
+    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points], normals)
 
 
 def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
@@ -388,13 +390,13 @@ def _errors_of(constraints: tuple[str, ...]) -> list[str]:
 
 
 def costs(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float = 0.0) -> np.ndarray:
-    """(B,) cost of each attempt: first whether it held, then whether it did for a while, then all the rest.
+    """(B,) cost of each attempt: held to the end first, then held for a quarter of a second, then everything else.
 
     Args:
-      outcome: of the attempts.
-      constraints: names of those that were asked for.
+      outcome: outcome of the attempts.
+      constraints: names of the requested constraints.
       removal: the last control step of the approach.
-      lift: metres by which the hand went up after it.
+      lift: height by which the hand rises after the approach, m.
     """
     place = outcome.trace.object_position
     way = place[-1] - place[removal] - [0.0, 0.0, lift]
@@ -405,7 +407,7 @@ def costs(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: fl
 
 
 def _no_motion(obj: GraspObject, arm: str, attempts: int, refused: collections.Counter[str]) -> CongraspError:
-    """Error where an arm can do no attempt that holds the object, with the limits that forbid them."""
+    """Error if an arm can execute no attempt that holds the object, with the limits that forbid them."""
     if not refused:
         return CongraspError(f"None of {attempts} attempts holds '{obj.name}'.", "Set more --attempts.")
     limits = ", ".join(f"{limit} {count}" for limit, count in refused.most_common())
@@ -416,7 +418,7 @@ def _no_motion(obj: GraspObject, arm: str, attempts: int, refused: collections.C
 
 
 def _places(obj: GraspObject, rests: np.ndarray, request: GraspRequest) -> np.ndarray:
-    """(B,) places of resting poses: upright first, then by likelihood; zeros where one was asked for."""
+    """(B,) ranks of the resting poses: upright first, then by likelihood; zeros if the request names one."""
     if request.rest is not None:
         return np.zeros_like(rests)
     upright = upright_rest(obj)
@@ -427,6 +429,6 @@ def _check_aligned(outcome: Outcome) -> None:
     """Raises a ContradictionError if trajectory and affordance exclude each other."""
     if not outcome.aligned.all():
         raise ContradictionError(
-            "The trajectory ends nearer to what must not be touched than to what may be grasped.",
+            "The trajectory ends nearer to the avoid region than to the graspable part.",
             "Let it end at the graspable part, or leave out --affordance and --avoid.",
         )

@@ -49,7 +49,7 @@ class Settings(NamedTuple):
     again: bool
     """Repeats finished objects."""
     rest: str = ""
-    """Resting pose: `upright` or a number from 1 on; any where empty."""
+    """Resting pose: `upright` or a number from 1 on; any if empty."""
 
 
 class Result(NamedTuple):
@@ -57,7 +57,7 @@ class Result(NamedTuple):
 
     name: str
     facts: dict[str, Any]
-    """As in the result file; empty where there is an error."""
+    """Content of the result file; empty if there is an error."""
     error: str = ""
     skipped: bool = False
     """It was finished before."""
@@ -68,7 +68,7 @@ class Result(NamedTuple):
         return bool(self.facts.get("success")) and self.facts["shape_reliable"]
 
     def line(self) -> str:
-        """One line."""
+        """Summary in one line."""
         if self.error:
             return self.error
         facts = self.facts
@@ -95,11 +95,10 @@ def _shown(facts: dict[str, Any], stem: str) -> str:
 
 
 def find_objects(paths: Sequence[pathlib.Path], folder: str = "objects") -> tuple[list[ObjectAt], list[Result]]:
-    """The objects of some paths (meshes, object files, folders of either), and errors of paths that hold none.
+    """The objects of some paths (meshes, object files, folders of either), and errors of paths without objects.
 
-    A path that is not there may be the name of an object in `folder`.
-
-    The objects have different names, which become those of their folders.
+    A path that does not exist may be the name of an object in `folder`. Objects of the same name get numbers, because
+    each name is that of a folder.
     """
     found: list[ObjectAt] = []
     errors: list[Result] = []
@@ -118,7 +117,7 @@ def _is_name(path: pathlib.Path) -> bool:
 
 
 def _distinct(found: Sequence[ObjectAt]) -> Iterator[str]:
-    """The names, with a number where one comes again."""
+    """The names, with a number at each repetition."""
     taken: dict[str, int] = {}
     for name, *_ in found:
         taken[name] = taken.get(name, 0) + 1
@@ -196,7 +195,7 @@ def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
 
 
 def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
-    """The object; of an object file, or one of the generator, the options set scale and mass alone."""
+    """The object; for object files and generated objects the options set scale and mass alone."""
     check_options(options)
     if at.source:
         return at.load(options)

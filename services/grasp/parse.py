@@ -1,7 +1,7 @@
-"""Constraints as people write them down, for one object: a direction, a part, a reference pose, a wrist path.
+"""Constraints from text and files, for one object: a direction, a part, a reference pose, a wrist path.
 
 Files give positions in metres in the axes and with the origin of the object's own file. Grasp motions and constraint
-sets, which know the object's frame, are taken as they are.
+sets, which are in the object frame, are used unchanged.
 """
 
 import os
@@ -36,7 +36,7 @@ from congrasp.services.grasp.wrist_paths import HUGE, read_csv, read_wrist_path
 from congrasp.services.record.goals import grasp_span
 
 _LARGEST = 4 << 20  # bytes of a JSON or CSV file
-_FAR = 1.0  # m from an object beyond which nobody grasps it
+_FAR = 1.0  # m from an object; places beyond it have another unit or origin
 
 
 class Target(NamedTuple):
@@ -49,12 +49,12 @@ class Target(NamedTuple):
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) m: the object's frame in the coordinates of its file."""
+        """(3,) m, origin of the object frame in the coordinates of its file."""
         return -np.asarray(self.obj.origin)
 
 
 def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> GraspRequest:
-    """The constraints that a person wrote down for an object.
+    """Reads the constraints of an object from texts.
 
     Args:
       obj: the object.
@@ -64,7 +64,7 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
         and commas where an option takes several words; a sequence of words or numbers stands for such a text.
 
     Raises:
-      CongraspError: something cannot be read or does not fit; the line names it.
+      CongraspError: an option is unknown, cannot be read or does not fit the object; the message names it.
     """
     options = {option.name: option for constraint in CONSTRAINTS for option in constraint.options}
     if unknown := sorted(set(texts) - set(options)):
@@ -133,7 +133,7 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
 
 
 def _check_near(obj: GraspObject, position: np.ndarray, what: str) -> None:
-    """Raises a CongraspError if a place (3,), object frame, is so far off that its unit must be another."""
+    """Raises a CongraspError if a place (3,), object frame, is so far from the object that its unit must be wrong."""
     with np.errstate(over="ignore"):
         away = float(np.linalg.norm(obj.points - position, axis=-1).min())
     if away > _FAR:
@@ -165,7 +165,7 @@ def _part(text: str, name: str, target: Target) -> Part:
             points = np.concatenate([points, trimesh.sample.sample_surface(geometry, 8000, seed=0)[0]])
     except OSError as error:
         raise CongraspError(f"{name}: {path} cannot be read: {error.strerror or error}.", "Check the path.") from None
-    except Exception as error:  # the readers raise whatever they stumble over
+    except Exception as error:  # trimesh's readers raise exceptions of many types
         raise CongraspError(f"{name}: {path} cannot be read as a mesh ({error}).", "Export it as PLY.") from None
     points = points[np.isfinite(points).all(-1)]
     if not len(points):
@@ -237,7 +237,7 @@ def _path(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
 
 
 def _recorded(path: pathlib.Path, joint: str, name: str, target: Target) -> dict[str, np.ndarray]:
-    """The way of a joint of a BVH skeleton to where it is nearest to the object, as captures are cut."""
+    """The path of a BVH joint up to the frame in which it is nearest to the object, cut like captures."""
     recorded = read_wrist_path(path, joint=joint)
     position, rotation = followed(target.hand, recorded.position, recorded.rotation)
     position = position - target.origin
@@ -253,7 +253,7 @@ def _recorded(path: pathlib.Path, joint: str, name: str, target: Target) -> dict
 
 
 def numbered(text: str) -> tuple[pathlib.Path, int]:
-    """The file and the number in FILE or FILE:NUMBER; 0 without."""
+    """The file and the number in FILE or FILE:NUMBER; the number is 0 by default."""
     name, colon, number = text.rpartition(":")
     return (
         (pathlib.Path(name), int(number))
@@ -263,7 +263,7 @@ def numbered(text: str) -> tuple[pathlib.Path, int]:
 
 
 def _motion(path: pathlib.Path, hand: Hand, index: int) -> GraspMotion:
-    """A motion of this hand; a file holds one."""
+    """The motion in a file; raises a CongraspError for another hand, or an `index` other than 0."""
     if index:
         raise CongraspError(f"{path} is one motion and has no number {index}.", "Leave the number out.")
     motion = load_motion(path)
@@ -280,14 +280,14 @@ def grasp_part(motion: GraspMotion) -> tuple[int, int]:
 
 
 def _wrist_on_object(motion: GraspMotion, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """The wrist (T, 3), (T, 4) in the frame of the object as it is in one frame of the motion."""
+    """The wrist (T, 3), (T, 4) in the object frame of one frame of the motion."""
     turn = Rotation.from_quat(motion.object_quaternion[frame], scalar_first=True).inv()
     wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)
     return turn.apply(motion.wrist_position - motion.object_position[frame]), (turn * wrist).as_quat(scalar_first=True)
 
 
 def _set_of(path: pathlib.Path, hand: Hand, obj: GraspObject, index: int) -> Message:
-    """A constraint set of this hand and object, which has a pose and a trajectory of this number."""
+    """The constraint set in a file; raises a CongraspError for another hand or object, or without this number."""
     constraints = constraint_sets.load(path)
     if constraints.meta["hand"] != hand.name:
         raise CongraspError(f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'.")
@@ -319,7 +319,7 @@ def _json(path: pathlib.Path, name: str, keys: tuple[str, ...]) -> dict[str, Any
 
 
 def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Numbers of this shape that can be meant."""
+    """(*shape) numbers below `HUGE`; raises a CongraspError for others."""
     try:
         array = np.asarray(values, float)
     except (TypeError, ValueError, OverflowError):
@@ -353,4 +353,4 @@ _READERS: dict[str, Callable[[str, str, Target], Any]] = {
     "pose": _pose,
     "path": _path,
 }
-"""Readers of an option's text by its kind (`Option.kind`), from the text, the option's name and what it is for."""
+"""Readers of an option's text by its kind (`Option.kind`); their arguments are the text, the option and its target."""

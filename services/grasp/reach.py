@@ -1,8 +1,8 @@
-"""The way of the hand from beside the table to where a grasp begins: planned, free of contact, as smooth as an arm.
+"""The planned approach of the hand from beside the table to the start of a grasp: smooth and free of contact.
 
-The wrist follows a cubic Bezier curve that ends along the heading. Its way s(x), x = t / T, has minimum jerk (Flash and
-Hogan 1985) from rest to the speed at which the policy takes over:
-s = (10 - 4 m) x^3 + (7 m - 15) x^4 + (6 - 3 m) x^5 with m = v T / length. Turn and fingers come to rest (m = 0).
+The wrist follows a cubic Bezier curve that ends along the heading. Its share s(x) of the arc length, x = t / T, has
+minimum jerk (Flash and Hogan 1985) from rest to the speed at which the policy takes over:
+s = (10 - 4 m) x^3 + (7 m - 15) x^4 + (6 - 3 m) x^5 with m = v T / length. Rotation and fingers come to rest (m = 0).
 """
 
 import itertools
@@ -25,15 +25,16 @@ from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.viz.shapes import upright
 
 SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
-"""m/s, m/s^2 and rad/s that the wrist does not exceed."""
+"""Limits of the wrist: m/s, m/s^2 and rad/s."""
 CLEARANCE = 0.01
-"""m between the hand and object or table, as long as the start of the grasp is not nearer and not far."""
-_NEAR_END = 0.8  # share of the curve from which the hand may come as near as the grasp begins
+"""Least clearance of the hand from object and table, m; near the end of the curve, that of the start of the grasp if it
+is smaller."""
+_NEAR_END = 0.8  # share of the curve beyond which the clearance may be that of the start of the grasp
 _BESIDE, _ABOVE = 0.45, 0.04  # of the wrist from the object's centre, of the hand above the table, at first, m
-_WAY = 0.22  # of the wrist further from the object at first than where the grasp begins, at least, m
+_WAY = 0.22  # least horizontal distance by which the wrist starts further from the object than the grasp does, m
 _BESIDE_WITH_ARM, _ABOVE_WITH_ARM, _DOWN_WITH_ARM = 0.12, 0.2, math.radians(60.0)
-"""The same of a hand whose arm needs room to table and base, m, and how far its fingers then point down."""
-_RELAXED = 0.15  # share of the way from the open to the closed pose, before it sets out
+"""The first two for a hand whose arm needs room above the table, m, and the angle by which its fingers point down."""
+_RELAXED = 0.15  # share from the open to the closed pose, of the fingers at first
 _CHECKED, _ALONG = 25, 5  # poses of the curve that are checked, and points on a capsule's axis
 _AZIMUTHS = np.radians([0, 30, -30, 60, -60, 100, -100, 140, -140, 180])
 _FINE = 401  # points of the curve
@@ -45,11 +46,11 @@ _BEGIN = ("object_position", "object_quaternion", "link_position", "link_quatern
 
 
 class NoReachError(CongraspError):
-    """Every way to the grasp touches the object or the table."""
+    """Every approach to the grasp touches the object or the table."""
 
 
 class Reach(NamedTuple):
-    """N poses of a hand, a control step apart; the next one is where the grasp begins."""
+    """N poses of a hand, a control step apart; the grasp begins at the next one."""
 
     position: np.ndarray
     """(N, 3) m, wrist, world."""
@@ -60,7 +61,7 @@ class Reach(NamedTuple):
 
 
 class _Curve(NamedTuple):
-    """A way of the wrist and fingers."""
+    """A path of the wrist and fingers."""
 
     points: np.ndarray
     """(n, 3) along it, m."""
@@ -73,7 +74,7 @@ class _Curve(NamedTuple):
     def at(self, x: np.ndarray, seconds: float, speed: float) -> Reach:
         """Poses at shares x (N,) of the time T = `seconds`, with `speed` (m/s) at its end.
 
-        The wrist only goes forward, s'(x) >= 0, which takes m <= 5/2: where T is longer, it sets out later.
+        The wrist never moves back: s'(x) >= 0 needs m <= 5/2. If T is longer, it starts later.
         """
         way = self.way(x, seconds, speed) * self.length[-1]
         position = np.stack([np.interp(way, self.length, axis) for axis in self.points.T], -1)
@@ -82,7 +83,7 @@ class _Curve(NamedTuple):
         return Reach(position, self.turns(share), (1 - s) * self.fingers[0] + s * self.fingers[1])
 
     def way(self, x: np.ndarray, seconds: float, speed: float) -> np.ndarray:
-        """Shares (N,) of the way at shares x (N,) of the time, see `at`."""
+        """Shares (N,) of the arc length at shares x (N,) of the time, see `at`."""
         moving = min(seconds, 2.5 * self.length[-1] / speed) if speed else seconds
         since = np.clip(1.0 - (1.0 - x) * seconds / moving, 0.0, 1.0)
         return _minimum_jerk(since, speed * moving / self.length[-1])
@@ -104,21 +105,22 @@ def plan_reach(
     speed: float = 0.0,
     side: float | None = None,
 ) -> Reach:
-    """The way to where a grasp begins.
+    """Plans the approach to the start of a grasp.
 
     Args:
       hand: the hand.
       obj: the object.
-      rest: (7,) its pose on the table.
-      heading: (3,) unit, the way that the hand comes, world.
-      first: the one pose in which the grasp begins.
-      seconds: how long it takes; longer where the wrist would be faster than `SPEED`, `ACCELERATION` or `TURNING`.
+      rest: (7,) pose of the object on the table, world frame.
+      heading: (3,) unit vector of the approach, world frame.
+      first: the single pose (N = 1) in which the grasp begins.
+      seconds: requested duration; extended where the wrist would exceed `SPEED`, `ACCELERATION` or `TURNING`.
       dt: length of a control step, s.
-      speed: of the wrist at the end, along the heading, m/s.
-      side: of the object on which the hand's arm stands, rad; it begins there and higher. Any where there is no arm.
+      speed: speed of the wrist at the end, along the heading, m/s.
+      side: azimuth of the arm's base as seen from the object, rad: the hand starts there, and higher. None if there is
+        no arm.
 
     Raises:
-      NoReachError: every way that was tried touches the object or the table.
+      NoReachError: every curve that was tried touches the object or the table.
     """
     x = np.linspace(0, 1, _CHECKED)
     checked = _minimum_jerk(x, 0.0)
@@ -150,7 +152,7 @@ def _curves(
     height: float,
     side: float | None,
 ) -> Iterator[_Curve]:
-    """Ways to try, the plainest first; `fingers` (2, F) at both ends, `height` (m) of the wrist on the table."""
+    """Curves to try, the simplest first; `fingers` (2, F) at both ends, `height` (m) of the wrist on the table."""
     end = first.position[0]
     height += _ABOVE if side is None else _ABOVE_WITH_ARM
     out = float(np.linalg.norm((end - rest[:3])[:2]))
@@ -171,7 +173,7 @@ def _curves(
 
 
 def _first_turn(hand: Hand, forward: np.ndarray, side: float | None) -> Rotation:
-    """The wrist with its fingers along a level direction (3,), lower on an arm, and its palm down."""
+    """Wrist orientation with the fingers along a level direction (3,), inclined on an arm, and the palm down."""
     # `upright` has the fingers up and the palm towards +x.
     across = np.cross(forward, [0.0, 0.0, -1.0])
     lying = Rotation.from_matrix(np.stack([[0.0, 0.0, -1.0], across, forward], -1))
@@ -198,8 +200,8 @@ def clearances(hand: Hand, field: DistanceField, rest: np.ndarray, axes: np.ndar
 
     Args:
       hand: the hand.
-      field: whose first grid is the object's.
-      rest: (7,) the object's pose.
+      field: distance field whose first grid is that of the object.
+      rest: (7,) pose of the object, world frame.
       axes: (N, P, 3) from `axes_in_wrist`, at the poses' finger angles.
       poses: N of the wrist.
     """
@@ -223,7 +225,7 @@ def _at(field: DistanceField, points: np.ndarray) -> jax.Array:
 
 
 def _duration(curve: _Curve, seconds: float, speed: float) -> float:
-    """Seconds of the way: as requested, or as many more as it takes the wrist to keep to its limits."""
+    """Duration of the curve in s: as requested, or the shortest one tried in which the wrist keeps to its limits."""
     x = np.linspace(0, 1, _FINE)
     for found in seconds * np.geomspace(1.0, _MOST_STRETCH, 100):
         poses, h = curve.at(x, found, speed), found * x[1]
@@ -239,7 +241,7 @@ def _duration(curve: _Curve, seconds: float, speed: float) -> float:
 def with_planned_reach(
     episode: Message, hand: Hand, obj: GraspObject, seconds: float, speed: float, side: float | None = None
 ) -> Message:
-    """The episode with the planned way of the hand before it; see `plan_reach` for the arguments and errors."""
+    """The episode with the planned approach before it; see `plan_reach` for the arguments and errors."""
     arrays = {name: np.asarray(value, float) for name, value in episode.arrays.items() if name in _BEGIN}
     rest = np.concatenate([arrays["object_position"][0], arrays["object_quaternion"][0]])
     turns = Rotation.from_quat(arrays["link_quaternion"][:1, 0], scalar_first=True)
@@ -250,9 +252,9 @@ def with_planned_reach(
 
 
 def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:
-    """The episode with the way of the hand before it, and `phases` of its meta data that begin so much later.
+    """The episode with an approach before it; `phases` of its metadata are shifted accordingly.
 
-    Before the grasp the object rests, nothing is touched, and errors are those of the first step.
+    During the approach the object rests, there is no contact, and errors are those of the first step.
     """
     arrays, steps = episode.arrays, len(reach.q)
     count = len(arrays["table"])
@@ -286,7 +288,7 @@ def _of_steps(name: str, value: np.ndarray, steps: int) -> bool:
 
 
 def _wrist_joints(episode: Message, reach: Reach) -> np.ndarray:
-    """(N, 6) virtual wrist joints, from the base that the first step's joints and pose tell of."""
+    """(N, 6) virtual wrist joints, with the base that follows from joints and pose of the first step."""
     first = np.asarray(episode.arrays["u"][0], float)
     turn = Rotation.from_quat(np.asarray(rotations.euler_to_quaternion(first[3:])), scalar_first=True)
     base = Rotation.from_quat(episode.arrays["link_quaternion"][0, 0], scalar_first=True) * turn.inv()

@@ -1,7 +1,7 @@
-"""Paths of a wrist in other people's motions: CSV, NPZ, and a joint of a BVH skeleton.
+"""Wrist paths from external motions: CSV, NPZ, and a joint of a BVH skeleton.
 
-What comes out is in metres, in a world whose z axis points up, for the `human` hand's wrist frame: fingers towards -y,
-the thumb's side +x, the back of the hand +z.
+Results are in metres, in a world frame with the z axis up, for the wrist frame of the `human` hand: fingers towards
+-y, thumb side +x, back of the hand +z.
 """
 
 import pathlib
@@ -18,7 +18,7 @@ from congrasp.common.io.npz import read_npz
 _LARGEST, _DEEPEST = 32 << 20, 200
 """Bytes of a BVH or CSV file, and joints of a BVH chain."""
 HUGE = 1e9
-"""No angle, place or part of a quaternion is as large."""
+"""Bound on angles, positions and quaternion components."""
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
     f"{sign}{axis}": s * row for axis, row in zip("xyz", np.eye(3), strict=True) for sign, s in (("+", 1), ("-", -1))
@@ -48,12 +48,12 @@ def read_wrist_path(
     Args:
       path: `.csv`, a line a frame: x, y, z (m) and a quaternion w, x, y, z; `.npz` with `position` (T, 3) and
         `quaternion` (T, 4), or a grasp motion; or `.bvh`.
-      joint: of a BVH file: the joint that is the wrist.
-      fingers: the axis of the wrist's own frame along which its fingers point, such as +x.
-      back: the axis towards the back of the hand.
+      joint: name of the wrist joint in a BVH file.
+      fingers: axis of the file's wrist frame along which the fingers point, such as +x.
+      back: axis of that frame towards the back of the hand.
 
     Raises:
-      CongraspError: the file cannot be read, or has no such joint.
+      CongraspError: the file cannot be read or has no such joint, or the axes are unknown or not orthogonal.
     """
     readers = {".csv": _csv, ".npz": _npz}
     kind = path.suffix.lower()
@@ -81,7 +81,7 @@ def read_bvh(path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, floa
     """A joint's positions (T, 3) and orientations in a BVH file's own unit and axes, and seconds between frames.
 
     Raises:
-      CongraspError: the file is damaged, or has no such joint; the line names those that it has.
+      CongraspError: the file is damaged, or has no such joint; the message names the existing ones.
     """
     try:
         return _bvh(read_file(path, _LARGEST, "Cut it into shorter ones.").decode(), path, joint)
@@ -90,7 +90,7 @@ def read_bvh(path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, floa
 
 
 def _bvh(text: str, path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, float]:
-    """The same of a file's text; a ValueError, LookupError or StopIteration where it is damaged."""
+    """Does the work of `read_bvh` for a file's text; ValueError, LookupError or StopIteration if it is damaged."""
     head, _, tail = text.partition("MOTION")
     chain, width, names = _chain(head, joint)
     if chain is None:
@@ -150,7 +150,7 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
 
 
 def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines, of which a first one of names counts for nothing.
+    """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines; a header is skipped.
 
     Raises:
       CongraspError: the file has more than `largest` bytes or cannot be read, or a line is not seven finite numbers.
@@ -199,7 +199,11 @@ def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _checked(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """The same of arrays whose shapes and values are right; a file without times has 10 ms a frame."""
+    """Returns checked arrays, and 10 ms as the time between frames.
+
+    Raises:
+      CongraspError: a shape is wrong, a number is not finite, or a quaternion is not normalised.
+    """
     if position.ndim != 2 or position.shape[1:] != (3,) or quaternion.shape != (len(position), 4) or not len(position):
         raise CongraspError(
             f"{path} has positions {position.shape} and quaternions {quaternion.shape}.",

@@ -10,8 +10,9 @@ from gymnasium.vector import AutoresetMode
 
 from congrasp.actors import initial
 from congrasp.actors.physics import make_physics
-from congrasp.actors.rollout import Rollout, RolloutWorker
+from congrasp.actors.rollout import Rollout
 from congrasp.actors.training_set import training_set
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.runtime.engines import PhysicsName
@@ -70,7 +71,6 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             self.hand, self.task, engine, None, _given, batch=num_envs, seed=0, half_precision=False
         )
         self._bank, self._autoreset, self._arrays = made.bank, autoreset, arrays
-        self._sample = jax.jit(lambda bank, key: initial.sample(self.hand, self.task, bank, key, num_envs))
         self._key = jax.random.key(0)
         self.num_envs = num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP if autoreset else AutoresetMode.DISABLED}
@@ -112,7 +112,7 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def _drawn(self) -> initial.InitialConditions:
         """Draws initial conditions of episodes."""
         self._key, key = jax.random.split(self._key)
-        return self._sample(self._bank, key)
+        return self._worker.programs.sample(self._bank, key, np.array(False))
 
     def _episodes(self, rollout: Rollout) -> dict[str, Any]:
         """Metrics of the episodes that have just ended."""

@@ -4,9 +4,9 @@ Actors record what they sent, with a checksum, and every reply; the learner reco
 the start of the update, what it dropped, and where its sessions began and ended. Neither reads the other's journal, and
 this module does not use the code that decided.
 
-What a journal's missing or damaged lines told cannot be known: what they may have been about is no fault, but counted
-as not in the journals, and reported as unjudged. A journal whose last lines were cut off looks like that of a process
-that was killed then.
+The content of missing or damaged lines of a journal is unknown. Rollouts that they may concern are no faults, but are
+counted as not in the journals, and reported as unjudged. A journal without its last lines looks like that of a process
+that was killed.
 """
 
 import collections
@@ -24,9 +24,9 @@ Identity = tuple[str, str, int]
 FAULTS = {"lost": "loss", "duplicated": "surplus", "corrupted": "damage", "unmatched": "surplus"}
 """Faults of rollouts, and their kinds."""
 EXIT_CODES = {"loss": 1, "surplus": 5, "damage": 6, "unjudged": 7}
-"""Exit codes of `congrasp audit`, by the gravest kind of what it found; 2 to 4 are those of errors."""
+"""Exit codes of `congrasp audit` by kind, the most serious first; 2 to 4 are those of errors."""
 UNJUDGED = "not in the journals"
-"""Outcome of accepted rollouts of which nothing can be said."""
+"""Outcome of accepted rollouts that cannot be judged."""
 
 
 class Made(NamedTuple):
@@ -51,11 +51,11 @@ class Report(NamedTuple):
     holes: int
     """Lines missing from the journals because of a full disk, or cut at the end."""
     damaged: int
-    """Lines of the journals that are not what was written."""
+    """Damaged lines of the journals."""
     missing: int
-    """Places in the journals where lines are missing that were there, and journals without a line."""
+    """Places in the journals from which lines were removed, and journals without a line."""
     unchecked: int
-    """Lines of older versions of congrasp, between which missing ones do not show."""
+    """Lines of older versions of congrasp, between which missing ones cannot be detected."""
 
     @property
     def exit_code(self) -> int:

@@ -1,4 +1,4 @@
-"""Processes of congrasp that another one starts and ends."""
+"""Child processes of congrasp: start and end."""
 
 import contextlib
 import dataclasses
@@ -29,7 +29,7 @@ class Child:
 
     def start(self) -> int:
         """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies with its parent."""
-        # Unfiltered, so that an error is the last line of the log, and not JAX's remark that it has left out some.
+        # Unfiltered, so that the last line of the log is the error, and not JAX's note on filtered frames.
         jax = {"JAX_TRACEBACK_FILTERING": "off"}
         environment = {**jax, **os.environ, **self.environment, PARENT_VARIABLE: str(os.getpid())}
         with self.log.open("ab") as log:
@@ -51,7 +51,7 @@ class Child:
 
 
 def wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
-    """Waits until all have ended, or the time is over."""
+    """Waits until all have ended, for at most `seconds`."""
     deadline = time.monotonic() + seconds
     for process in processes:
         with contextlib.suppress(subprocess.TimeoutExpired):

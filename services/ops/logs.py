@@ -70,12 +70,12 @@ def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> Non
 
 @contextlib.contextmanager
 def announced(what: str | Callable[[], str], first: float = 3.0, every: float = 10.0) -> Iterator[None]:
-    """Prints what takes long, and for how long already, after `first` and then every `every` seconds (to stderr).
+    """Context that prints a task and its elapsed time to stderr, after `first` and then every `every` seconds.
 
     Args:
-      what: names it, or returns its present name.
+      what: name of the task, or a function that returns its current name.
       first: seconds until the first line.
-      every: seconds from one line to the next.
+      every: seconds between two lines.
     """
     done, began = threading.Event(), time.monotonic()
 
@@ -95,7 +95,7 @@ def announced(what: str | Callable[[], str], first: float = 3.0, every: float = 
 
 
 def log_error(text: str) -> bool:
-    """Logs why the process ends if its lines are JSON; returns True if they are."""
+    """Logs an error that ends the process if the log is JSON; returns True if it is."""
     structured = any(isinstance(handler.formatter, JsonLines) for handler in logging.getLogger().handlers)
     if structured:
         log("error", text)

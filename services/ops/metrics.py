@@ -13,13 +13,13 @@ from congrasp.common.errors import CongraspError, TransportError
 
 _TICKETS = ("granted", "redeemed", "returned", "expired")
 _GAUGES = {
-    "running": ("tickets_running", "Tickets that are out."),
+    "running": ("tickets_running", "Tickets in use."),
     "capacity": (
         "tickets_capacity",
-        "Tickets that could be granted now; with those that run, the actors that it can use.",
+        "Tickets that can be granted now; with the running ones, the number of actors that the learner can use.",
     ),
     "missing": ("rollouts_missing", "Gaps in the counts of actors' rollouts."),
-    "rejected": ("requests_rejected", "Requests of actors that had made too many useless ones."),
+    "rejected": ("requests_rejected", "Requests rejected because their actors had made too many useless ones."),
 }
 _MILLISECONDS = (0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -77,12 +77,12 @@ class LearnerMetrics:
         yield _gauge("version", "Newest policy version.", status["version"])
         yield _gauge("finished", "Whether the run is over.", status["finished"])
         yield _gauge("counters_balanced", "Whether the counters add up.", not status["warnings"])
-        yield _gauge("queue_length", "Rollouts that wait.", status["queue"]["length"])
-        yield _gauge("queue_limit", "Rollouts that may wait.", status["queue"]["limit"])
+        yield _gauge("queue_length", "Queued rollouts.", status["queue"]["length"])
+        yield _gauge("queue_limit", "Limit of queued rollouts.", status["queue"]["limit"])
         for name, value in status["rates"].items():
             yield _gauge(name, "Over the last ten seconds.", value)
         yield from self._counters(status["counters"])
-        yield _gauge("roles_unlisted", "Processes beyond those that are listed.", status["unlisted"])
+        yield _gauge("roles_unlisted", "Live processes that the status does not list.", status["unlisted"])
         yield from self._roles(status["roles"])
         update = _gauge("update", "Metrics of the last update, by the names of the log.", labels=["figure"])
         for name, value in self._values.items():
@@ -110,8 +110,8 @@ class LearnerMetrics:
         who = ["actor", "incarnation"]
         lag = _gauge("actor_lag", "Versions by which an actor's last rollout was behind.", labels=who)
         steps = _gauge("actor_steps_per_second", "Over the last ten seconds.", labels=who)
-        rollouts = CounterMetricFamily("congrasp_learner_actor_rollouts", "Accepted of an actor.", labels=who)
-        refused = CounterMetricFamily("congrasp_learner_actor_refused", "Refused of an actor's name.", labels=who)
+        rollouts = CounterMetricFamily("congrasp_learner_actor_rollouts", "Accepted rollouts of an actor.", labels=who)
+        refused = CounterMetricFamily("congrasp_learner_actor_refused", "Rejected requests of an actor.", labels=who)
         for role in roles:
             labels = [role["id"], role["incarnation"]]
             if "lag" in role:
@@ -146,8 +146,8 @@ class ActorMetrics:
     def collect(self) -> Iterator[Metric]:
         """Yields the metrics of the class."""
         last = dict(self._last)
-        yield CounterMetricFamily("congrasp_actor_rollouts", "Rollouts that it made.", last.pop("rollouts", 0.0))
-        yield GaugeMetricFamily("congrasp_actor_version", "Policy version that acts.", last.pop("version", -1.0))
+        yield CounterMetricFamily("congrasp_actor_rollouts", "Rollouts of this actor.", last.pop("rollouts", 0.0))
+        yield GaugeMetricFamily("congrasp_actor_version", "Version of the acting policy.", last.pop("version", -1.0))
         for name, value in last.items():
             yield GaugeMetricFamily(f"congrasp_actor_{name}", "Of the last rollout.", value)
 
@@ -191,8 +191,8 @@ class ServerMetrics:
         health = self.health()
         for name, help in (
             ("ready", "Whether it answers."),
-            ("version", "Of the policy."),
-            ("queue", "Queries that wait."),
+            ("version", "Version of the policy."),
+            ("queue", "Queued queries."),
         ):
             if name in health:
                 yield GaugeMetricFamily(f"congrasp_policy_{name}", help, float(health[name]))

@@ -103,7 +103,7 @@ def _end(code: int) -> None:
 
 
 def follow_parent() -> None:
-    """Requests SIGTERM from the kernel when the parent dies, if the parent wants that (Linux; elsewhere a no-op)."""
+    """Requests SIGTERM from the kernel for the parent's death, if the parent asked for it (Linux only)."""
     parent = os.environ.pop(PARENT_VARIABLE, None)
     if parent is None or not sys.platform.startswith("linux"):
         return

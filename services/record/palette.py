@@ -12,7 +12,7 @@ MATERIALS = {"flesh": FLESH, "nail": (0.94, 0.77, 0.70), "sleeve": (0.22, 0.28, 
 OBJECT: Colour = (0.95, 0.62, 0.24)
 TABLE: Colour = (0.80, 0.79, 0.77)
 HEADING: Colour = (0.22, 0.40, 0.86)
-"""Colour of wrist paths and reference poses."""
+"""Colour of headings and reference poses."""
 WAYPOINT: Colour = (0.53, 0.30, 0.75)
 GRASPABLE: Colour = (0.20, 0.65, 0.32)
 AVOID: Colour = (0.80, 0.16, 0.16)

@@ -43,7 +43,7 @@ def record_run(
       Zero.
 
     Raises:
-      CongraspError: recording stopped, or nothing could be recorded.
+      CongraspError: there is no connection, the live view cannot listen, or recording stopped.
     """
     console = Console(stderr=True, quiet=structured)
     warn = functools.partial(log, "warning") if structured else lambda text: console.print(f"congrasp: {text}")

@@ -17,7 +17,7 @@ from congrasp.services.record.entries import Converter
 from congrasp.services.record.writer import LogWriter
 
 FLUSH_SECONDS = 0.5
-"""Greatest time that a killed recorder loses."""
+"""Seconds between two flushes; a killed recorder loses no more than these."""
 
 
 class Sink(Protocol):

@@ -122,7 +122,7 @@ def reproduce(
         advance(done)
     if not results:
         raise CongraspError(
-            "Nothing could be evaluated.", failures[0] if failures else "Pass --hand with a hand that has a policy."
+            "Nothing could be evaluated.", failures[0] if failures else "Pass --hands with a hand that has a policy."
         )
     account = _account(request, numbers, found, results, failures)
     write(account, request.out)

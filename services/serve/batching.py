@@ -1,6 +1,6 @@
 """Batches queries that arrive together: a bounded queue and a worker thread, which a single query bypasses.
 
-Peers take turns in the queue, and each has a limited share of it: one that floods is refused when others would not be.
+Peers take turns in the queue, and each has a limited share of it, so that a flood from one does not exclude the others.
 While several peers send queries, batches are small and the peers share each equally, so that a long query, answered in
 parts, delays the others by no more than a small batch.
 """
@@ -27,7 +27,7 @@ class Parts(NamedTuple, Generic[T, R]):
     """Splitting of an item into parts."""
 
     most: int
-    """Limit of a batch's weight while there are several peers, but no more of them than this."""
+    """Limit of a batch's weight while several peers, at most as many as this, send queries."""
     cut: Callable[[T, int, int], T]
     """(item, first, end) -> the part of weight `end` - `first`."""
     join: Callable[[T, list[R]], R | Exception]
@@ -117,6 +117,7 @@ class Batcher(Generic[T, R]):
 
         Raises:
           OverloadedError: `depth` items are queued already, or `share` of this peer.
+          CongraspError: the queue is closed.
         """
         now = time.monotonic()
         waiting: _Waiting[T, R] = _Waiting(item, self._weigh(item), Future(), now, now + timeout)

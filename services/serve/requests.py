@@ -11,6 +11,10 @@ them, those of the current one are repeated.
 For a policy with a camera ("camera") `cloud` (N, 3) replaces `surface_points` and all fields of the object's pose and
 velocity. Cloud and constraints are in the world frame.
 
+For a policy that observes normals (`TaskConfig.surface_normals`) it may carry `surface_normals` (N, 3), outward unit
+vectors; missing ones are estimated from the points, those of a cloud toward `camera_position` (3,), world frame. Other
+policies ignore both.
+
 A query may also be packed: the vector itself as its single array, with the digest of its layout in the metadata. A
 named query can request the `layout` with its reply. Packed queries cost both ends a quarter. They may hold several
 states, one per row, with the same constraints; the reply then has as many rows.
@@ -34,6 +38,7 @@ from congrasp.common.io.inputs import LONGEST_NAME
 from congrasp.common.task.camera import world
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import known, require_known
+from congrasp.common.task.normals import estimated_normals
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.common.wire.codec import Message
@@ -42,6 +47,8 @@ STATES_LIMIT = 64
 """Most states in one query."""
 CLOUD = "cloud"
 """Name of the points of a query to a policy with a camera."""
+NORMALS, CAMERA = "surface_normals", "camera_position"
+"""Names of the normals at these points, and of the position of the camera."""
 SURFACE_LIMIT = 4096
 """Most surface points in one query; the policy uses `TaskConfig.surface_points` of them."""
 PACKED = "packed"
@@ -102,7 +109,11 @@ class Layout:
         steps = (task.history - 1,)
         self.shapes |= {name: (*steps, *self.shapes[name.removeprefix("past_")]) for name in self._past}
         self.shapes |= {name: np.shape(value) for name, value in self._neutral.items()}
-        self.shapes |= {self.points: (points, 3), "surface_avoid": (points,), "asked": (len(self.known),)}
+        self.shapes |= {self.points: (points, 3), "surface_avoid": (points,)}
+        if task.surface_normals:
+            self.shapes[NORMALS] = (points, 3)
+            self.shapes |= {CAMERA: (3,)} if self.points == CLOUD else {}
+        self.shapes["asked"] = (len(self.known),)
         self.offsets = {}
         self.size = 0
         for name, shape in self.shapes.items():
@@ -112,6 +123,7 @@ class Layout:
         self._flags = [name for name, (_, _, array) in self._arrays.items() if array.kind == "flag"]
         past = [name for name in self._past if "quaternion" in name]
         self._directions = [*(name for name in self._state if "quaternion" in name), *past, *own]
+        self._unit = [*self._directions, *([NORMALS] if NORMALS in self.shapes else [])]
         self.digest = hashlib.sha256(json.dumps(self.description()).encode()).hexdigest()[:16]
 
     def description(self) -> dict[str, Any]:
@@ -155,6 +167,7 @@ class Layout:
 
     def _named(self, arrays: Mapping[str, Any], asked: tuple[str, ...]) -> np.ndarray:
         """Returns the vector (S,) of a named query; raises a CongraspError for an unknown, missing or invalid field."""
+        arrays = {name: x for name, x in arrays.items() if name in self.shapes or name not in (NORMALS, CAMERA)}
         unknown = sorted(arrays.keys() - self.shapes.keys() | arrays.keys() & {"asked"})
         if unknown:
             shown = ascii(unknown[0])[:60]
@@ -168,7 +181,7 @@ class Layout:
                 raise CongraspError(f"The query lacks the field '{name}'.")
         vector = np.zeros(self.size, np.float32)
         given = dict(arrays)
-        given[self.points], given["surface_avoid"] = self._resampled(given)
+        given |= self._resampled(given)
         for name in self._past:  # without history, the current state is repeated
             given.setdefault(name, np.broadcast_to(given[name.removeprefix("past_")], self.shapes[name]))
         for name, value in given.items():
@@ -208,13 +221,28 @@ class Layout:
         start = rotations.conjugate(fields["object_quaternion_initial"]), fields["base_quaternion"]
         held = rotations.rotate(rotations.multiply(*start), jnp.array(grasp_frame(self.hand).cross))
         fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"], held)
+        if NORMALS in fields:
+            fields[NORMALS], length = self._normals(fields)
+            lengths.append(length)
         surface, goal = self.surface(fields), self.goal(fields)
         fitting = [~asked[:, i] | c.valid(surface, goal[c.name]) for i, c in enumerate(self.known)]
         return fields, jnp.stack([finite, *fitting, *lengths], 1)
 
     def surface(self, fields: Mapping[str, Any]) -> Surface:
         """Returns the labelled surface points, or the cloud, of completed fields."""
-        return Surface(fields[self.points], fields["surface_avoid"])
+        return Surface(fields[self.points], fields["surface_avoid"], fields.get(NORMALS))
+
+    def _normals(self, fields: Mapping[str, Any]) -> tuple[jax.Array, jax.Array]:
+        """Normals (B, N, 3), estimated where a query has none, and the norm (B,) farthest from 1 of given ones."""
+        points, normals = fields[self.points], fields[NORMALS]
+        absent = jnp.all(normals == 0.0, (1, 2))
+        eye = fields.get(CAMERA)
+        estimated = estimated_normals(points)
+        if eye is not None:
+            known = jnp.any(eye != 0.0, -1)
+            estimated = jnp.where(known[:, None, None], estimated_normals(points, eye), estimated)
+        normals, length = _unit(normals, ~absent, np.array((0, 0, 1), np.float32))
+        return jnp.where(absent[:, None, None], estimated, normals), length
 
     def goal(self, fields: Mapping[str, Any]) -> Goal:
         """Returns the goal arrays of completed fields, before the priority rules."""
@@ -244,7 +272,7 @@ class Layout:
         if not all(fitting):
             return CongraspError(*self.known[fitting.index(False)].invalid)
         bad = lengths.index(False)
-        name, length = self._directions[bad], checks[state, 1 + len(self.known) + bad]
+        name, length = self._unit[bad], checks[state, 1 + len(self.known) + bad]
         return CongraspError(f"The field '{name}'{which} has length {length:.3f}, not 1.")
 
     def _asked(self, names: Any) -> tuple[str, ...]:
@@ -259,8 +287,8 @@ class Layout:
             )
         return tuple(constraint.name for constraint in self.known if constraint.name in names)
 
-    def _resampled(self, arrays: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Points and labels, resampled to the number that the policy uses."""
+    def _resampled(self, arrays: dict[str, Any]) -> dict[str, np.ndarray]:
+        """Points, labels and, if given, normals, resampled to the number that the policy uses."""
         points = np.asarray(arrays[self.points])
         if points.ndim != 2 or points.shape[1] != 3 or not 1 <= len(points) <= SURFACE_LIMIT:
             raise CongraspError(
@@ -269,10 +297,15 @@ class Layout:
         avoid = np.asarray(arrays.get("surface_avoid", np.zeros(len(points), bool)))
         if avoid.shape != (len(points),):
             raise CongraspError(f"The field 'surface_avoid' has shape {avoid.shape}; it must be ({len(points)},).")
+        found = {self.points: points, "surface_avoid": avoid}
+        if NORMALS in arrays:
+            found[NORMALS] = normals = np.asarray(arrays[NORMALS])
+            if normals.shape != points.shape:
+                raise CongraspError(f"The field '{NORMALS}' has shape {normals.shape}; it must be {points.shape}.")
         if len(points) == self.task.surface_points:
-            return points, avoid
+            return found
         index = np.arange(self.task.surface_points) * len(points) // self.task.surface_points
-        return points[index], avoid[index]
+        return {name: array[index] for name, array in found.items()}
 
 
 def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[jax.Array, jax.Array]:

@@ -101,10 +101,10 @@ class PolicyServer:
         self._follower.start()
 
     def health(self) -> dict[str, Any]:
-        """Readiness, version, hand, queue, and why a newer policy was refused, as JSON.
+        """Readiness, version, hand, queue, and the reason why a newer policy was rejected (`trouble`), as JSON.
 
-        The server takes no more than `queue_limit` queries that wait, `peer_limit` of one peer, and answers no more
-        than `states_per_second`, as measured at its start.
+        `queue_limit` and `peer_limit` bound the queued queries of all peers and of one. `states_per_second` is the
+        highest throughput, measured at the start.
         """
         held = self._held
         return {
@@ -123,7 +123,7 @@ class PolicyServer:
         }
 
     def _describe(self, key: str, request: Message) -> Message:
-        """The health, or what a control loop has to know where a query asks for that."""
+        """The health, or the policy's metadata if the query requests them."""
         return Message({}, self._function.metadata() if request.meta.get("metadata") else self.health())
 
     def close(self) -> None:
@@ -242,7 +242,7 @@ def _hold(bundle: PolicyBundle) -> _Held:
 
 
 def follow_file(path: pathlib.Path) -> Source:
-    """Returns a source that reads a policy file again whenever it changes."""
+    """Returns a source that rereads a policy file whenever it changes."""
     seen: list[float] = []
 
     def read(version: int) -> PolicyBundle | None:

@@ -1,7 +1,8 @@
 """`congrasp view`: the constraint studio and the window on a training, in a browser.
 
-`state` holds the constraints that the user sets, `history` what of that can be undone, `description` what a page shows
-of it; `motions` the grasps, `lanes` how they met the constraints, `files` what they are saved as, `diagnosis` why none
-held; `training` what is known of a run and `recordings` its episodes on disk. None of them knows a browser. `session`
-joins them to a policy, `server` offers that over HTTP, and `static/` is the page.
+`state` holds the constraints that the user sets, `history` undoes and redoes changes, `description` describes them to
+the page. `motions` keeps the grasps, `lanes` rates them by the constraints, `files` saves them, and `diagnosis`
+explains failures. `training` holds the state of a run and `recordings` its episodes on disk. None of them depends on a
+browser. `session` connects them to a policy, `sessions` keeps one per browser, `server` serves them over HTTP, and
+`static/` is the page.
 """

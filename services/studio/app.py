@@ -32,7 +32,7 @@ from congrasp.services.studio.training import Follower, TrainingWindow
 
 _GUESS = ImportOptions(unit="guess")
 _FIRST = "mug"
-"""Family of the object that a studio without objects begins with."""
+"""Family of the initial object, unless the user names objects."""
 
 
 @contextlib.contextmanager
@@ -51,7 +51,7 @@ def open_view(
     """Offers the page while the block runs; yields its address. For the arguments see `services.cli.view`.
 
     Raises:
-      CongraspError: something that was named is not there, or the port is busy.
+      CongraspError: a named file or run does not exist, the options exclude each other, or the port is in use.
     """
     if policy is not None and connect:
         raise CongraspError(
@@ -71,7 +71,7 @@ def open_view(
         else:
             hands = _pretrained()
         recorded = Recordings(recordings) if recordings else None
-        loaded = {name: functools.cache(load) for name, load in hands.items()}  # programs are compiled once for all
+        loaded = {name: functools.cache(load) for name, load in hands.items()}  # all browsers share compiled programs
         sessions = Sessions(lambda: Session(loaded, catalogue(objects), MeshImporter(), window, recorded))
         stack.callback(sessions.close)
         server = PageServer(sessions.routes, host, port)
@@ -95,7 +95,7 @@ def _of_run(
 
 
 def _pretrained() -> dict[str, Callable[[], PolicyGrasping]]:
-    """The pretrained policies and the user's own, by the names of their hands."""
+    """The pretrained and custom policies, by the names of their hands."""
     return {
         name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
         for name in hands_with_policy()
@@ -125,13 +125,13 @@ class MeshImporter:
         return x, y, z
 
     def load(self, path: pathlib.Path, unit: str) -> tuple[GraspObject, list[str]]:
-        """The object of a mesh; with notes for the user."""
+        """The object of a mesh, and notes for the user."""
         obj = one_object(path, ImportOptions(unit=cast(Unit, unit)))
         return obj, list(obj.notes)
 
 
 def _run_of(recordings: pathlib.Path | None) -> str:
-    """The name of a run by the folder of its recordings."""
+    """The name of a run, from the folder of its recordings."""
     names = [part for part in recordings.resolve().parts if part != LOGS] if recordings else []
     return names[-1] if names else ""
 
@@ -141,7 +141,7 @@ def _read(window: TrainingWindow, recordings: pathlib.Path) -> None:
     Recordings(recordings).check()
 
     def work() -> None:
-        """Reads them all."""
+        """Reads all files."""
         try:
             window.load(recordings)
         except CongraspError as error:

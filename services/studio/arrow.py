@@ -1,4 +1,4 @@
-"""The heading as it is drawn: an arrow in the object frame, and the roll of the hand around it."""
+"""The drawn heading: an arrow in the object frame, and the roll of the hand around it."""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.sampling.headings import INWARD
 
 LARGEST = 1e6
-"""Of each number of a place (m) or a direction that a page sends: single precision has its squares, too."""
+"""Bound on each number of a position (m) or direction from a page; its square is finite in single precision."""
 _ROUND = 1e-6  # rad
 _LOWEST = 0.012  # m above the table of a target from above
 
@@ -19,9 +19,9 @@ class Arrow(NamedTuple):
     """A heading in the object frame."""
 
     position: np.ndarray
-    """(3,) where the middle of the grasping hand should be, m."""
+    """(3,) target of the middle of the grasping hand, m."""
     direction: np.ndarray
-    """(3,) unit, the way the hand comes."""
+    """(3,) unit, direction of the approach."""
     cross: np.ndarray
     """(3,) unit, orthogonal to the direction: along the hand's cross-finger axis."""
 
@@ -34,7 +34,7 @@ class Arrow(NamedTuple):
         level = _level(self.direction, up)
         other = np.cross(self.direction, level)
         angle = float(np.arctan2(self.cross @ other, self.cross @ level))
-        return angle if angle > _ROUND - np.pi else np.pi  # as much, without a sign that rounding decides on
+        return angle if angle > _ROUND - np.pi else np.pi  # -π and π are one angle, whose sign rounding would decide
 
     def with_roll(self, angle: float, up: np.ndarray) -> "Arrow":
         """The arrow with a roll of `angle` rad; see `roll`."""
@@ -43,15 +43,15 @@ class Arrow(NamedTuple):
 
 
 def arrow_of(position: Any, direction: Any, cross: Any) -> Arrow:
-    """An arrow of whatever a user gives.
+    """An arrow from values that a user sets.
 
     Args:
       position: (3,) target in the object frame, m.
-      direction: (3,) of any length but zero.
-      cross: (3,) made orthogonal to the direction.
+      direction: (3,) of any length above zero.
+      cross: (3,) cross-finger axis; made orthogonal to the direction.
 
     Raises:
-      CongraspError: something is not three numbers, or the direction is zero.
+      CongraspError: a value is not three numbers within `LARGEST`, or the direction is zero.
     """
     position, direction = vector("arrow's position", position), vector("arrow's direction", direction)
     length = np.linalg.norm(direction)
@@ -62,7 +62,7 @@ def arrow_of(position: Any, direction: Any, cross: Any) -> Arrow:
 
 
 def from_above(obj: GraspObject, rest: int) -> Arrow:
-    """Straight down onto the top of an object in a resting pose, across its narrower side."""
+    """The arrow straight down onto an object in a resting pose, with the cross-finger axis along its narrower side."""
     turn = matrix(obj.rest_poses[rest][3:])
     world = obj.points @ turn.T
     near = np.linalg.norm(world[:, :2] - (world[:, :2].max(0) + world[:, :2].min(0)) / 2, axis=-1)
@@ -75,7 +75,7 @@ def from_above(obj: GraspObject, rest: int) -> Arrow:
 
 
 def vector(what: str, value: Any) -> np.ndarray:
-    """(3,) three numbers of a size that can be reckoned with, or a CongraspError."""
+    """(3,) finite numbers within `LARGEST`; raises a CongraspError for others."""
     try:
         found = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -95,7 +95,7 @@ def _level(direction: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def _orthogonal(wanted: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(3,) unit, the part of a vector that is orthogonal to a direction, or any such where there is none."""
+    """(3,) unit, the part of a vector that is orthogonal to a direction; any orthogonal one if that part vanishes."""
     cross = wanted - wanted @ direction * direction
     if np.linalg.norm(cross) < 1e-3:
         cross = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])

@@ -1,4 +1,4 @@
-"""An object's surface as the studio paints it: the avoid region, and a mesh fine enough to show it."""
+"""The painted surface of an object: the avoid region, and a mesh fine enough to show it."""
 
 import itertools
 from typing import Any, NamedTuple
@@ -19,22 +19,22 @@ class Paint(NamedTuple):
     avoid: np.ndarray
     """(512,) bool, surface points of the painted avoid region."""
     shown: np.ndarray
-    """(V,) bool, vertices that are painted."""
+    """(V,) bool, painted vertices."""
     version: int
-    """Another for all other paint, on any canvas."""
+    """Changes with the paint, and is unique across canvases."""
 
 
 class Canvas:
-    """The paint on one object, none at first.
+    """The paint on one object, at first empty.
 
     Attributes:
-      vertices, faces: (V, 3), (E, 3) of the mesh that is painted on.
-      colours: (V, 3) uint8 sRGB of the object's own; None if it has none.
-      paint: what is painted.
+      vertices, faces: (V, 3), (E, 3) of the painted mesh.
+      colours: (V, 3) uint8 sRGB of the object; None if it has none.
+      paint: the painted regions.
     """
 
     def __init__(self, obj: GraspObject):
-        """Cuts the object's mesh finer."""
+        """Refines the object's mesh."""
         self._obj = obj
         self.colours: np.ndarray | None = None
         if obj.colours:
@@ -49,7 +49,11 @@ class Canvas:
         return self.paint.avoid
 
     def brush(self, points: Any, radius: float, avoid: bool) -> None:
-        """Paints what is within `radius` (m) of points (N, 3), or takes the paint away."""
+        """Paints everything within `radius` (m) of points (N, 3), or removes the paint there if `avoid` is False.
+
+        Raises:
+          CongraspError: the points are not at most 2000 finite ones, or the radius is not 1 mm to 20 cm.
+        """
         strokes = np.asarray(points, float)
         if strokes.ndim != 2 or strokes.shape[1:] != (3,) or not np.isfinite(strokes).all() or len(strokes) > 2000:
             raise CongraspError("A brush stroke must be at most 2000 points of three numbers.")
@@ -64,14 +68,14 @@ class Canvas:
         self._set(brushed(self._obj.points, self.avoid), brushed(self.vertices, self.paint.shown))
 
     def fill(self, avoid: bool) -> None:
-        """Paints everything in one colour."""
+        """Paints everything, or removes all paint if `avoid` is False."""
         self._set(np.full_like(self.avoid, avoid), np.full_like(self.paint.shown, avoid))
 
     def take_parts(self) -> None:
-        """The paint that an object came with: its non-graspable parts."""
+        """Paints the object's non-graspable parts, and nothing else."""
         avoid = self._obj.non_graspable_points
         self._set(avoid, avoid[cKDTree(self._obj.points).query(self.vertices)[1]])
 
     def _set(self, avoid: np.ndarray, shown: np.ndarray) -> None:
-        """Takes new paint."""
+        """Sets the paint, with a new version."""
         self.paint = Paint(avoid, shown, next(_versions))

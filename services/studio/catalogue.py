@@ -15,7 +15,7 @@ _LONGEST_NAME = 255  # bytes, of Linux
 
 
 class Importer(Protocol):
-    """Makes objects of meshes."""
+    """Makes objects from meshes."""
 
     def sides(self, path: pathlib.Path) -> tuple[float, float, float]:
         """The sides of a mesh in its own unit; a CongraspError if it cannot be read."""
@@ -25,10 +25,10 @@ class Importer(Protocol):
 
 
 class Catalogue:
-    """Objects to choose from, by name; they are made or imported when they are chosen."""
+    """Objects to choose from, by name; each is made or imported when it is chosen."""
 
     def __init__(self, makers: Mapping[str, Callable[[], GraspObject]]):
-        """The first is what a studio begins with."""
+        """Takes the makers of the objects by name; a studio begins with the first."""
         self._makers = dict(makers)
         self._made: dict[str, GraspObject] = {}
 
@@ -38,13 +38,13 @@ class Catalogue:
         return list(self._makers)
 
     def add(self, name: str, maker: Callable[[], GraspObject]) -> str:
-        """One more; returns the name that it got."""
+        """Adds an object; returns its name, which has a number if `name` is taken."""
         free = next(n for n in (name, *(f"{name} ({i})" for i in range(2, 10_000))) if n not in self._makers)
         self._makers[free] = maker
         return free
 
     def drop(self, name: str) -> None:
-        """One less."""
+        """Removes an object, if there is one of this name."""
         self._makers.pop(name, None)
         self._made.pop(name, None)
 
@@ -59,15 +59,15 @@ class Catalogue:
 
 @dataclasses.dataclass(frozen=True)
 class Upload:
-    """A mesh that the user brought."""
+    """An uploaded mesh."""
 
     path: pathlib.Path
     sides: tuple[float, float, float]
     """In the file's own unit."""
     unit: str = ""
-    """Its unit: the user's choice, else the one that makes an object for a hand; empty where that is not only one."""
+    """Its unit: the user's choice, else the guessed one; empty unless exactly one is likely."""
     notes: tuple[str, ...] = ()
-    """Repairs by its import."""
+    """Notes of its import for the user."""
 
     def view(self) -> dict[str, Any]:
         """For the page: the file, its unit, and the size that each unit makes of it."""
@@ -82,25 +82,25 @@ class Uploads:
     """Uploaded meshes by the names of their objects in a catalogue.
 
     Attributes:
-      pending: the one that waits for its unit, or None.
+      pending: the upload that waits for its unit, or None.
     """
 
     def __init__(self, folder: pathlib.Path, catalogue: Catalogue, importer: Importer):
-        """None has come yet; each file goes into a folder of its own within the given one."""
+        """Begins without uploads; each file gets a separate folder in the given one."""
         self._folder, self._catalogue, self._importer = folder, catalogue, importer
         self._known: dict[str, Upload] = {}
         self.pending: Upload | None = None
 
     def of(self, name: str) -> Upload | None:
-        """The one that waits for its unit, else that of an object."""
+        """The upload that waits for its unit, else that of an object, else None."""
         return self.pending or self._known.get(name)
 
     def take(self, name: str, body: bytes) -> Upload:
-        """A mesh's file as it comes, whose unit is guessed.
+        """Stores the file of a mesh and guesses its unit.
 
         Raises:
-          BadRequest: no file can have the name.
-          CongraspError: it is empty or cannot be read, or in no unit a hand could grasp it.
+          BadRequest: `name` is no file name.
+          CongraspError: the file is empty or cannot be read, or a hand could grasp the mesh in no unit.
         """
         name = pathlib.PurePosixPath(name.replace("\\", "/")).name or "mesh"
         if name == ".." or not name.isprintable() or len(name.encode()) > _LONGEST_NAME:
@@ -121,10 +121,10 @@ class Uploads:
         Args:
           upload: the mesh.
           unit: m, cm, mm or in.
-          replaces: name of the object that it was until now.
+          replaces: name of the object that an earlier import made of it.
 
         Raises:
-          CongraspError: it cannot be imported, or is too large or too small for a hand.
+          CongraspError: the mesh cannot be imported, or is too large or too small for a hand.
         """
         try:
             obj, notes = self._importer.load(upload.path, unit)
@@ -139,5 +139,5 @@ class Uploads:
         return name
 
     def _told(self, error: CongraspError, path: pathlib.Path) -> CongraspError:
-        """The error as the user knows the file, and not where it was put."""
+        """The error with the file's name in place of its path on the server."""
         return CongraspError(str(error).replace(str(path), path.name))

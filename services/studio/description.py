@@ -22,7 +22,7 @@ from congrasp.services.studio.state import Studio
 
 
 def describe(studio: Studio) -> dict[str, Any]:
-    """Everything that a page shows of a request; object frame but for the resting pose."""
+    """Everything that a page shows of a request; in the object frame, except resting pose and start (world frame)."""
     resolution = studio.resolution
     goal = resolution.goal
     obj, hand = studio.obj, studio.hand
@@ -59,7 +59,7 @@ def describe(studio: Studio) -> dict[str, Any]:
 
 
 def _toggles(hand: Hand, name: str, fields: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """A constraint without tools of its own, as the page shows it."""
+    """Title and flags of a constraint that has no drawing tool."""
     constraint = get_constraint(name)
     labels = constraint.labels(hand)
     shown = {field: dict(zip(labels[field], fields[field].tolist(), strict=True)) for field in labels}
@@ -84,14 +84,14 @@ def _batch_of_one(studio: Studio, goal: Goal) -> tuple[Goal, Surface, np.ndarray
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _start(hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Link frames (L, 3), (L, 4) in the world from which a grasp begins."""
+    """Link frames (L, 3), (L, 4) at the start of a grasp, world frame."""
     q, position, quaternion = initial_hand(hand, task, goal, surface, rest)
     return _links(hand, q[0], position[0], quaternion[0])
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _links(hand: Hand, q: jax.Array, position: jax.Array, quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Link frames (L, 3), (L, 4) of finger angles (F,) and a wrist pose (3,), (4,), in the pose's frame."""
+    """Link frames (L, 3), (L, 4) of finger angles (F,) and a wrist pose (3,), (4,), in the frame of that pose."""
     local = kinematics.link_poses(hand, q)
     turn = jnp.broadcast_to(quaternion, local[1].shape)
     return rotations.compose_pose(jnp.broadcast_to(position, local[0].shape), turn, *local)

@@ -1,4 +1,4 @@
-"""Why nothing held: how the shown attempt failed, and which constraint it takes to leave out."""
+"""Diagnosis of failed grasps: the cause in the shown attempt, and the constraint that prevents a hold."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -9,21 +9,21 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.failures import cause
 
 Held = Callable[[GraspRequest, str], int]
-"""(request, what is left out of it) -> how many of the attempts under it hold."""
+"""(weaker request, name of the omitted constraint) -> number of attempts that hold."""
 
 
 def why_nothing_held(
     episode: Message, request: GraspRequest, explanation: list[str], held: Held, *, attempts: int, drop_height: float
 ) -> str:
-    """A few sentences for the user.
+    """Explains a failed grasp to the user in a few sentences.
 
     Args:
-      episode: the attempt that is shown.
-      request: what it was asked for.
-      explanation: what the priority rules do with it, strongest constraint first.
-      held: attempts it again under a weaker request.
-      attempts: how many there are at once.
-      drop_height: m below where it was at which the object has fallen.
+      episode: the shown attempt.
+      request: its request.
+      explanation: effects of the priority rules on it, strongest constraint first.
+      held: repeats the attempts under a weaker request.
+      attempts: number of attempts.
+      drop_height: drop at which the object counts as fallen, m.
     """
     text = f"None of {attempts} attempts held. The one shown: {cause(episode, drop_height)}."
     found = {name: held(weaker, name) for name, weaker in _weaker(request)}

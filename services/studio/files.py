@@ -1,4 +1,4 @@
-"""A motion as a file that the browser saves: data, pictures and videos."""
+"""Files of a motion for download: data, pictures and videos."""
 
 import pathlib
 import shutil
@@ -24,12 +24,12 @@ from congrasp.services.viz.sheets import png_of
 DATA = ("npz", "mcap", *FORMATS)
 """Formats in which a motion can be saved at once."""
 DRAWN = ("mp4", "png")
-"""Formats that are drawn first, which takes a while."""
+"""Formats that are rendered first, in a job."""
 _PICTURE, _VIDEO = (1280, 720), (854, 480)  # pixels
 
 
 def data_file(episode: Message, key: str, kind: str) -> Download:
-    """A motion as a file of one of `DATA`; what is a folder comes as a zip archive.
+    """A motion as a file of one of `DATA`; formats that are folders become zip archives.
 
     Raises:
       CongraspError: there is no such kind, or a package for it is absent.
@@ -61,18 +61,18 @@ def data_file(episode: Message, key: str, kind: str) -> Download:
 def drawing(
     episode: Message, key: str, kind: str, view: Mapping[str, Any], frame: int, progress: Callable[[float], None]
 ) -> Download:
-    """A motion as MP4, or one of its frames as PNG, as the page shows it.
+    """A motion as MP4, or one of its frames as PNG, from the page's camera.
 
     Args:
       episode: the motion.
-      key: its number, for the file's name.
+      key: its key, for the file's name.
       kind: one of `DRAWN`.
       view: the page's camera: position and target (3,) in the world, m, and its vertical field_of_view in degrees.
       frame: control step of the PNG.
-      progress: told how much is done, from 0 to 1.
+      progress: called with the completed share, from 0 to 1, of an MP4.
 
     Raises:
-      CongraspError: something of that cannot be.
+      CongraspError: the kind, the camera or the frame is invalid.
     """
     if kind not in DRAWN:
         raise CongraspError(f"A motion cannot be drawn as '{str(kind)[:20]}'.", f"Choose from: {', '.join(DRAWN)}.")

@@ -1,4 +1,4 @@
-"""Grasps of a policy as the studio asks for them: exactly as drawn, and close to it where that fails."""
+"""Grasps of a policy for the studio: exactly as drawn, or close to that where it fails."""
 
 import dataclasses
 import threading
@@ -27,28 +27,28 @@ from congrasp.services.studio.diagnosis import why_nothing_held
 from congrasp.services.studio.jobs import SECONDS, Progress
 
 ATTEMPTS = 8
-"""Grasps side by side: the one that was drawn, and others near it."""
+"""Number of parallel grasps: the drawn one, and others near it."""
 _ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
-"""Deviation of the others from what was drawn: m, rad, rad (one standard deviation)."""
+"""Standard deviations of the others from the drawn grasp: m per axis, rad, rad."""
 _COMPILING = 60
-"""Seconds that the first grasp takes on two cores of a laptop without kept programs."""
+"""Seconds of the first grasp on two cores of a laptop, with an empty compilation cache."""
 _OTHER = 2.0
-"""Cost of deviating from what was drawn, in addition to the costs of `services.grasp.grasper`."""
+"""Cost of deviating from the drawn grasp, in addition to the costs of `services.grasp.grasper`."""
 
 
 class PolicyGrasping:
-    """A policy of a file or of a run that is being trained; every grasp is one of its newest weights."""
+    """A policy of a file or of a run in training; every grasp uses its newest weights."""
 
     def __init__(self, source: Source, name: str, *, threads: int = 0):
         """Loads the policy; compiles nothing yet.
 
         Args:
-          source: where its weights come from.
-          name: how the page calls it.
-          threads: of the physics; 0 takes one a core.
+          source: source of its weights.
+          name: its name on the page.
+          threads: threads of the physics; 0 for one per core.
 
         Raises:
-          CongraspError: there is none.
+          CongraspError: the source has no policy yet.
         """
         first = source(-1)
         if first is None:
@@ -63,7 +63,7 @@ class PolicyGrasping:
         self._compiled, self._free = False, threading.Lock()
 
     def newest(self) -> dict[str, Any]:
-        """Source and version; `trouble` says why newer weights were not taken."""
+        """Source and version; `trouble` is the reason why newer weights were not taken, or empty."""
         return {"source": self._name, "version": self._policy.version, "trouble": self._trouble}
 
     def refresh(self) -> None:
@@ -80,9 +80,9 @@ class PolicyGrasping:
             self._trouble = str(error)
 
     def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
-        """The episode of the grasp that was drawn if it holds, else of the best of those near it.
+        """The episode of the drawn grasp, unless one near it holds or keeps to the constraints clearly better.
 
-        Its meta `note` says which it is; where none held, why.
+        `note` in its metadata says which one it is, or explains why none held.
 
         Raises:
           CongraspError: the policy lacks a constraint, or no reach leads to the grasp.
@@ -96,7 +96,7 @@ class PolicyGrasping:
             self._free.release()
 
     def _grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
-        """See `grasp`; one at a time."""
+        """Does the work of `grasp`; the caller holds the lock."""
         self._attempts.phases = phases
         first_time = not self._compiled
         progress(f"compiling, {SECONDS} s of about {_COMPILING}" if first_time else "newest weights", 0.02)
@@ -133,7 +133,7 @@ class PolicyGrasping:
     def _attempt(
         self, obj: GraspObject, request: GraspRequest, progress: Callable[[float], None]
     ) -> tuple[Outcome, np.ndarray]:
-        """Outcome of a request and of others near it, and how far (B,) in m each is beside it."""
+        """Outcome of a request and of others near it, and the distance (B,) of each from it, m."""
         episodes, aside = _episodes(self.hand, self.task, obj, request)
         steps = self._attempts.steps
         return self._attempts.run(obj, episodes, lambda step: progress(step / steps)), aside
@@ -142,7 +142,7 @@ class PolicyGrasping:
 def _episodes(
     hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest
 ) -> tuple[RequestedEpisodes, np.ndarray]:
-    """`ATTEMPTS` episodes, the first as drawn; and how far (B,) in m each is beside that."""
+    """`ATTEMPTS` episodes, the first as drawn, and the distance (B,) of each from it, m."""
     rng = np.random.default_rng(0)
     drawn = repeated(hand, task, obj, request, ATTEMPTS)
     goal = drawn.goal
@@ -164,12 +164,12 @@ def _episodes(
 
 
 def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float) -> int:
-    """The one that was drawn, unless another is clearly better: it holds, or keeps to the constraints."""
+    """Index of the drawn grasp, or of another one that is clearly better: it holds, or keeps to the constraints."""
     return int(np.argmin(costs(outcome, constraints, removal, lift) + _OTHER * (np.arange(ATTEMPTS) > 0)))
 
 
 def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
-    """Why another grasp than the drawn one is shown; empty if it is that one, or none held."""
+    """Reason why another grasp than the drawn one is shown; empty if it is the drawn one, or none held."""
     held = outcome.metrics["held"] > 0
     if held.any() and index:
         why = "did better" if held[0] else "held, which what was drawn did not"

@@ -1,4 +1,4 @@
-"""Undo and redo of what a user does to the request."""
+"""Undo and redo of changes to the request."""
 
 from typing import Any
 
@@ -17,25 +17,25 @@ ACTIONS = {
     "draw": "wrist path",
     "suggest": "suggestion",
 }
-"""Methods of `Studio` that a page may call, with their arguments by name, and what a person calls each."""
+"""Methods of `Studio` that a page may call, with their arguments by name, and their labels on the page."""
 _MOST = 100  # edits that can be undone
 
 
 class History:
-    """Does edits, and takes them back one by one; an edit that fails leaves everything as it was."""
+    """Makes edits and undoes them one by one; an edit that fails changes nothing."""
 
     def __init__(self, studio: Studio):
-        """Nothing has been done to the studio's request yet."""
+        """Begins without edits."""
         self._studio = studio
         self._done: list[tuple[str, Edit]] = []
         self._undone: list[tuple[str, Edit]] = []
         self._gesture: Any = None
 
     def do(self, action: str, *, gesture: Any = None, **values: Any) -> None:
-        """Calls one of `ACTIONS`; those of one gesture in a row, such as of a slider that is dragged, are one edit.
+        """Calls one of `ACTIONS`. Successive calls of one gesture, such as dragging a slider, are one edit.
 
         Raises:
-          CongraspError: it cannot be done.
+          CongraspError: the action fails.
         """
         before = self._studio.edit
         try:
@@ -49,11 +49,11 @@ class History:
         self._undone.clear()
 
     def undo(self) -> None:
-        """Takes the last edit back, if there is one."""
+        """Undoes the last edit, if there is one."""
         self._swap(self._done, self._undone)
 
     def redo(self) -> None:
-        """Does again what was undone last, if nothing was done since."""
+        """Repeats the edit that was undone last, if no other followed."""
         self._swap(self._undone, self._done)
 
     def view(self) -> dict[str, str]:
@@ -62,7 +62,7 @@ class History:
         return {name: ACTIONS[edits[-1][0]] if edits else "" for name, edits in found.items()}
 
     def _swap(self, source: list[tuple[str, Edit]], target: list[tuple[str, Edit]]) -> None:
-        """Goes to the last edit of one list, and keeps the present one in the other."""
+        """Restores the last edit of `source`, and keeps the current one in `target`."""
         self._gesture = None
         if source:
             action, edit = source.pop()

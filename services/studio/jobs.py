@@ -1,4 +1,4 @@
-"""Work that takes longer than a click: one job at a time, with its progress."""
+"""Background jobs: one at a time, with its progress."""
 
 import threading
 import time
@@ -10,16 +10,16 @@ from congrasp.common.errors import CongraspError
 from congrasp.services.ops.logs import log
 
 SECONDS = "{seconds}"
-"""In the text of a job: stands for how long it runs already."""
+"""Placeholder in the text of a job for its elapsed seconds."""
 Progress = Callable[[str, float], None]
-"""(what is being done, how much of it is done from 0 to 1)."""
+"""(current activity, completed share from 0 to 1)."""
 
 
 class Jobs:
-    """Runs one job at a time in a thread of its own."""
+    """Runs one job at a time in a separate thread."""
 
     def __init__(self) -> None:
-        """Nothing runs."""
+        """Begins without a job."""
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="studio")
         self._lock = threading.RLock()
         self._number = 0
@@ -27,10 +27,10 @@ class Jobs:
         self._state: dict[str, Any] = _state(0, running=False)
 
     def start(self, text: str, work: Callable[[Progress], str | None]) -> dict[str, Any]:
-        """Begins a job, which may return the name of what it made; returns its state.
+        """Begins a job, which may return the key of its result; returns the job's state.
 
         Raises:
-          CongraspError: another one is still running.
+          CongraspError: another job is still running.
         """
         with self._lock:
             self.require_idle()
@@ -47,30 +47,30 @@ class Jobs:
                 raise CongraspError(f"Please wait: {self.state()['text']}.")
 
     def state(self) -> dict[str, Any]:
-        """The present job, or the last one: number, running, text, share, error, and what it made."""
+        """The current job, or the last one: number, running, text, share, error, and the key of its result (made)."""
         with self._lock:
             seconds = f"{time.monotonic() - self._since:.0f}"
             return {**self._state, "text": self._state["text"].replace(SECONDS, seconds)}
 
     def close(self) -> None:
-        """Takes no more jobs, and waits for none."""
+        """Rejects further jobs, without waiting for a running one."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _run(self, work: Callable[[Progress], str | None]) -> None:
-        """Runs a job to its end and notes how it ended."""
+        """Runs a job to its end and stores its result or error."""
         error, made = "", None
         try:
             made = work(self._progress)
         except CongraspError as found:
             error = str(found)
-        except Exception as found:  # whatever goes wrong in a job, the page shows it and the studio continues
+        except Exception as found:  # the page shows any error of a job, and the studio continues
             error = f"This went wrong and is a fault of congrasp: {type(found).__name__}: {found}."
             log("error", error)
         with self._lock:
             self._state |= {"running": False, "share": 1.0, "error": error, "made": made}
 
     def _progress(self, text: str, share: float) -> None:
-        """Notes how far the job is."""
+        """Stores the progress of the job."""
         with self._lock:
             self._state |= {"text": text, "share": min(1.0, max(0.0, share))}
 

@@ -19,7 +19,7 @@ from congrasp.services.record.goals import active_blocks, active_constraints, ma
 from congrasp.services.viz.render import grasp_steps
 
 TOUCH = 0.05
-"""Newtons from which a link counts as touching."""
+"""Least force of a link in contact, N."""
 _UNITS = {"rad": (180 / np.pi, "°"), "m": (100.0, " cm"), "": (100.0, " %")}
 MEANINGS = {term.name: term.meaning for term in GRASP} | {
     weight.name: weight.meaning for constraint in CONSTRAINTS for weight in constraint.weights
@@ -33,15 +33,15 @@ class Lane(NamedTuple):
     met: np.ndarray
     """(T,) bool."""
     counts: np.ndarray
-    """(T,) bool: the constraint is meant for this step (a heading for the grasp, a path for the approach)."""
+    """(T,) bool: the constraint applies to this step (a heading to the grasp, a path to the approach)."""
     legend: str
     """Measured quantity, and its tolerance."""
     errors: Mapping[str, np.ndarray]
-    """(T,) by name with its unit."""
+    """(T,) errors by their units, `share` without unit; the number of links by `links`."""
 
 
 def lanes(episode: Message) -> dict[str, Lane]:
-    """The lanes of an episode: contact, then the active constraints whose errors it has recorded, by name."""
+    """The lanes of an episode by name: contact, then the active constraints whose errors are recorded."""
     arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
     table = np.arange(len(arrays["table"])) < grasp_steps(episode)[1]
     links = (np.linalg.norm(arrays["contact_force"], axis=-1) > TOUCH).sum(-1)
@@ -72,7 +72,7 @@ def _turn(quaternion: Any) -> Rotation:
 
 
 def for_page(episode: Message) -> Message:
-    """The episode as the player needs it: poses, forces, rewards, object, markers and lanes."""
+    """The episode for the page's player: poses, forces, rewards, object, markers and lanes."""
     found = lanes(episode)
     keep: tuple[str, ...] = (
         "link_position",

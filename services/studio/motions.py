@@ -1,4 +1,4 @@
-"""Motions that a studio keeps to be played, compared and saved."""
+"""Motions of a studio, to play, compare and save."""
 
 from typing import Any
 
@@ -12,14 +12,14 @@ from congrasp.services.record.goals import active_constraints
 
 _ABOVE = np.cos(np.radians(45.0))
 MOST = 30
-"""Motions that are kept; the oldest goes first."""
+"""Number of motions kept; the oldest is dropped first."""
 
 
 class Motions:
     """The newest motions, by number."""
 
     def __init__(self) -> None:
-        """There is none yet."""
+        """Begins without motions."""
         self._kept: dict[str, Message] = {}
         self._number = 0
 
@@ -38,7 +38,7 @@ class Motions:
         return self._kept[key]
 
     def delete(self, key: str) -> None:
-        """Keeps a motion no longer."""
+        """Deletes a motion, if there is one of this number."""
         self._kept.pop(key, None)
 
     def view(self) -> list[dict[str, Any]]:
@@ -47,7 +47,7 @@ class Motions:
 
 
 def _asked(episode: Message) -> str:
-    """Request of a motion in words: its constraints, and the way the hand came in the world."""
+    """Request of a motion in words: its constraints, and the direction of the approach, world frame."""
     arrays, names = episode.arrays, active_constraints(episode.arrays)[1:]
     turn = Rotation.from_quat(arrays["object_quaternion"][0], scalar_first=True)
     down = -float(turn.apply(np.asarray(arrays["goal/heading_direction"], float))[2])

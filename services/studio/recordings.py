@@ -13,7 +13,7 @@ from congrasp.services.record.salvage import DAMAGE, intact_summary
 from congrasp.services.record.scene import EPISODE_SCHEMA
 
 MOST = 60
-"""Episodes that one search finds at most; the nearest to the time."""
+"""Maximum number of episodes of one search: those nearest to the time."""
 FARTHER = (1.0, 5.0, 25.0)
 """Factors on the time searched, tried in turn until there is an episode."""
 
@@ -21,11 +21,11 @@ FARTHER = (1.0, 5.0, 25.0)
 class Recordings:
     """The episodes in a folder of recordings, found by their time.
 
-    What the last search found stays in memory, to be played.
+    Episodes of the last search stay in memory, for the player.
     """
 
     def __init__(self, path: pathlib.Path):
-        """Reads nothing before the first search: files may appear and grow."""
+        """Reads nothing until the first search, because files may appear and grow."""
         self.path = path
         self._lock = threading.Lock()
         self._found: dict[str, Message] = {}
@@ -43,13 +43,13 @@ class Recordings:
 
         Args:
           time: seconds since 1970.
-          seconds: how far from it they may be; the search widens where there are none.
+          seconds: largest distance from it; the search widens by `FARTHER` while it finds none.
 
         Returns:
-          How far the search went, and for each episode what a list shows of it; its `id` is for `episode`.
+          The distance searched (s), and the list entry of each episode; its `id` is for `episode`.
 
         Raises:
-          CongraspError: there are no recordings.
+          CongraspError: there are no recordings, or a file cannot be read.
         """
         files = log_files(self.path)
         for farther in FARTHER:
@@ -67,7 +67,7 @@ class Recordings:
         """An episode of the last search.
 
         Raises:
-          CongraspError: it did not find this one.
+          CongraspError: the last search did not find it.
         """
         with self._lock:
             if key not in self._found:
@@ -100,7 +100,7 @@ def _within(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, by
 
 
 def _by_index(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, bytes]] | None:
-    """The same of a finished file, in which little is read; None if it is unfinished, or damaged where it is read."""
+    """Does the work of `_within` by the index of a finished file; None if it is unfinished, or damaged where read."""
     try:
         with file.open("rb") as stream:
             if (summary := intact_summary(stream)) is None or (statistics := summary.statistics) is None:

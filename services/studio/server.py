@@ -19,7 +19,7 @@ from congrasp.services.ops.logs import log
 
 STATIC = pathlib.Path(__file__).with_name("static")
 MOST_BYTES = 128 << 20
-"""Of one request's body: an uploaded mesh."""
+"""Bytes of the largest request body, an uploaded mesh."""
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -30,7 +30,7 @@ _POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' 
 _ROUTES = "/api/"
 _TOKEN = re.compile("[0-9a-f]{32}")
 _TIMEOUT = 30.0  # seconds that a request may take to arrive
-_DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes of a refused body, so that the refusal arrives before the end does
+_DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes read of a refused body, so that the answer arrives before the close
 
 
 class BadRequest(CongraspError):
@@ -72,7 +72,7 @@ class PageServer:
 
         Args:
           routes: returns the routes of a browser, by the token in its cookie; an empty one without a cookie.
-          host: interface; requests by another name than that of loopback are only answered on others.
+          host: interface; on loopback, only requests to a loopback name are answered.
           port: TCP port; 0 takes a free one (see `port`).
 
         Raises:
@@ -110,7 +110,7 @@ class PageServer:
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
 
     def close(self) -> None:
-        """Stops to listen."""
+        """Stops the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(2.0)
@@ -118,7 +118,7 @@ class PageServer:
     def _allowed(self, request: http.server.BaseHTTPRequestHandler) -> bool:
         """True if a request comes from the page itself: other sites in the browser must not reach it.
 
-        A site can have its name point to this machine, so the name that was asked for must be this machine's own.
+        A site's name may resolve to this machine (DNS rebinding), so the Host header must name this machine.
         """
         host = request.headers.get("Host", "")
         origin, site = request.headers.get("Origin"), request.headers.get("Sec-Fetch-Site")
@@ -129,7 +129,7 @@ class PageServer:
 
 class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
-    request_queue_size = 128  # a connection that finds no room is repeated after a second
+    request_queue_size = 128  # the client retries a connection that finds no room, after a second
 
     def __init__(self, address: tuple[str, int], handler: Any):
         """Listens at (interface, port)."""
@@ -138,7 +138,7 @@ class _Server(http.server.ThreadingHTTPServer):
         super().__init__(address, handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away in the middle of an answer is no error."""
+        """Ignores browsers that disconnect during an answer."""
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
@@ -147,7 +147,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     cookie: str
 
     def routes(self) -> Routes:
-        """Routes of the browser that asks."""
+        """Routes of the requesting browser."""
         raise NotImplementedError
 
     def allowed(self) -> bool:
@@ -167,7 +167,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         """Answers by a route; a request is refused by its headers, before its body is read."""
         path, query = self._route()
-        # What a form of another site can send has none of these types.
+        # A form of another site cannot send these types.
         kind = (self.headers.get("Content-Type") or "").partition(";")[0]
         given = self.headers.get("Content-Length") or ""
         length = int(given) if given.isdecimal() and len(given) < 20 else -1
@@ -192,7 +192,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         return ""
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not logged."""
+        """Logs nothing."""
 
     def _route(self) -> tuple[str, dict[str, str]]:
         """Path and query parameters of the request; an empty path for a malformed URL."""
@@ -203,7 +203,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         return parts.path, dict(urllib.parse.parse_qsl(parts.query))
 
     def _refused(self, more: bool = False) -> bool:
-        """Sends a refusal if the request is not allowed; whether it did."""
+        """Sends a refusal if the request is not allowed, or `more` is set; returns True if it did."""
         if not more and self.allowed():
             return False
         self._send(403, "application/json", b'{"error": "This page answers only to itself."}')
@@ -237,7 +237,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         except CongraspError as error:
             self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
             return
-        except Exception as error:  # whatever a page asks for, the server continues
+        except Exception as error:  # the server continues after any error of a request
             log("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
             message = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
             self._send(500, "application/json", json.dumps({"error": message}).encode())

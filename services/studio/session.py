@@ -1,4 +1,4 @@
-"""One user's studio with its policy, objects and motions, beside the window on a training: what the page talks to."""
+"""The session of one browser: studio, policy, objects and motions, and the training window; handles its requests."""
 
 import functools
 import json
@@ -39,21 +39,21 @@ from congrasp.services.viz.shapes import skin_colours
 LIGHTEST_G, HEAVIEST_G = 1, 5000
 LONGEST = Phases(approach=10.0, lift=0.5, hold=10.0)
 _OWN_WEIGHT = {"mass_g": 0.0, "material": ""}
-"""The object weighs what it came with."""
+"""Leaves the mass of the object unchanged."""
 _DRAWING = "drawing"
-"""Kinds of results of a job that are a picture or a video instead of a motion."""
+"""Result of a job that rendered a picture or a video, in place of a motion's number."""
 _LATEST = 1e10
 """Seconds since 1970 beyond which nothing was recorded."""
 
 
 class Grasping(Protocol):
-    """A policy that can be asked for a grasp."""
+    """A policy that grasps objects."""
 
     hand: Hand
     task: TaskConfig
 
     def newest(self) -> dict[str, Any]:
-        """Source of the policy and its version, after a check for newer weights."""
+        """Source and version of the weights of the last grasp, and the trouble with newer ones."""
 
     def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
         """The episode of a grasp with these phases."""
@@ -73,10 +73,10 @@ class Session:
         """Loads the first hand's policy and the first object.
 
         Args:
-          hands: by name, what loads a policy.
-          objects: what can be chosen.
-          importer: makes objects of uploaded meshes.
-          window: what is known of a run, or None.
+          hands: loaders of policies, by name.
+          objects: objects to choose from.
+          importer: makes objects from uploaded meshes.
+          window: state of a run, or None.
           recordings: its episodes on disk, or None.
         """
         self._hands, self._objects = hands, objects
@@ -107,7 +107,7 @@ class Session:
         self.routes = Routes(gets, {"/api/do": self._do, "/api/upload": self._upload})
 
     def close(self) -> None:
-        """Ends what runs, and removes uploaded meshes."""
+        """Rejects further jobs, and removes uploaded meshes."""
         self._jobs.close()
         self._folder.cleanup()
 
@@ -143,7 +143,7 @@ class Session:
         return hand_message(own if name == own.name else known_hand(name))
 
     def mesh(self) -> Message:
-        """The object's mesh that is painted on."""
+        """The painted mesh of the object."""
         with self._lock:
             canvas, name = self._studio.canvas, self._studio.obj.name
         own = {} if canvas.colours is None else {"colours": canvas.colours}
@@ -170,13 +170,13 @@ class Session:
         return data_file(self.motion(key), key, kind)
 
     def drawn(self) -> Download:
-        """The picture or video that was drawn last; a CongraspError if there is none."""
+        """The picture or video that was rendered last; a CongraspError if there is none."""
         if self._drawn is None:
             raise CongraspError("Nothing has been drawn yet.", "Save a motion as mp4 or png.")
         return self._drawn
 
     def training(self, names: str) -> dict[str, Any]:
-        """Content of the window; `names`: curves, separated by commas."""
+        """Content of the training window; `names` are those of curves, separated by commas."""
         if self._window is None:
             raise CongraspError("The studio follows no run.", "Start it with --connect, or with --recordings.")
         return self._window.view([name for name in names.split(",") if name])
@@ -195,7 +195,7 @@ class Session:
         return {"seconds": reach, "episodes": episodes}
 
     def _do(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
-        """One action of the user; answers with the new state."""
+        """Does one action of the user; returns the new state."""
         try:
             request = json_object(body)
             action = request.pop("action")
@@ -224,7 +224,7 @@ class Session:
         return self.state()
 
     def _upload(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
-        """A mesh to import; its object is chosen when that is done, unless several units would do."""
+        """Imports a mesh and then shows its object; waits for the user's choice if several units fit."""
         upload = self._uploads.take(query.get("name", ""), body)
         with self._lock:
             if upload.unit:
@@ -241,7 +241,7 @@ class Session:
         self._import(upload.path.name, lambda: self._uploads.load(upload, unit, replaces))
 
     def _weigh(self, mass_g: float = 0, material: str = "") -> None:
-        """Sets what the object weighs: its mass, else by a material; its own mass where neither is given."""
+        """Sets the object's mass: `mass_g`, else by a material, else its original mass."""
         if mass_g and not LIGHTEST_G <= mass_g <= HEAVIEST_G:
             raise CongraspError(f"The mass is {mass_g:g} g.", f"Write {LIGHTEST_G} to {HEAVIEST_G} g, or nothing.")
         obj = self._objects.get(self._object)
@@ -249,7 +249,7 @@ class Session:
         self._weight = {"mass_g": mass_g, "material": material}
 
     def _time(self, **phases: float) -> None:
-        """Sets approach (s), lift (m) or hold (s) of the coming grasps."""
+        """Sets approach (s), lift (m) or hold (s) of further grasps."""
         for name, value in phases.items():
             most = getattr(LONGEST, name, None)
             if most is None or not 0 <= float(value) <= most:
@@ -258,7 +258,7 @@ class Session:
         self._phases = self._phases._replace(**{name: float(value) for name, value in phases.items()})
 
     def _import(self, file: str, load: Callable[[], str]) -> dict[str, Any]:
-        """Begins an import, which returns the object's name; shows the object."""
+        """Begins an import by `load`, which returns the object's name, and then shows the object."""
 
         def work(progress: Progress) -> None:
             """Imports it."""
@@ -285,7 +285,7 @@ class Session:
         self._jobs.start(f"loading the policy of the hand {name}", work)
 
     def _take_hand(self, grasping: Grasping, obj: GraspObject) -> None:
-        """A studio for a policy's hand."""
+        """Opens a studio for a policy's hand."""
         self._grasping = grasping
         self._studio = Studio(grasping.hand, grasping.task, obj)
         self._history = History(self._studio)
@@ -306,14 +306,14 @@ class Session:
         self._uploads.pending = None
 
     def _show(self, name: str) -> None:
-        """Puts an object that is there into the studio."""
+        """Shows an object of the catalogue."""
         self._studio.take(self._objects.get(name))
         self._weight = dict(_OWN_WEIGHT)
         self._history = History(self._studio)
         self._object, self._shown = name, self._shown + 1
 
     def _grasp(self) -> None:
-        """Begins the grasp that is requested; its motion is kept."""
+        """Begins the requested grasp, whose motion is kept."""
         request, obj = self._studio.request, self._studio.labelled
         grasping, phases = self._grasping, self._phases
 
@@ -326,7 +326,7 @@ class Session:
         self._jobs.start("grasping", work)
 
     def _draw_motion(self, id: str, kind: str, camera: Mapping[str, Any], frame: int = 0) -> None:
-        """Begins to draw a motion as one of `DRAWN`; `drawn` then has it."""
+        """Begins to render a motion as one of `DRAWN`, for `drawn`."""
         key = str(id)
         episode = self.motion(key)
 

@@ -1,4 +1,4 @@
-"""A session for each browser: painting and undoing in one leave the others' objects alone."""
+"""One session per browser, so that edits in one do not change the objects of others."""
 
 import collections
 import threading
@@ -8,7 +8,7 @@ from congrasp.services.studio.server import Routes
 from congrasp.services.studio.session import Session
 
 MOST = 8
-"""Browsers at the same time; one more ends the session that was used least recently."""
+"""Maximum number of browsers; a further one ends the session that was used least recently."""
 
 
 class Sessions:
@@ -21,7 +21,7 @@ class Sessions:
           new: opens a session.
 
         Raises:
-          CongraspError: of `new`.
+          CongraspError: `new` failed.
         """
         self._new, self._spare = new, [new()]
         self._open: collections.OrderedDict[str, Session] = collections.OrderedDict()

@@ -1,4 +1,4 @@
-"""The request of the studio's user, without any browser: object, constraints, and what the priority rules do."""
+"""The request of the studio's user: object, constraints, and the effects of the priority rules; without a browser."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ from congrasp.services.studio.arrow import LARGEST, Arrow, arrow_of, from_above,
 from congrasp.services.studio.canvas import Canvas, Paint
 
 TOOLS = ("affordance", "pose", "trajectory")
-"""Constraints that have tools of their own; the page makes toggles for the flags of the others."""
+"""Constraints with drawing tools; the page makes toggles for the flags of the others."""
 _LEAST_PATH = 0.03  # m
 
 
@@ -40,7 +40,7 @@ class Path(NamedTuple):
 
 
 class Edit(NamedTuple):
-    """All that a user sets of a request for one object; nothing in it is ever changed."""
+    """Everything that a user sets in a request for one object; immutable."""
 
     rest: int
     asked: frozenset[str]
@@ -52,26 +52,26 @@ class Edit(NamedTuple):
 
 
 class Studio:
-    """One user's request: every method is something that the user does, and raises a CongraspError if it cannot be.
+    """One user's request. Its methods are the user's actions, and raise a CongraspError if they are impossible.
 
     Attributes:
-      obj: the object as it came.
+      obj: the object, without paint.
       rest: index of its resting pose.
       asked: names of the optional constraints that are switched on.
       arrow: the heading.
       pose: the reference pose, or None.
       path: the wrist path, or None.
-      others: flags of the constraints without tools of their own.
+      others: flags of the constraints without drawing tools.
       canvas: the object's surface, with the painted avoid region.
     """
 
     def __init__(self, hand: Hand, task: TaskConfig, obj: GraspObject):
-        """Begins with an object, and a heading that the table leaves room for."""
-        self.hand, self.task = hand, dataclasses.replace(task, object_scale=1.0)  # objects as large as they are
+        """Begins with an object, and a heading from above."""
+        self.hand, self.task = hand, dataclasses.replace(task, object_scale=1.0)  # objects keep their size
         self.take(obj)
 
     def take(self, obj: GraspObject) -> None:
-        """Another object, with nothing requested but its heading from above."""
+        """Takes another object, and resets the request to a heading from above."""
         self.obj, self.rest = obj, 0
         self.asked: frozenset[str] = frozenset()
         self.canvas = Canvas(obj)
@@ -86,7 +86,7 @@ class Studio:
 
     @property
     def edit(self) -> Edit:
-        """All that the user has set; setting it brings another state back."""
+        """Everything that the user has set; setting it restores another state."""
         return Edit(self.rest, self.asked, self.arrow, self.pose, self.path, self.others, self.canvas.paint)
 
     @edit.setter
@@ -94,7 +94,7 @@ class Studio:
         self.rest, self.asked, self.arrow, self.pose, self.path, self.others, self.canvas.paint = edit
 
     def set_rest_pose(self, rest: int) -> None:
-        """Another resting pose."""
+        """Sets the resting pose, and resets the heading to one from above."""
         if not isinstance(rest, int) or not 0 <= rest < len(self.obj.rest_poses):
             which = rest + 1 if isinstance(rest, int) else f"'{str(rest)[:20]}'"
             raise CongraspError(f"The object '{self.obj.name}' has no resting pose {which}.")
@@ -102,7 +102,7 @@ class Studio:
         self.arrow = from_above(self.obj, rest)
 
     def ask(self, constraint: str, on: bool) -> None:
-        """Switches an optional constraint; what it needs and is not there yet is suggested."""
+        """Switches an optional constraint on or off; suggests its missing parts."""
         require_known([constraint], self.task)
         if not get_constraint(constraint).optional:
             raise CongraspError(f"The {constraint} is always active.", "Set it with the arrow.")
@@ -115,7 +115,7 @@ class Studio:
         self._switch(constraint, on)
 
     def choose(self, constraint: str, field: str, values: Any) -> None:
-        """Sets the flags of a constraint without tools of its own, and asks for it."""
+        """Sets the flags of a constraint without drawing tools, and switches it on."""
         require_known([constraint], self.task)
         if constraint not in self.others or field not in get_constraint(constraint).labels(self.hand):
             raise CongraspError(f"There is nothing to choose for '{constraint}'.", f"Choose for: {list(self.others)}.")
@@ -131,13 +131,13 @@ class Studio:
 
         Args:
           position: (3,) target in the object frame, m.
-          direction: (3,) of any length but zero.
-          cross: (3,) along the cross-finger axis; the present one, made orthogonal, if not given.
+          direction: (3,) of any length above zero.
+          cross: (3,) along the cross-finger axis, made orthogonal; the current one by default.
         """
         self.arrow = arrow_of(position, direction, self.arrow.cross if cross is None else cross)
 
     def snap_heading(self, surface: Any, direction: Any) -> None:
-        """Sets the heading through a point (3,) of the surface: its target is as deep inside as in training."""
+        """Sets the heading through a point (3,) of the surface; its target is `INWARD` beyond it, as in training."""
         surface, direction = vector("point", surface), vector("arrow's direction", direction)
         self.set_heading(surface + INWARD * direction / max(1e-6, float(np.linalg.norm(direction))), direction)
 
@@ -147,35 +147,35 @@ class Studio:
         self.arrow = self.arrow.with_roll(angle, self.up)
 
     def paint(self, points: Any, radius: float, avoid: bool) -> None:
-        """Brushes over points (N, 3) of the surface: they join the avoid region, or leave it.
+        """Adds the surface near points (N, 3) to the avoid region, or removes it; see `Canvas.brush`.
 
-        Paint asks for the affordance; without any it is asked for no longer.
+        The affordance is requested while there is paint.
         """
         self.canvas.brush(points, radius, avoid)
         self._repainted()
 
     def fill(self, avoid: bool) -> None:
-        """Paints everything in one colour."""
+        """Paints everything, or removes all paint if `avoid` is False."""
         self.canvas.fill(avoid)
         self._repainted()
 
     def close_hand(self) -> None:
-        """Asks for a reference pose: the hand at the arrow, closed around the object."""
+        """Requests a reference pose: the hand at the arrow, closed around the object."""
         require_known(["pose"], self.task)
         self._close()
         self._switch("pose", True)
 
     def _close(self) -> None:
-        """The pose of `close_hand`."""
+        """Sets the pose of `close_hand`."""
         arrow = (np.asarray(part, np.float32)[None] for part in self.arrow)
         pose = closed_poses(self.hand, np.asarray(self.obj.points), np.asarray(self.obj.normals), *arrow)
         self.pose = Poses(*(np.asarray(field)[0] for field in pose))
 
     def draw(self, points: Any) -> None:
-        """Asks for a wrist path through points (N, 3) of the object frame, from far to near.
+        """Requests a wrist path through points (N, 3) of the object frame, from far to near.
 
-        It is moved little by little along its way, so that it ends where the wrist of the reference pose is, or of the
-        hand closed at the arrow; the wrist is turned as there all the way.
+        A displacement that grows along the path makes it end at the wrist of the reference pose, or of the hand closed
+        at the arrow. The orientation of the wrist is that of the end throughout.
         """
         require_known(["trajectory"], self.task)
         drawn = np.asarray(points, float)
@@ -198,7 +198,7 @@ class Studio:
         self._switch("trajectory", True)
 
     def suggest(self, constraint: str) -> None:
-        """Asks for the next heading, reference pose or wrist path that training would draw for this object.
+        """Requests the next heading, reference pose or wrist path that training would draw for this object.
 
         Raises:
           CongraspError: there are none in this resting pose.
@@ -211,7 +211,7 @@ class Studio:
             self._switch(constraint, True)
 
     def _suggest(self, constraint: str) -> None:
-        """The heading, pose or path of `suggest`."""
+        """Sets the heading, pose or path of `suggest`."""
         sets = self._constraint_sets().arrays
         region = int("affordance" in self.asked and bool(self.canvas.avoid.any()))
         allowed = sets["heading/allowed" if constraint == "heading" else "pose/allowed"][region, self.rest]
@@ -243,7 +243,7 @@ class Studio:
         """Request for the policy.
 
         Raises:
-          CongraspError: it cannot be asked for; see `trouble`.
+          CongraspError: the request is impossible; see `trouble`.
         """
         if trouble := self.trouble:
             raise CongraspError(trouble)
@@ -274,7 +274,7 @@ class Studio:
 
     @property
     def trouble(self) -> str:
-        """Why this cannot be asked for, and what to do; empty if it can."""
+        """Reason why the request is impossible, with a remedy; empty if it is possible."""
         if "affordance" in self.asked and (self.canvas.avoid.all() or not self.canvas.avoid.any()):
             what = "Everything is" if self.canvas.avoid.any() else "Nothing is"
             return f"{what} painted as avoid region. Paint a part of the object with the brush."
@@ -298,11 +298,11 @@ class Studio:
         return ""
 
     def _repainted(self) -> None:
-        """Asks for the affordance where there is paint."""
+        """Requests the affordance if there is paint."""
         self._switch("affordance", bool(self.canvas.avoid.any()))
 
     def _switch(self, constraint: str, on: bool) -> None:
-        """Asks for a constraint, or no longer."""
+        """Switches a constraint on or off."""
         self.asked = self.asked | {constraint} if on else self.asked - {constraint}
 
     @property
@@ -311,14 +311,14 @@ class Studio:
         return matrix(self.obj.rest_poses[self.rest][3:])[2]
 
     def _constraint_sets(self) -> Message:
-        """The constraint set of the object with its present paint, made when it is needed."""
+        """The constraint set of the object with its current paint, generated on demand."""
         key = self.canvas.avoid.tobytes()
         if self._sets is None or self._sets[0] != key:
             self._sets = key, make_sets(self.hand, self.task, [self.labelled], seed=0)[0]
         return self._sets[1]
 
     def _world(self, point: np.ndarray) -> np.ndarray:
-        """(3,) a point of the object frame in the world."""
+        """(3,) m, a point of the object frame in the world frame."""
         rest = self.obj.rest_poses[self.rest]
         return rest[:3] + matrix(rest[3:]) @ point
 

@@ -1,4 +1,4 @@
-"""Pictures of an object's resting poses, drawn when they are first looked at."""
+"""Pictures of an object's resting poses, rendered on demand."""
 
 import threading
 
@@ -12,16 +12,16 @@ _SIZE = (150, 112)  # pixels
 
 
 class Thumbnails:
-    """Those of one object at a time."""
+    """Pictures of the resting poses of one object at a time."""
 
     def __init__(self) -> None:
-        """None is drawn."""
+        """Renders nothing yet."""
         self._lock = threading.Lock()
         self._object: GraspObject | None = None
         self._drawn: dict[int, Picture] = {}
 
     def picture(self, obj: GraspObject, rest: int) -> Picture:
-        """An object in one of its resting poses; a CongraspError if it has none of that number."""
+        """An object in one of its resting poses, from 0; raises a CongraspError if there is none of this number."""
         if not 0 <= rest < len(obj.rest_poses):
             raise CongraspError(f"The object '{obj.name}' has no resting pose {rest + 1}.")
         with self._lock:

@@ -26,18 +26,18 @@ from congrasp.services.record.reader import Record, is_episode, log_files, metri
 from congrasp.services.viz.plots import figures
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
-"""Curves that a page shows first."""
+"""Curves that a page shows by default."""
 _LAST = {"success": "episode/success", "steps_per_second": "steps_per_second"}
 _REPORTED = ("version", "rollouts", "steps_per_second")
 _READ = ("/metrics/", "/events/")
 _EVENTS = 100
-_TREND = 200  # points of an actor's own history that are kept
-_STALE = 15.0  # seconds after which an actor that nobody lists any more is forgotten
+_TREND = 200  # episodes of an actor that its success covers
+_STALE = 15.0  # seconds after which an actor that the learner no longer lists is removed
 
 
 @dataclasses.dataclass
 class Curve:
-    """A number over the updates of a run; where a run went back to a checkpoint, the later value counts."""
+    """A metric over the updates of a run; after a return to a checkpoint, later values replace earlier ones."""
 
     steps: list[float] = dataclasses.field(default_factory=list)
     values: list[float] = dataclasses.field(default_factory=list)
@@ -45,7 +45,7 @@ class Curve:
     """Seconds since 1970."""
 
     def add(self, step: float, value: float, time: float) -> None:
-        """One more point."""
+        """Adds a point, and removes those at the same or a later step."""
         if self.steps and step <= self.steps[-1]:
             first = bisect.bisect_left(self.steps, step)
             del self.steps[first:], self.values[first:], self.times[first:]
@@ -54,7 +54,7 @@ class Curve:
         self.times.append(time)
 
     def thinned(self, most: int) -> dict[str, list[float]]:
-        """At most `most` points for a page: of each stretch the lowest, the highest and the most sudden."""
+        """At most `most` points for a page: of each section the lowest, the highest and the sharpest one."""
         index = np.arange(len(self.steps))
         if len(index) > most:
             values = np.array(self.values)
@@ -66,7 +66,7 @@ class Curve:
 
 @dataclasses.dataclass
 class Actor:
-    """One actor, as its messages show it."""
+    """State of one actor, from its messages."""
 
     seen: float
     episode: Message | None = None
@@ -75,7 +75,7 @@ class Actor:
     recent: collections.deque[bool] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=_TREND))
     """Success of its last episodes."""
     last: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Version, rollouts and steps per second as it reported them last."""
+    """Version, rollouts and steps per second of its last report."""
 
 
 class TrainingWindow:
@@ -83,11 +83,11 @@ class TrainingWindow:
 
     Attributes:
       live: True if the run is followed; False if it is only read from its recordings.
-      damaged: messages that were not what their key says.
+      damaged: number of messages whose content did not match their key.
     """
 
     def __init__(self, run: str):
-        """Nothing is known yet."""
+        """Begins without messages."""
         self.run, self.live, self.damaged = run, False, 0
         self._lock = threading.Lock()
         self._curves: dict[str, Curve] = {}
@@ -98,7 +98,7 @@ class TrainingWindow:
         self._labels: dict[str, dict[str, str]] = {}
 
     def take(self, key: str, message: Message, now: float) -> None:
-        """One log message, as published under `log/**`; `now` in seconds since 1970."""
+        """Accepts one log message, as published under `log/**`; `now` in seconds since 1970."""
         try:
             *_, kind, role, name = key.split("/")
             with self._lock:
@@ -113,7 +113,7 @@ class TrainingWindow:
             self.damaged += 1
 
     def take_status(self, found: Mapping[str, Any] | None, now: float) -> None:
-        """The learner's status; None while there is no response."""
+        """Accepts the learner's status; None while there is no response."""
         with self._lock:
             self._disconnected = found is None
             if found is None:
@@ -127,10 +127,10 @@ class TrainingWindow:
                     del self._actors[name]
 
     def load(self, path: pathlib.Path) -> None:
-        """Curves and events of a run's recordings, and what every actor reported last, with its newest episode.
+        """Reads curves and events from a run's recordings, and the last report and newest episode of every actor.
 
         Raises:
-          CongraspError: there are none.
+          CongraspError: there are no recordings.
         """
         self._loading = True
         try:
@@ -139,7 +139,7 @@ class TrainingWindow:
             self._loading = False
 
     def _read(self, path: pathlib.Path) -> None:
-        """The work of `load`."""
+        """Does the work of `load`."""
         newest: dict[str, Record] = {}
         for file in log_files(path):
             for record in read_records(file, lambda topic: topic.startswith(_READ) or is_episode(topic)):
@@ -163,12 +163,14 @@ class TrainingWindow:
         """The newest episode of an actor.
 
         Raises:
-          CongraspError: none has come.
+          CongraspError: none has been received.
         """
         with self._lock:
             known = self._actors.get(actor)
             if known is None or known.episode is None:
-                raise CongraspError(f"No episode of the actor '{actor}' has come yet.", "Actors send one now and then.")
+                raise CongraspError(
+                    f"There is no episode of the actor '{actor}' yet.", "Wait: actors send one from time to time."
+                )
             return known.episode
 
     def curve(self, name: str) -> Curve:
@@ -179,11 +181,11 @@ class TrainingWindow:
         """
         with self._lock:
             if name not in self._curves:
-                raise CongraspError(f"There is no curve '{name}'.", "The page lists those that there are.")
+                raise CongraspError(f"There is no curve '{name}'.", "Choose one of the page's list.")
             return self._curves[name]
 
     def view(self, names: Sequence[str] = (), points: int = 300) -> dict[str, Any]:
-        """Everything that a page shows of it, as JSON; of the curves those that are named."""
+        """The state of the run for a page, as JSON, with the named curves."""
         with self._lock:
             found, roles = self._status, {}
             if found is not None:
@@ -213,7 +215,7 @@ class TrainingWindow:
             }
 
     def _phase(self) -> str:
-        """Phase of the run: training, finished, unreachable, or read from its recordings."""
+        """Phase of the run: training, finished, disconnected, or recorded (read from its recordings alone)."""
         if self._status is not None and self._status["finished"]:
             return "finished"
         if not self.live and self._status is None:
@@ -227,13 +229,13 @@ class TrainingWindow:
         return found | (dict(zip(("update", "time"), max(ends), strict=True)) if ends else {})
 
     def _labels_of_all(self) -> dict[str, dict[str, str]]:
-        """For each curve what people call it, its unit and its group, in the order of the figures."""
+        """Title, unit and group of each curve, in the order of the figures."""
         if self._labels.keys() != self._curves.keys():
             self._labels = labels_of(self._curves)
         return self._labels
 
     def _event(self, time: float, level: str, text: str) -> None:
-        """Keeps a line of the log."""
+        """Stores a line of the log."""
         self._events.append({"time": time, "level": level, "text": text})
 
     def _metrics(self, role: str, name: str, meta: Mapping[str, Any], now: float) -> None:
@@ -254,7 +256,7 @@ class TrainingWindow:
                 self._curves.setdefault(key, Curve()).add(step, value, when)
 
     def _episode(self, name: str, message: Message, now: float) -> None:
-        """Keeps an actor's newest episode."""
+        """Stores an actor's newest episode."""
         if "link_position" not in message.arrays or "success" not in message.meta:
             raise ValueError("not an episode")
         actor = self._actors.setdefault(name, Actor(now))
@@ -276,7 +278,7 @@ class TrainingWindow:
 
 
 def labels_of(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Title, unit and group of each metric, as the figures of `congrasp plot` have them, in their order."""
+    """Title, unit and group of each metric, in the order of the figures of `congrasp plot`."""
     any_values = np.arange(2.0), np.arange(2.0)
     found = {}
     for group, panels in figures({"": {f"learner/0/{name}": any_values for name in metrics}}).values():
@@ -294,10 +296,10 @@ def _logged(record: Record) -> tuple[float, str, str]:
 
 
 class Follower:
-    """Feeds a window from a run, in two threads of its own, until it is closed."""
+    """Feeds a window from a run, in two threads, until it is closed."""
 
     def __init__(self, transport: Transport, window: TrainingWindow, every: float = 1.0):
-        """Subscribes and begins; the transport stays the caller's."""
+        """Subscribes and starts the threads; the caller still owns the transport."""
         self._transport, self._window, self._every = transport, window, every
         window.live = True
         self._stop = threading.Event()
@@ -314,14 +316,14 @@ class Follower:
             thread.join(2.0)
 
     def _receive(self) -> None:
-        """Takes log messages until it is closed."""
+        """Passes log messages to the window until it is closed."""
         while not self._stop.is_set():
             received = self._subscription.receive(0.5)
             if received is not None:
                 self._window.take(*received, time.time())
 
     def _ask(self) -> None:
-        """Asks the learner for its status, again and again."""
+        """Queries the learner's status periodically."""
         while True:
             try:
                 found = statuses.ask(self._transport, self._window.run)

@@ -363,7 +363,7 @@ def _compare(before: list[Row], after: list[Row]) -> None:
     console.print(f"{when}, mean ± standard deviation over {_SEEDS} draws of episodes:")
     for name, label, factor in (
         ("episode_return", "return", 1.0),
-        ("links_at_removal", "links in contact at step 50", 1.0),
+        ("links_at_removal", "links in contact at removal", 1.0),
         ("success", "success, %", 100.0),
     ):
         old, new = (factor * np.array([getattr(row, name) for row in rows]) for rows in (before, after))

@@ -1,4 +1,4 @@
-"""The contact sheet of a hand's self-check: its grips, and below them its joints."""
+"""Contact sheet of a hand's self-check: its grips, and below them its joints."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ def check_sheet(hand: Hand, grips: "Sequence[Grip]") -> np.ndarray:
     images, labels = [], []
     for grip in grips:
         shapes = _grip(hand, grip)
-        # What was lost may be far away: the hand alone decides on the picture then.
+        # A lost object may be far away, so that the camera then fits the hand alone.
         near = len(shapes) if grip.held else -1
         for side, view in _VIEWS.items():
             images.append(render_fitted(shapes[:near], view, _SIZE, shapes[near:]))
@@ -36,7 +36,7 @@ def check_sheet(hand: Hand, grips: "Sequence[Grip]") -> np.ndarray:
 
 
 def _grip(hand: Hand, grip: "Grip") -> list[Shape]:
-    """The hand upright, and at last the object."""
+    """The hand upright, followed by the object."""
     turn = upright(hand)
     placed = turn * Rotation.from_quat(grip.object_quaternion, scalar_first=True)
     mesh = grip.obj.visual_vertices, grip.obj.visual_faces

@@ -27,7 +27,7 @@ class _Placed:
     """Constraints of an object in one of its resting poses, as shapes in the world frame."""
 
     arrays: Mapping[str, np.ndarray]
-    """Of the constraint set."""
+    """Arrays of the constraint set."""
     rest: int
     """Index of the resting pose."""
     hand: Hand

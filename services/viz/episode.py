@@ -15,13 +15,13 @@ from congrasp.services.viz.shapes import arrow, beads, object_shape, posed_hand,
 
 TOUCHING = (0.13, 0.74, 0.63)
 TOUCH = 1e-3
-"""Force from which a link touches, N."""
-_FULL_CONTACT = 2.0  # force at which a link takes most of the contact colour, N
-_ARROW_SEARCH, _ARROW_GAP = 0.012, 0.004  # radius in which the approach looks for the object, space before it, m
+"""Least force of a link in contact, N."""
+_FULL_CONTACT = 2.0  # force at which the contact colour of a link is strongest, N
+_ARROW_SEARCH, _ARROW_GAP = 0.012, 0.004  # radius around the arrow's line to search for the surface, gap before it, m
 
 
 def episode_shapes(episode: Message, step: int, *, overlays: bool = True) -> list[Shape]:
-    """Hand, object and table of one control step of an episode; as overlays its active constraints and contacts."""
+    """Hand, object and table of one control step; with `overlays` also the active constraints and contacts."""
     bodies = _bodies(episode, step, overlays=overlays)
     return bodies + (_constraints(known_hand(episode.meta["hand"]), episode, step) if overlays else [])
 
@@ -40,7 +40,7 @@ def _bodies(episode: Message, step: int, *, overlays: bool) -> list[Shape]:
 
 
 def _object(episode: Message, step: int, *, painted: bool = True) -> Shape:
-    """The object at a step in its own colours, or painted with its two regions where these are a constraint."""
+    """The object at a step in its original colours, or painted with its two regions if they are a constraint."""
     arrays = episode.arrays
     avoid = np.asarray(arrays["surface_avoid"], bool)
     paint = None
@@ -73,7 +73,7 @@ def _constraints(hand: Hand, episode: Message, step: int) -> list[Shape]:
 
 
 def _outside(marker: Arrow, surface: np.ndarray) -> np.ndarray:
-    """(3,) where an arrow to a point inside the object ends: before its line enters the surface (P, 3)."""
+    """(3,) m, end of an arrow to a point inside the object: before its line enters the surface (P, 3)."""
     off = surface - marker.tip
     along = off @ marker.direction
     across = np.linalg.norm(off - along[:, None] * marker.direction, axis=-1)

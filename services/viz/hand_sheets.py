@@ -1,4 +1,4 @@
-"""Contact sheets of hands: their poses with the grasp frame, and what every joint does."""
+"""Contact sheets of hands: their poses with the grasp frame, and the motion of every joint."""
 
 import itertools
 from collections.abc import Sequence
@@ -43,18 +43,18 @@ def _frame(hand: Hand) -> list[Shape]:
 
 
 def _side(hand: Hand) -> np.ndarray:
-    """From where a sheet looks: the palm, and the thumb's side."""
+    """(3,) view direction of a sheet: towards the palm, from the thumb's side."""
     thumb = np.sign(upright(hand).apply(hand.keypoints[len(hand.links)])[1]) or 1.0
     return _VIEW * [1.0, thumb, 1.0]
 
 
 def _points(shapes: Sequence[Shape]) -> np.ndarray:
-    """(n, 3) points that a picture of the shapes must hold."""
+    """(n, 3) points that a picture of the shapes must contain."""
     return np.concatenate([shape_points(shape) for shape in shapes])
 
 
 def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
-    """The hand open, half closed and closed (columns), from the palm, the thumb's side and between (rows)."""
+    """The hand open, half closed and closed (columns), from the palm, the thumb's side and in between (rows)."""
     placed = _poses(hand)
     points = np.concatenate([_points(shapes) for shapes in placed.values()])
     thumb = np.sign(upright(hand).apply(hand.keypoints[len(hand.links)])[1])
@@ -71,9 +71,9 @@ def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
 def hands_sheet(
     hands: Sequence[Hand], skins: Sequence[Skin | None] = (), *, size: tuple[int, int] = (300, 300)
 ) -> np.ndarray:
-    """A row for each hand: open with its grasp frame, half closed, closed; all on one scale.
+    """A row for each hand: open with its grasp frame, half closed, closed; each row on one scale.
 
-    `skins` are the hands' surfaces, where they are not to be their own (`common.hands.skin.skin_of`).
+    `skins` replace the default surfaces of the hands (`common.hands.skin.skin_of`); None keeps the default.
     """
     images, labels = [], []
     for hand, skin in itertools.zip_longest(hands, skins):
@@ -87,7 +87,7 @@ def hands_sheet(
 
 
 def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarray:
-    """The hand's three poses, and every motor at both of its limits, with the links that it moves in colour."""
+    """The hand's three poses, its zero position, and every motor at both limits with the links that it moves tinted."""
     rows = {**_poses(hand), "all at zero": _placed(hand, np.clip(0.0, hand.lower, hand.upper))}
     rows["open"] += _frame(hand)
     names = [link.name for link in hand.links]

@@ -21,12 +21,12 @@ from congrasp.services.viz.sheets import contact_sheet
 _SIZE = (460, 360)
 _VIEW = (0.9, -0.6, 0.45)
 _GAP = 0.03  # m between the hand and the object
-_LARGEST, _SMALLEST = 1.5, 0.01  # m; a mesh beyond is drawn at another scale before its import
+_LARGEST, _SMALLEST = 1.5, 0.01  # m; the file's mesh is drawn at the object's size if it is beyond them
 _LARGE_FILE = 30 << 20  # bytes
 
 
 class Body(NamedTuple):
-    """A mesh that stands beside the hand."""
+    """A mesh to draw next to the hand."""
 
     vertices: np.ndarray
     """(V, 3)."""
@@ -34,19 +34,19 @@ class Body(NamedTuple):
     """(F, 3)."""
     colour: tuple[float, float, float]
     own: Colours | None = None
-    """Colours of its own."""
+    """Colours of its surface, in place of `colour`."""
 
 
 def import_sheet(
     hand: Hand, obj: GraspObject, before: trimesh.Trimesh | None, avoid: np.ndarray | None = None
 ) -> np.ndarray:
-    """Pictures, each beside the open hand: the file, the object on the table, and its convex pieces.
+    """Pictures next to the open hand: the file, the object on the table, its affordance, and its convex pieces.
 
     Args:
       hand: the hand.
-      obj: what the import made.
-      before: the mesh of the file, in the file's unit, if it is to be drawn.
-      avoid: (P,) bool, the surface points that must not be touched, if there is an affordance.
+      obj: the imported object.
+      before: the mesh of the file, in the file's unit; None omits its picture.
+      avoid: (P,) bool, surface points of the avoid region; None omits the picture of the affordance.
 
     Returns:
       (H, W, 3) uint8.
@@ -84,7 +84,7 @@ def import_sheet(
 
 
 def mesh_of_file(source: Source) -> trimesh.Trimesh | None:
-    """The surface of an object's files as they are, in their own unit; None where reading it twice takes too long."""
+    """The surface in an object's files, in their unit; None if the files are too large to read twice."""
     files = [file.path for file in source.visuals or source.pieces]
     if sum(path.stat().st_size for path in files) > _LARGE_FILE:
         return None
@@ -93,7 +93,7 @@ def mesh_of_file(source: Source) -> trimesh.Trimesh | None:
 
 
 def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
-    """Meshes that stand at height zero, and the open hand, upright, beside them."""
+    """Meshes at height zero, and the open hand, upright, next to them."""
     points = np.concatenate([body.vertices for body in bodies])
     low, high = points.min(0), points.max(0)
     middle = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])

@@ -1,4 +1,4 @@
-"""Compiled loops over triangles and over the samples of a picture, which Numba keeps between processes."""
+"""Compiled loops over triangles and over the samples of a picture, which Numba caches between processes."""
 
 import contextlib
 import os
@@ -12,7 +12,7 @@ from congrasp.common.io.files import cache_folder
 GAMMA = 2.2
 """sRGB is about linear light to the power of one over this."""
 NOTHING = -1
-"""Stands where no triangle is."""
+"""Index of samples without a triangle."""
 _KEY_STRENGTH, _SKY_STRENGTH, _BOUNCE = 0.70, 0.50, 0.05
 _HIGHLIGHT = 60  # exponent: how sharp the highlight is
 _ROUNDING = 1e-9  # of weights: a sample on an edge belongs to both sides
@@ -38,13 +38,13 @@ _compiled = numba.njit(
 def cover(
     corners: np.ndarray, value: np.ndarray, faces: np.ndarray, closed: np.ndarray, top: np.ndarray, owner: np.ndarray
 ) -> None:
-    """Keeps at each sample of a grid the triangle of the greatest value there.
+    """Finds the triangle with the greatest value at each sample of a grid.
 
     Args:
       corners: (V, 2) columns and rows of points, in samples; rows count downwards.
       value: (V,) of the points, linear in between; a triangle with a NaN covers nothing.
       faces: (F, 3) the triangles.
-      closed: (F,) bool: only what winds outwards and faces the viewer is wanted.
+      closed: (F,) bool, True for triangles that are drawn only if they face the viewer (closed surfaces).
       top: (height, width) greatest value so far; changed in place.
       owner: (height, width) the triangle that has it; changed in place.
     """
@@ -52,7 +52,7 @@ def cover(
     for face in range(len(faces)):
         i, j, k = faces[face]
         area, weights = _weights(corners, i, j, k)
-        # Rows count downwards: what winds outwards and faces the viewer has a negative area.
+        # Rows count downwards, so that triangles of a closed surface that face the viewer have negative areas.
         if not abs(area) > _SMALL or (closed[face] and area > 0) or not np.isfinite(value[i] + value[j] + value[k]):
             continue
         (x0, x1, x2), (y0, y1, y2) = _each(corners, i, j, k, 0), _each(corners, i, j, k, 1)
@@ -107,17 +107,17 @@ def shade(
     alpha: float,
     image: np.ndarray,
 ) -> None:
-    """Draws what each sample of a picture shows: a key light with a highlight, the sky, and some light from all around.
+    """Shades the samples of a picture: a key light with a highlight, the sky, and a little ambient light.
 
     Args:
       corners: (V, 2) columns and rows of points, in samples.
       nearness: (V,) one over their depths.
       faces: (F, 3) the triangles.
-      values: (V, 13) place, normal, linear colour, shares of key light and sky, strength of the highlight, opacity.
+      values: (V, 13) position, normal, linear colour, shares of key light and sky, strength of the highlight, opacity.
       owner: (height, width) the triangle that a sample shows, or `NOTHING`.
-      eye: (3,) where the camera is.
+      eye: (3,) position of the camera.
       key: (3,) unit direction towards the key light.
-      alpha: how much of it covers what was drawn before.
+      alpha: opacity over the image so far.
       image: (height, width, 3) sRGB; changed in place.
     """
     here = np.empty(values.shape[1])
@@ -147,7 +147,7 @@ def shade(
 
 @_compiled
 def _dot(a: Sequence[float] | np.ndarray, b: Sequence[float] | np.ndarray) -> float:
-    """Of two vectors (3,)."""
+    """Dot product of two vectors (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -161,19 +161,19 @@ def add_light(
     top: np.ndarray,
     total: np.ndarray,
 ) -> None:
-    """Adds what a far lamp gives to points, as far as nothing is before them.
+    """Adds the light of a distant lamp to points that no body shadows (a shadow map).
 
-    The four samples of the lamp's picture around a point are compared with it and mixed by how near they are, so that a
-    shadow's edge is a sample wide.
+    The four samples of the lamp's picture around a point are compared with it and interpolated bilinearly, so that the
+    edge of a shadow is one sample wide.
 
     Args:
       points: (n, 3).
-      strength: (n,) what the lamp gives where nothing is before it.
+      strength: (n,) light of the lamp without shadow.
       axes: (3, 3) rows: the lamp's right, up, and the direction towards it.
-      origin: (3,) along these, of the first sample of the lamp's picture, and what is added to a point's height.
-      sample: the size of a sample, m.
-      top: (height, width) how near the nearest body is to the lamp.
-      total: (n,) changed in place.
+      origin: (3,) along these: of the first sample of the lamp's picture, and the bias added to a point's height.
+      sample: size of a sample, m.
+      top: (height, width) height of the body nearest to the lamp.
+      total: (n,) light; changed in place.
     """
     for n in range(len(points)):
         x = min(max((_dot(axes[0], points[n]) - origin[0]) / sample, 0.0), top.shape[1] - 1.001)

@@ -1,4 +1,4 @@
-"""Visibility of a soft lamp and of the sky from a surface: both are sets of lamps, each with visible bodies."""
+"""Visibility of a soft key light and of the sky from a surface: both are sets of distant lamps with shadow maps."""
 
 from typing import NamedTuple
 
@@ -12,19 +12,19 @@ class Lamps(NamedTuple):
     """Resolution of a soft light."""
 
     key: int
-    """Lamps that stand for the key light."""
+    """Number of lamps of the key light."""
     sky: int
-    """Lamps that stand for the sky."""
+    """Number of lamps of the sky."""
     grid: int
-    """Samples along each side of what a lamp sees."""
+    """Samples along each side of a shadow map."""
 
 
 MANY, FEW = Lamps(24, 48, 160), Lamps(12, 24, 160)
 """For bodies in large pictures, and in small ones."""
 ON_TABLE = Lamps(48, 160, 64)
-"""For a table top: a far body's shadow is as wide as the light, so that few lamps would show as bands."""
+"""For a table top: the shadow of a high body is so wide that few lamps would show as bands."""
 _KEY_SIZE = 0.12  # radius of the key light at a distance of one
-_SKIN = 1.5  # how far above the surface its light is looked up, in samples
+_SKIN = 1.5  # height above the surface at which its light is looked up, in samples
 
 
 def light_on(points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np.ndarray, lamps: Lamps) -> np.ndarray:
@@ -33,15 +33,15 @@ def light_on(points: np.ndarray, normals: np.ndarray, bodies: Triangles, key: np
     Args:
       points: (n, 3).
       normals: (n, 3) of the surfaces there.
-      bodies: what casts shadows.
+      bodies: bodies that cast shadows.
       key: (3,) unit direction towards the key light.
-      lamps: how many there are.
+      lamps: numbers of lamps, and their resolution.
     """
     light, whole = np.zeros((2, len(points))), np.full(len(points), 1e-6)
     for lamp in _disc(key, lamps.key, _KEY_SIZE):
         _add(lamp, lamps.grid, np.full(len(points), 1 / lamps.key), points, normals, bodies, light[0])
     for lamp in _dome(lamps.sky):
-        facing = np.clip(0.75 * (normals @ lamp) + 0.25, 0, None)  # a lamp of the sky stands for a patch of it
+        facing = np.clip(0.75 * (normals @ lamp) + 0.25, 0, None)  # a lamp represents a patch of the sky
         _add(lamp, lamps.grid, facing, points, normals, bodies, light[1])
         whole += facing
     light[1] /= whole
@@ -57,7 +57,7 @@ def _add(
     bodies: Triangles,
     total: np.ndarray,
 ) -> None:
-    """Adds to the light (n,) of points what reaches them of a far lamp in the direction (3,), times a strength (n,)."""
+    """Adds the visible share of a distant lamp in direction (3,), times a strength (n,), to the points' light (n,)."""
     if not len(bodies.faces):
         total += strength
         return
@@ -66,7 +66,7 @@ def _add(
     axes = np.stack([side, np.cross(lamp, side), lamp])  # right, up, towards the lamp
     x, y, height = axes @ bodies.points.T
     sample = max(np.ptp(x), np.ptp(y)) / (grid - 3)
-    # One empty sample on each side: what is beyond the picture is in the light.
+    # One empty sample on each side, so that points beyond the map are lit.
     left, upper = x.min() - sample, y.max() + sample
     top, owner = np.full((grid, grid), -np.inf, np.float32), np.empty((grid, grid), np.int32)
     corners = np.stack([x - left, upper - y], -1) / sample

@@ -19,7 +19,7 @@ from congrasp.services.viz.scene import Shape
 from congrasp.services.viz.shapes import arrow, object_shape, table_shape
 from congrasp.services.viz.sheets import contact_sheet
 
-_ARROWS, _LENGTH = 24, 0.08  # how many headings, and from how far before them they are drawn, m
+_ARROWS, _LENGTH = 24, 0.08  # number of headings, length of their arrows in m
 _SIZE, _SMALL, _COLUMNS = (460, 400), (240, 200), 7
 _VIEW = (0.8, -0.6, 0.6)
 
@@ -28,7 +28,7 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
     """Three views of the object in its most likely resting pose.
 
     Left: the surface, the graspable region green and the avoid region red. Middle: the convex pieces. Right: some of
-    the headings that the table leaves the human hand, drawn from 8 cm before the heading position up to it.
+    the headings that the human hand can reach over the table, drawn from 8 cm before the heading position up to it.
 
     Returns:
       (H, W, 3) uint8.
@@ -82,7 +82,7 @@ def rests_sheet(obj: GraspObject) -> np.ndarray:
 
 
 def overview(objects: Sequence[GraspObject]) -> np.ndarray:
-    """(H, W, 3) uint8: each object at rest as most likely, its graspable region green and its avoid region red."""
+    """(H, W, 3) uint8: each object in its likeliest resting pose, graspable region green and avoid region red."""
     images, titles = [], []
     for obj in objects:
         shape = _painted(obj)

@@ -1,4 +1,4 @@
-"""Figures of a run from its recordings: learning curves, reward terms, episodes and every other number."""
+"""Figures of a run from its recordings: learning curves, reward terms, episodes and all other metrics."""
 
 import dataclasses
 import io
@@ -23,7 +23,7 @@ QUIET, _GRID = "#6b7280", "#e3e6ea"
 COLOURS = ("#2f6fdb", "#e08a2c", "#1f9d88", "#b5373a", "#7a4cc2", "#5b8c2a", "#c2478f", "#6b7280")
 _MEANINGLESS = {"episode/object_index"}
 _LEGEND = 8
-"""Lines of one panel that a legend still names."""
+"""Largest number of lines for which a panel has a legend."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,12 +52,12 @@ LEARNING = (
 def plot_runs(
     paths: Sequence[pathlib.Path], out: pathlib.Path, formats: Sequence[str] = ("png", "pdf")
 ) -> list[pathlib.Path]:
-    """Draws runs, several over one another.
+    """Draws runs; several are overlaid.
 
     Args:
       paths: runs' folders, or MCAP files.
       out: folder for the figures.
-      formats: of the files: png, pdf.
+      formats: formats of the files: png, pdf.
 
     Returns:
       The files written, each figure in each format.
@@ -77,7 +77,7 @@ def plot_runs(
 
 
 def _labels(paths: Sequence[pathlib.Path]) -> list[str]:
-    """Names of runs for a legend: their folders', or the whole paths where two have the same."""
+    """Names of runs for a legend: those of their folders, or the whole paths if two have the same name."""
     names = [path.resolve().name for path in paths]
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
@@ -95,12 +95,12 @@ def encoded(figure: Any, kind: str = "png") -> bytes:
     """A figure as the content of a file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=130)
-    figure.set_layout_engine("none")  # the layout is found; to find it again would take as long
+    figure.set_layout_engine("none")  # the layout is computed; another format would compute it again
     return buffer.getvalue()
 
 
 def new_figure(width: float, height: float, title: str) -> Any:
-    """An empty figure of so many inches."""
+    """An empty figure of a width and height in inches."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
@@ -109,7 +109,7 @@ def new_figure(width: float, height: float, title: str) -> Any:
 
 
 def style(axes: Any, title: str, x: str, y: str) -> None:
-    """Title and labels of one plot, and its quiet frame."""
+    """Sets title, labels and the plain frame of one plot."""
     axes.set_title(title, loc="left", color=INK, fontsize=10)
     axes.set_ylabel(y, color=QUIET, fontsize=8)
     axes.set_xlabel(x, color=QUIET, fontsize=8)
@@ -123,8 +123,8 @@ def style(axes: Any, title: str, x: str, y: str) -> None:
 def figures(runs: Runs) -> dict[str, tuple[str, list[Panel]]]:
     """Title and panels of each figure by file name.
 
-    Every metric of the runs is in exactly one panel, but for those that mean nothing as a mean, and those outside of
-    the learning curves that have one value throughout.
+    Every metric of the runs is in exactly one panel, except those whose mean has no meaning, and constant ones outside
+    of the learning curves.
     """
     names = {_metric(name) for series in runs.values() for name in series} - _MEANINGLESS
     learning = [
@@ -143,7 +143,7 @@ def figures(runs: Runs) -> dict[str, tuple[str, list[Panel]]]:
 
 
 def _constants(runs: Runs) -> set[str]:
-    """Metrics of which every curve, of several points, has one and the same value."""
+    """Metrics whose curves, each of several points, all have one value."""
     values: dict[str, list[np.ndarray]] = {}
     for series in runs.values():
         for name, (_, found) in series.items():
@@ -156,9 +156,10 @@ def _constants(runs: Runs) -> set[str]:
 
 
 def draw(title: str, panels: Sequence[Panel], runs: Runs) -> Any:
-    """One figure of small multiples.
+    """Draws one figure of small multiples.
 
-    A line is named after its process, or its run where there are several, and its metric where the panel has two.
+    The label of a line names its run if there are several, its process if there are several, and its metric if the
+    panel has two.
     """
     columns = min(_COLUMNS, len(panels))
     rows = -(-len(panels) // columns)
@@ -185,7 +186,7 @@ def draw(title: str, panels: Sequence[Panel], runs: Runs) -> Any:
 
 
 def smooth(values: np.ndarray, window: int) -> np.ndarray:
-    """Mean of the last `window` values (n,), of fewer at the beginning; NaN does not count."""
+    """(n,) running mean of the last `window` values, of fewer at the beginning; ignores NaN."""
     finite = np.isfinite(values)
     base = values[finite][0] if finite.any() else 0.0  # sums of differences stay exact where nothing changes
     total = np.cumsum(np.where(finite, values - base, 0.0))
@@ -196,7 +197,7 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def _curve(axes: Any, steps: np.ndarray, values: np.ndarray, colour: str, label: str) -> None:
-    """Draws a metric; a long one smoothed, over itself."""
+    """Draws a metric; a long one also smoothed."""
     window = len(values) // 40
     if window < 3:
         marker = "o" if len(values) < 20 else ""
@@ -207,12 +208,12 @@ def _curve(axes: Any, steps: np.ndarray, values: np.ndarray, colour: str, label:
 
 
 def _metric(name: str) -> str:
-    """`learner/0/term/contact` is the metric `term/contact` of the process `learner/0`."""
+    """Metric of a name: that of `learner/0/term/contact` is `term/contact`."""
     return name.split("/", 2)[2]
 
 
 def _label(run: str, name: str, panel: Panel, runs: Runs) -> str:
-    """The line's name in a legend."""
+    """Label of a line in a legend."""
     role, process, metric = name.split("/", 2)
     processes = {found.rpartition(f"/{metric}")[0] for found in runs[run] if _metric(found) == metric}
     who = process if process.startswith(role) else f"{role} {process}"

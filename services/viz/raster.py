@@ -21,8 +21,8 @@ def render_scene(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int] 
     """Draws the shapes.
 
     Args:
-      shapes: what to draw; the world's z axis points up.
-      camera: from where.
+      shapes: shapes to draw, in a world frame with the z axis up.
+      camera: the camera.
       size: width and height in pixels.
 
     Returns:
@@ -60,7 +60,7 @@ def visible(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> n
 
 
 def _turned(triangles: Triangles, camera: Camera) -> Triangles:
-    """With normals that point to the camera where a surface is open, and may wind either way."""
+    """Triangles with the normals of open surfaces, which may wind either way, towards the camera."""
     first, second, third = np.moveaxis(triangles.corners, 1, 0)
     away = _dot(np.cross(second - first, third - first), first - camera.position) > 0
     normals = triangles.normals.copy()
@@ -70,25 +70,25 @@ def _turned(triangles: Triangles, camera: Camera) -> Triangles:
 
 
 class _Picture:
-    """A picture that is being drawn: (height, width, 3) sRGB, and one over the depth of what each sample shows."""
+    """A picture in progress: (height, width, 3) sRGB, and the inverse depth of each sample."""
 
     def __init__(self, camera: Camera, image: np.ndarray, nearness: np.ndarray):
         self._camera, self.image, self._nearness = camera, image, nearness
 
     @classmethod
     def empty(cls, camera: Camera, width: int, height: int) -> "_Picture":
-        """With nothing in it."""
+        """Returns a picture of the background."""
         share = np.linspace(1, 0, height, dtype=np.float32)[:, None, None]
         image = np.broadcast_to(share * _TOP + (1 - share) * _BOTTOM, (height, width, 3)).copy()
         return cls(camera, image, np.zeros((height, width), np.float32))
 
     def finer(self) -> "_Picture":
-        """The same picture with more samples."""
+        """Returns the same picture with more samples."""
         image, nearness = (each.repeat(SAMPLES, 0).repeat(SAMPLES, 1) for each in (self.image, self._nearness))
         return _Picture(self._camera, image, nearness)
 
     def add(self, triangles: Triangles, light: np.ndarray, alpha: float = 1.0) -> None:
-        """Draws triangles where they are nearest, with the light (V, 2) at their points."""
+        """Draws triangles where they are nearest, with the shares of light (V, 2) at their points."""
         corners, nearness = self._projected(triangles.points)
         top, owner = self._covered(corners, nearness, triangles)
         more = triangles.shine[:, None], triangles.opacity[:, None]
@@ -99,13 +99,13 @@ class _Picture:
             self._nearness = top
 
     def owners(self, triangles: Triangles) -> np.ndarray:
-        """(height, width) which of the triangles each sample shows, or `NOTHING`."""
+        """(height, width) index of the triangle that each sample shows, or `NOTHING`."""
         return self._covered(*self._projected(triangles.points), triangles)[1]
 
     def _projected(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(V, 2) columns and rows of points (V, 3), and (V,) one over their depths."""
         x, y, depth = self._camera.axes() @ (points - self._camera.position).T
-        depth = np.where(depth > _NEAR, depth, np.nan)  # what is not wholly before the camera is left out
+        depth = np.where(depth > _NEAR, depth, np.nan)  # omits triangles that are not entirely before the camera
         height, width = self._nearness.shape
         focus = height / 2 / np.tan(np.radians(self._camera.field_of_view) / 2)
         return np.stack([width / 2 + focus * x / depth, height / 2 - focus * y / depth], -1) - 0.5, 1 / depth
@@ -113,7 +113,7 @@ class _Picture:
     def _covered(
         self, corners: np.ndarray, nearness: np.ndarray, triangles: Triangles
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One over the depth of each sample with the triangles in the picture, and which of them it shows."""
+        """Inverse depth of each sample with the triangles in the picture, and the index of the one that it shows."""
         top, owner = self._nearness.copy(), np.full(self._nearness.shape, NOTHING, np.int32)
         cover(corners, nearness, triangles.faces, triangles.closed, top, owner)
         return top, owner

@@ -19,7 +19,7 @@ from congrasp.services.viz.views import View, camera_of, views
 
 Around = Callable[[int], Sequence[Shape]]
 """Shapes around the grasp at a control step, such as the arm that carries the hand."""
-_GAP = 3  # between two views of a picture, pixels
+_GAP = 3  # pixels between two views of a picture
 
 
 class Film(NamedTuple):
@@ -28,15 +28,15 @@ class Film(NamedTuple):
     size: tuple[int, int] = (1280, 720)
     """Width and height in pixels, both even."""
     fps: float = 25.0
-    """Frames a second."""
+    """Frames per second."""
     overlays: bool = False
-    """Draws the active constraints, and in green where the hand touches."""
+    """Draws the active constraints, and links in contact in green."""
 
 
 def grasp_picture(
     episode: Message, step: int, size: tuple[int, int] = (1280, 720), view: View | None = None
 ) -> np.ndarray:
-    """A step as (height, width, 3) uint8, without overlays: from a view, the best if none is given, and from aside."""
+    """(height, width, 3) uint8, a step without overlays: from a view, by default the best one, and from its side."""
     width, height = size
     left = 2 * width // 3
     shapes = episode_shapes(episode, step, overlays=False)
@@ -63,7 +63,7 @@ def render_episode_frames(
       episode: an episode message (`services.record.reader.read_episodes` yields them from MCAP).
       steps: control steps, from 0.
       size: width and height in pixels.
-      camera: from where; from the best view otherwise.
+      camera: the camera; by default one for the best view.
       overlays: see `Film`.
       around: further shapes at a control step.
     """
@@ -85,13 +85,13 @@ def episode_sheet(
     steps: Sequence[int] | None = None,
     camera: Camera | None = None,
 ) -> np.ndarray:
-    """An episode in a few frames (its first and last step, and the table's removal, among them), with its metrics.
+    """An episode in a few frames, by default with its first and last step and the table's removal, and its metrics.
 
     Args:
       episode: the episode.
       frames: number of pictures.
       size: width and height of each, pixels.
-      steps: control steps of the pictures; spread evenly otherwise.
+      steps: control steps of the pictures; spread evenly by default.
       camera: see `render_episode_frames`.
     """
     steps = steps or key_steps(np.asarray(episode.arrays["table"], bool), frames)
@@ -117,8 +117,8 @@ def episode_strip(
       frames: number of pictures.
       size: width and height of each, pixels.
       first: label of the first picture.
-      last: what to say after the time of the last one.
-      until: step of the last one; the episode's last if not given.
+      last: text after the time of the last one.
+      until: step of the last one; by default that of the episode.
     """
     table = np.asarray(episode.arrays["table"], bool)
     steps = key_steps(table if until is None else table[: until + 1], frames)
@@ -136,7 +136,7 @@ def grasp_steps(episode: Message) -> tuple[int, int]:
 
 
 def _phase(episode: Message, step: int) -> str:
-    """Phase of a step, if worth showing: approach, lift, hold, or table removed."""
+    """Label of the phase of a step: table removed, or a phase of an episode with approach or lift; else empty."""
     if not episode.arrays["table"][step]:
         return "table removed"
     phases = phases_of(episode.meta)
@@ -148,7 +148,7 @@ def _phase(episode: Message, step: int) -> str:
 
 
 def key_steps(table: np.ndarray, frames: int) -> list[int]:
-    """Steps spread evenly over an episode whose `table` (T,) is present at first; the removal's step is among them."""
+    """Steps spread evenly over an episode, with that of the table's removal; `table` (T,) bool is True at first."""
     steps = sorted({round(x) for x in np.linspace(0, len(table) - 1, frames)})
     if not table.all() and len(steps) > 2:
         removal = int(np.argmin(table))
@@ -180,15 +180,15 @@ def save_episode_video(
     until: int | None = None,
     around: Around = lambda step: [],
 ) -> None:
-    """An episode as MP4, in real time.
+    """Writes an episode as MP4, in real time.
 
     Args:
-      path: the file; it is written under another name and renamed when it is whole.
+      path: the file; written under another name and renamed when it is complete.
       episode: the episode.
       film: size, frame rate and overlays.
       camera: see `render_episode_frames`.
-      progress: told which share of the frames is drawn.
-      until: its first control step that is not drawn; all are by default.
+      progress: called with the share of drawn frames, from 0 to 1.
+      until: control step at which the video ends, exclusive; the end of the episode by default.
       around: see `render_episode_frames`.
 
     Raises:
@@ -199,7 +199,7 @@ def save_episode_video(
     steps = [int(i * step) for i in range(int(np.ceil(last / step)))]
 
     def frames() -> Iterator[np.ndarray]:
-        """The frames, one after another."""
+        """Yields the frames in order."""
         drawn = render_episode_frames(episode, steps, film.size, camera, overlays=film.overlays, around=around)
         for done, frame in enumerate(drawn, 1):
             yield frame

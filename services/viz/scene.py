@@ -13,13 +13,13 @@ _KEY = np.array([-0.45, -0.55, 1.0])  # towards the key light: right, away from 
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """One thing to draw.
+    """A shape to draw.
 
     `size` is a radius and a half length along z, zeros for a mesh; `position` (3,) and `quaternion` (4,) are in the
-    world. `colour` is sRGB in [0, 1]. With `alpha` below one the shape is seen through, and never casts a `shadow`.
-    `vertices` (V, 3) and `faces` (F, 3) belong to a mesh. Where `paint_points` (N, 3) and `paint_colours` (N, 3) are
-    given, each point of a mesh takes the colours of the nearest of them, in the shape's frame. Where `normals` (V, 3)
-    and `colours` (V, 3) are given, the mesh is drawn with these as it is: closed, wound outwards, and fine enough.
+    world frame. `colour` is sRGB in [0, 1]. With `alpha` below one the shape is transparent, and casts no `shadow`.
+    `vertices` (V, 3) and `faces` (F, 3) belong to a mesh. With `paint_points` (N, 3), in the shape's frame, and
+    `paint_colours` (N, 3), each point of a mesh takes the colours of the nearest paint points. With `normals` (V, 3)
+    and `colours` (V, 3), the mesh is drawn unchanged: it must be closed, wound outwards, and fine enough.
     """
 
     kind: Kind
@@ -40,7 +40,7 @@ class Shape:
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """A pinhole camera at `position` that looks at `target`, both (3,) in the world; z is up."""
+    """A pinhole camera at `position` that looks at `target`, both (3,) in the world frame; z is up."""
 
     position: np.ndarray
     target: np.ndarray
@@ -70,7 +70,7 @@ def between(
     *,
     shadow: bool = True,
 ) -> Shape:
-    """A capsule from `start` to `end` (3,), or a ball where they coincide; the rest is as in `Shape`."""
+    """A capsule from `start` to `end` (3,), or a ball if they coincide; for the other arguments see `Shape`."""
     along = np.subtract(end, start)
     length = float(np.linalg.norm(along))
     middle = np.add(start, end) / 2

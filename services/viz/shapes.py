@@ -1,4 +1,4 @@
-"""Shapes that pictures are made of: hands, the table, arrows, strings of beads; and cameras that hold them."""
+"""Shapes of pictures: hands, objects, arms, the table, arrows, strings of beads; and cameras that fit them."""
 
 import itertools
 from collections.abc import Sequence
@@ -18,9 +18,9 @@ from congrasp.services.viz.scene import Camera, Shape, between
 
 _TABLE_RADIUS = 0.6  # m
 FIELD_OF_VIEW = 26.0
-"""Degrees, of cameras that `fit` makes."""
-_SPACE = 1.06  # free space at the picture's edges
-_STILL = 1e-3  # m of a curl that tells no direction
+"""Field of view of the cameras of `fit`, degrees."""
+_SPACE = 1.06  # factor on the extent, for free space at the picture's edges
+_STILL = 1e-3  # m of a curl that is too small for a direction
 
 
 def skin_shape(
@@ -37,9 +37,9 @@ def skin_shape(
       skin: the surface.
       position: (L, 3) origins of the links' frames in the world.
       quaternion: (L, 4) their orientations.
-      tint: a colour besides the hand's own.
-      shares: (L,) of that colour on each link; none by default.
-      alpha: below one the hand is seen through.
+      tint: a colour to blend with that of the hand.
+      shares: (L,) shares of that colour on each link; zero by default.
+      alpha: opacity; below one the hand is transparent.
     """
     points, normals = skin.posed(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
     own = skin_colours(skin)
@@ -58,7 +58,7 @@ def skin_shape(
 
 
 def skin_colours(skin: Skin) -> np.ndarray:
-    """(V, 3) a skin's own colours."""
+    """(V, 3) colours of a skin, by its materials."""
     return np.array([MATERIAL_COLOURS[name] for name in MATERIALS], np.float32)[skin.material]
 
 
@@ -83,9 +83,9 @@ def posed_hand(
     alpha: float = 1.0,
     skin: Skin | None = None,
 ) -> Shape:
-    """The hand with finger angles (F,) and its wrist at a position (3,) m and orientation in the world.
+    """The hand with finger angles (F,) and its wrist at a position (3,) m and orientation in the world frame.
 
-    Tint, shares and alpha are those of `skin_shape`; the skin is the hand's own by default.
+    Tint, shares and alpha are those of `skin_shape`; the skin is `skin_of(hand)` by default.
     """
     links, quaternion = mujoco_link_poses(hand, q)
     turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
@@ -105,7 +105,7 @@ def object_shape(
       mesh: (V, 3) and (F, 3) in its frame.
       position: (3,) m, world.
       quaternion: (4,) from its frame to the world.
-      paint: points (P, 3) in its frame, and what colour (P, 3) in [0, 1] the surface has at them; without, one for all.
+      paint: points (P, 3) in its frame, and the colours (P, 3) of the surface there, in [0, 1]; optional.
       colour: colour without paint.
     """
     points, colours = paint or (None, None)
@@ -172,7 +172,7 @@ def fit(points: np.ndarray, direction: np.ndarray, aspect: float) -> Camera:
     target = (points.min(0) + points.max(0)) / 2
     axes = Camera(target + direction, target).axes()
     distance = 1.0
-    for _ in range(8):  # alternately near enough and in the middle; a few rounds settle to a fraction of a pixel
+    for _ in range(8):  # distance and centre in turn; a few rounds converge to a fraction of a pixel
         x, y, z = axes @ (points - target).T
         distance = max((np.abs(x) / (tangent * aspect) - z).max(), (np.abs(y) / tangent - z).max())
         sides = np.stack([x, y]) / (distance + z)
@@ -181,7 +181,7 @@ def fit(points: np.ndarray, direction: np.ndarray, aspect: float) -> Camera:
 
 
 def shape_points(shape: Shape) -> np.ndarray:
-    """(n, 3) points of the world that a picture of a capsule or a mesh must hold."""
+    """(n, 3) points, world frame, that a picture of a capsule or a mesh must contain."""
     turn = Rotation.from_quat(shape.quaternion, scalar_first=True)
     if shape.vertices is not None:
         return turn.apply(shape.vertices) + shape.position
@@ -190,13 +190,13 @@ def shape_points(shape: Shape) -> np.ndarray:
 
 
 def upright(hand: Hand) -> Rotation:
-    """Turns the wrist frame so that the fingers point up and the palm, where the fingers curl to, faces +x."""
+    """Rotation of the wrist frame after which the fingers point up and the palm, towards which they curl, faces +x."""
     fingers = hand.keypoints[len(hand.links) + 1 :].mean(0)
     up = fingers / np.linalg.norm(fingers)
     links = list(hand.tip_links[1:])
     curl = (mujoco_link_poses(hand, hand.q_closed)[0] - mujoco_link_poses(hand, hand.q_open)[0])[links].mean(0)
     palm = curl - (curl @ up) * up
-    if np.linalg.norm(palm) < _STILL:  # fingers of one joint, or around an axis: towards the thumb, then
+    if np.linalg.norm(palm) < _STILL:  # fingers with one joint, or around an axis, do not curl: use the thumb
         thumb = hand.keypoints[len(hand.links)] - fingers
         palm = thumb - (thumb @ up) * up
     palm = palm / np.linalg.norm(palm)

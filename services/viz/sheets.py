@@ -27,6 +27,9 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
 
     Returns:
       (H, W, 3) uint8.
+
+    Raises:
+      CongraspError: there are no pictures, or not one label for each.
     """
     if not images or len(images) != len(labels):
         raise CongraspError(f"{len(images)} pictures and {len(labels)} labels do not make a contact sheet.")
@@ -71,7 +74,7 @@ def png_of(image: np.ndarray) -> bytes:
 
 
 def save_png(path: pathlib.Path, image: np.ndarray) -> None:
-    """Writes (H, W, 3) uint8 as PNG, whole or not at all; a CongraspError names a path that cannot be written."""
+    """Writes (H, W, 3) uint8 as PNG, atomically; a CongraspError names a path that cannot be written."""
     write_atomically(path, png_of(image))
 
 
@@ -98,7 +101,7 @@ def save_video(
         writer = imageio_ffmpeg.write_frames(
             str(path), size, fps=frame_rate, quality=8, macro_block_size=2, output_params=[*encoding]
         )
-        with warnings.catch_warnings():  # JAX warns of forks; this one is another program at once
+        with warnings.catch_warnings():  # JAX warns of forks, which are safe if another program is executed
             warnings.simplefilter("ignore", RuntimeWarning)
             writer.send(None)
         for frame in frames:

@@ -1,4 +1,4 @@
-"""Titles and units of a run's metrics, for people."""
+"""Readable titles and units of a run's metrics."""
 
 import json
 import pathlib
@@ -27,11 +27,11 @@ _TITLES = {
     },
 }
 _UNITS = {"_per_second": "1/s", "_seconds": "s", "_rad": "rad", "_m": "m", "_bytes": "bytes", "_ratio": "share"}
-"""Units of metrics that have no title here, by how their names end."""
+"""Units of metrics without a title, by the endings of their names."""
 
 
 def titled(metric: str) -> tuple[str, str]:
-    """Title and unit of a metric by its name after the process; one that is not known gets its name in words."""
+    """Title and unit of a metric by its name after the process; the title of an unknown one is its name in words."""
     if metric in _TITLES:
         title, unit = _TITLES[metric]
         return title, unit

@@ -1,4 +1,4 @@
-"""Shapes as triangles with smooth normals, small enough for paint and light to be known at their corners alone."""
+"""Shapes as triangles with smooth normals, small enough for paint and light per vertex."""
 
 import functools
 from collections.abc import Iterable, Sequence
@@ -15,29 +15,29 @@ from congrasp.services.viz.scene import Shape
 CREASE = np.cos(np.radians(35.0))
 """Faces whose normals differ by more than this angle (given as its cosine) meet in a sharp edge."""
 _Size = tuple[float, int]
-_PLAIN, _PAINTED = (0.005, 12_000), (0.0025, 40_000)  # longest side of a mesh's triangles, m, and about how many
+_PLAIN, _PAINTED = (0.005, 12_000), (0.0025, 40_000)  # longest side of a mesh's triangles, m, and their number, about
 _RINGS, _SECTIONS = 72, 160  # of a table top
-_DENSER = 1.6  # exponent: how much denser its rings are around the middle
+_DENSER = 1.6  # exponent of the radii of its rings; above one they are denser around the middle
 _FADES = 0.55  # share of its radius from which it fades into the background
 
 
 class Triangles(NamedTuple):
-    """F triangles between V points, which have a normal each: where two smooth surfaces meet there are two points."""
+    """F triangles between V points with one normal each; a sharp edge has a point for each of its surfaces."""
 
     points: np.ndarray
     """(V, 3) float32."""
     normals: np.ndarray
     """(V, 3) float32 unit."""
     colours: np.ndarray
-    """(V, 3) float32 linear light that the surface gives back."""
+    """(V, 3) float32 linear reflectance."""
     shine: np.ndarray
     """(V,) float32 strength of the highlight."""
     faces: np.ndarray
     """(F, 3) indices of their corners."""
     closed: np.ndarray
-    """(F,) bool: part of a closed surface that winds outwards, so that only its outside can be seen."""
+    """(F,) bool, True for a closed surface that winds outwards, of which only the outside is visible."""
     opacity: np.ndarray
-    """(V,) float32 share of what is behind that each point covers."""
+    """(V,) float32 opacity."""
 
     @property
     def corners(self) -> np.ndarray:
@@ -53,13 +53,13 @@ class _Surface(NamedTuple):
     faces: np.ndarray
     closed: bool
     paint: np.ndarray | None = None
-    """(V, 3) linear light, if it is painted."""
+    """(V, 3) linear reflectance; None without paint."""
     opacity: np.ndarray | None = None
-    """(V,) if it is not the same everywhere."""
+    """(V,) opacity; None if it is one everywhere."""
 
 
 def triangles_of(shapes: Iterable[Shape], *, fine: bool = True) -> Triangles:
-    """The triangles of shapes in the world, one shape after the other; small ones if they are `fine`."""
+    """The triangles of shapes in the world frame, one shape after the other; small ones if `fine`."""
     none = np.zeros((0, 3), np.float32)
     found = [Triangles(none, none, none, none[:, 0], none.astype(int), none[:, 0] > 0, none[:, 0])]
     return joined([*found, *(_triangles(shape, fine) for shape in shapes)])
@@ -73,7 +73,7 @@ def joined(parts: Sequence[Triangles]) -> Triangles:
 
 
 def _triangles(shape: Shape, fine: bool) -> Triangles:
-    """The triangles of one shape in the world."""
+    """The triangles of one shape in the world frame."""
     if shape.normals is not None and shape.colours is not None:
         points, normals = (np.asarray(part, np.float32) for part in (shape.vertices, shape.normals))
         surface = _Surface(points, normals, np.asarray(shape.faces), True, _linear(np.asarray(shape.colours)))
@@ -102,13 +102,13 @@ def _triangles(shape: Shape, fine: bool) -> Triangles:
 
 
 def _content(array: np.ndarray | None, kind: type) -> bytes:
-    """The numbers of an array, if there is one."""
+    """The bytes of an array; empty without one."""
     return b"" if array is None else np.asarray(array, kind).tobytes()
 
 
 @functools.lru_cache(maxsize=64)
 def _mesh(vertices: bytes, faces: bytes, paint_points: bytes, paint_colours: bytes, fine: bool) -> _Surface:
-    """A mesh; its arrays' contents tell meshes apart, so that one that moves from picture to picture is cut once."""
+    """A mesh; cached by the content of its arrays, so that a mesh that moves between pictures is refined once."""
     corners, triples = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, int).reshape(-1, 3)
     closed = bool(trimesh.Trimesh(corners, triples).is_volume)
     size = (_PAINTED if paint_points else _PLAIN) if fine else None
@@ -124,7 +124,7 @@ def _capsule(radius: float, half_length: float, fine: bool) -> _Surface:
     """A capsule along z, or a ball."""
     ball = trimesh.creation.icosphere(2 if fine else 1, 1.0)
     normals, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
-    # As large as a round one, not inside of it, and pulled apart at its equator: what crosses it becomes the shaft.
+    # Scaled to the area of the round one, and split at its equator: triangles across the equator become the shaft.
     lift = np.where(normals[:, 2] > 1e-6, half_length, np.where(normals[:, 2] < -1e-6, -half_length, 0.0))
     points = radius * np.sqrt(4 * np.pi / ball.area) * normals + lift[:, None] * np.array([0.0, 0.0, 1.0])
     return _surface(points[faces], normals[faces], True, _PLAIN if fine else None)
@@ -132,7 +132,7 @@ def _capsule(radius: float, half_length: float, fine: bool) -> _Surface:
 
 @functools.lru_cache(maxsize=8)
 def _table_top(radius: float, half_length: float, fine: bool) -> _Surface:
-    """A disc at the upper end, finest in the middle, whose edge fades away; plain and few triangles if not `fine`."""
+    """A disc at the upper end, finest in the middle, with a fading edge; opaque and of few triangles if not `fine`."""
     rings, sections = (_RINGS, _SECTIONS) if fine else (1, 96)
     angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
     share = (np.arange(1, rings + 1) / rings) ** _DENSER
@@ -152,7 +152,7 @@ def _table_top(radius: float, half_length: float, fine: bool) -> _Surface:
 
 
 def _surface(corners: np.ndarray, normals: np.ndarray, closed: bool, size: _Size | None) -> _Surface:
-    """Triangles (F, 3, 3) with normals (F, 3, 3), cut if a size is given; equal corners become one point."""
+    """Triangles (F, 3, 3) with normals (F, 3, 3), refined if a size is given; equal corners become one point."""
     if size:
         corners, normals = cut(corners, normals, *size)
     rows = np.concatenate([corners, normals], -1).reshape(-1, 6)
@@ -162,7 +162,7 @@ def _surface(corners: np.ndarray, normals: np.ndarray, closed: bool, size: _Size
 
 
 def smooth_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners and normals (F, 3, 3) of a mesh (V, 3), (F, 3) without its faces of no area.
+    """Corners and normals (F, 3, 3) of a mesh (V, 3), (F, 3), without its degenerate faces.
 
     A corner's normal is the mean, weighted by area, of the faces around it that are within the crease angle.
     """
@@ -173,7 +173,7 @@ def smooth_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     good = area > 1e-14
     faces, corners, cross = faces[good], corners[good], cross[good]
     flat = cross / area[good, None]
-    # Vertices at one place are one vertex, whatever the file says.
+    # Vertices at one position count as one vertex, even if the file has several.
     places = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)[1].ravel()[faces].ravel()
     order = np.argsort(places, kind="stable")
     owner = order // 3
@@ -189,13 +189,13 @@ def smooth_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
 
 
 def cut(corners: np.ndarray, normals: np.ndarray, side: float, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface (F, 3, 3) in smaller triangles: those with a long side are halved across it, again and again.
+    """The same surface (F, 3, 3) in smaller triangles: those with a long side are bisected repeatedly.
 
     Args:
       corners: (F, 3, 3).
-      normals: (F, 3, 3) there.
-      side: longest side wanted, m.
-      most: about how many triangles there may be; sides stay longer on a surface that needs more.
+      normals: (F, 3, 3) at the corners.
+      side: longest side, m.
+      most: approximate limit of the number of triangles; sides stay longer on a surface that needs more.
     """
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum() / 2
     longest = max(side, 3 * float(np.sqrt(area / most)))
@@ -221,5 +221,5 @@ def _painted(tree: cKDTree, colours: np.ndarray, points: np.ndarray) -> np.ndarr
 
 
 def _linear(colour: np.ndarray) -> np.ndarray:
-    """sRGB as linear light."""
+    """Converts sRGB to linear light."""
     return (colour**GAMMA).astype(np.float32)

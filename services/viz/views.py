@@ -19,16 +19,16 @@ from congrasp.services.viz.scene import Camera, Shape
 from congrasp.services.viz.shapes import capsule_shapes, fit
 
 _AZIMUTHS, _ELEVATIONS = np.arange(0, 360, 30), (16, 28, 40)  # degrees, of the cameras that are compared
-_ASIDE = 75.0  # degrees between the two views of a picture
-_ROWS = 72  # of the pictures that cameras are compared by
+_ASIDE = 75.0  # least angle between the azimuths of the two views of a picture, degrees
+_ROWS = 72  # of the pictures by which cameras are compared
 _CONTACT, _FINGER, _OBJECT, _BROAD, _BEHIND, _BEFORE = 2.0, 1.0, 1.0, 1.0, 1.5, 0.8
 """Weights of the seen shares of touching links, of all fingers and of the object, of the object's broad side, and of a
 view along the forearm from behind and from the front of the hand."""
-_FALL = 0.1  # how far the camera follows a falling object, m
+_FALL = 0.1  # m that the camera follows a falling object
 
 
 class View(NamedTuple):
-    """A direction from which a scene is seen, degrees."""
+    """Direction from a scene to the camera, degrees."""
 
     azimuth: float
     """Around the vertical: 0 looks from +x, 90 from +y."""
@@ -43,7 +43,7 @@ class View(NamedTuple):
 
 
 def view_of(text: str) -> View | None:
-    """The view that a user names as AZIMUTH,ELEVATION; None where nothing is named.
+    """Parses a view, azimuth and elevation; None for an empty text.
 
     Raises:
       CongraspError: the text is no view.
@@ -63,7 +63,7 @@ def view_of(text: str) -> View | None:
 
 
 def views(episode: Message, steps: Sequence[int]) -> tuple[View, View]:
-    """The view that shows most of fingers, contacts and object in some steps, and the best of those from its side."""
+    """The view that shows most of fingers, contacts and object in some steps, and the best one from its side."""
     pictured = [_Pictured(episode, steps[i]) for i in sorted({len(steps) // 2, len(steps) - 1})]
     options = [View(float(azimuth), elevation) for elevation in _ELEVATIONS for azimuth in _AZIMUTHS]
     scores = [sum(step.score(view) for step in pictured) for view in options]
@@ -75,14 +75,14 @@ def views(episode: Message, steps: Sequence[int]) -> tuple[View, View]:
 def camera_of(
     episode: Message, steps: Sequence[int], aspect: float = 4 / 3, view: View | None = None, *, overlays: bool = False
 ) -> Camera:
-    """A camera that holds everything that happens in the steps, from a view or from the best one."""
+    """A camera that fits hand and object in all of the steps, from a view, by default the best one."""
     points = np.concatenate([_extent(episode, step, overlays=overlays) for step in steps])
-    points = points[ConvexHull(points).vertices]  # what holds these holds all
+    points = points[ConvexHull(points).vertices]  # a camera that fits these fits all
     return fit(points, (view or views(episode, steps)[0]).direction, aspect)
 
 
 class _Pictured:
-    """A step, the hand as capsules, as views are compared by it."""
+    """A step with the hand as capsules, for the comparison of views."""
 
     def __init__(self, episode: Message, step: int):
         arrays = episode.arrays
@@ -123,15 +123,15 @@ class _Pictured:
 
 
 def _counts(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:
-    """(n,) samples that show each shape."""
+    """(n,) number of samples that show each shape."""
     seen = visible(shapes, camera, size)
     return np.bincount(seen[seen >= 0], minlength=len(shapes))
 
 
 def _extent(episode: Message, step: int, *, overlays: bool) -> np.ndarray:
-    """(N, 3) points that a picture of a step must hold: skin without sleeve, the object's box, as overlay a trajectory.
+    """(N, 3) points that a picture of a step must contain: skin without sleeve, the object's box, trajectory overlays.
 
-    An object that has fallen far may leave the picture.
+    An object that has fallen more than `_FALL` is omitted.
     """
     arrays = episode.arrays
     hand = known_hand(episode.meta["hand"])

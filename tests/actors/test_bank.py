@@ -16,6 +16,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.common.objects import procedural
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.sampling.bank import surface_of
 from congrasp.common.task.sampling.build import POSES, build_bank, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
 
@@ -52,6 +53,16 @@ def _pointing(z: float) -> jax.Array:
     own = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
     target = rotations.frame_from_axes(jnp.array([0.0, 0.0, z]), jnp.array([1.0, 0.0, 0.0]))
     return rotations.multiply(target, rotations.conjugate(own))
+
+
+def test_normals_belong_to_the_points_of_their_object(bank):
+    for n, obj in enumerate(OBJECTS):
+        place = np.linalg.norm(obj.points[:, None] - np.asarray(bank.points[n]), axis=-1).argmin(0)
+        np.testing.assert_allclose(bank.normals[n], obj.normals[place], atol=1e-6)
+    drawn = jnp.array([1, 0])
+    assert surface_of(TASK, bank, drawn).normals is None
+    surface = surface_of(dataclasses.replace(TASK, surface_normals=True), bank, drawn)
+    np.testing.assert_array_equal(surface.normals, np.asarray(bank.normals)[[1, 0]])
 
 
 def test_references_below_the_table_are_not_valid():

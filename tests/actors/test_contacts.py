@@ -52,7 +52,7 @@ def _turned(torsion: float) -> float:
     size = 0.012
     xml = f"""
     <mujoco>
-      <option timestep="0.0025" cone="elliptic" impratio="10" integrator="implicitfast"/>
+      <option timestep="0.0025" cone="elliptic" impratio="100" integrator="implicitfast"/>
       <worldbody>
         <body name="rod" pos="0.03 0 0">
           <freejoint/>

@@ -48,6 +48,7 @@ def _bank(valid: np.ndarray) -> ConstraintBank:
     return ConstraintBank(
         points=points,
         avoid=points[..., 0] < 0,
+        normals=np.sign(points),
         rest=np.tile(np.array([0, 0, 0.1, 1, 0, 0, 0], np.float32), (2, 1, 1)),
         heading_position=np.zeros((*headings, 3), np.float32),
         heading_direction=units(rng, *headings),

@@ -10,7 +10,7 @@ import pytest
 
 from congrasp.actors.physics import ENGINES, Engine, make_physics, resolve_physics
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import NetworkConfig, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common import rotations
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
@@ -20,7 +20,7 @@ HAND = get_hand("human")
 OBJECTS = [procedural.generate(0, "cylinder")]
 TASK = TaskConfig(
     constraints=("heading",), surface_points=64, approach_steps=16, hold_steps=4, hold_steps_max=4, history=3,
-    observation="camera", sensing=SensingConfig(period=(0.05, 0.05)),
+    observation="camera", surface_normals=True, sensing=SensingConfig(period=(0.05, 0.05)),
 )  # fmt: skip
 BATCH = 2
 
@@ -36,7 +36,7 @@ def running():
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     worker = RolloutWorker(
         HAND, TASK, physics, build_bank(HAND, TASK, OBJECTS, 0), close, batch=BATCH, seed=0, half_precision=False,
-        traced=slice(None), taught=True, privileged=OBJECTS,
+        traced="all", taught=True, privileged=OBJECTS,
     )  # fmt: skip
     return worker, worker.collect(None, 18)
 
@@ -61,8 +61,20 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
     for one, other in zip(decode(before, TASK.control, action), decode(after, TASK.control, action), strict=True):
         np.testing.assert_array_equal(one, other)
     elsewhere = state.camera._replace(cloud=state.camera.cloud._replace(points=state.camera.cloud.points + 0.01))
+    tilted = state.camera._replace(cloud=state.camera.cloud._replace(normals=-state.camera.cloud.normals))
+    turned = env.seen(env.with_scene(state._replace(camera=tilted), physics_state))
+    assert np.abs(observation.observe(turned) - observation.observe(before)).max() > 0.1
     shifted = env.seen(env.with_scene(state._replace(camera=elsewhere), physics_state))
     assert np.abs(observation.observe(shifted) - observation.observe(before)).max() > 0.009
+
+
+def test_normals_of_the_cloud_point_toward_the_camera(running):
+    worker, _ = running
+    camera = worker.state.camera
+    points, normals = np.asarray(camera.cloud.points), np.asarray(camera.cloud.normals)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0, atol=1e-5)
+    eye = np.asarray(camera.origin + camera.sensors.eye)[:, None]
+    assert (np.sum(normals * (eye - points), -1) >= 0).all()
 
 
 def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):

@@ -227,6 +227,21 @@ def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(en
     physics.close()
 
 
+def test_environments_whose_solver_reached_its_limit_are_counted(env):
+    start = jax.tree.map(np.asarray, env.reset_state)
+    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+    state = physics.start(start)
+    target, table = grasp(start, 0), np.ones(ENVIRONMENTS, bool)
+    for limited in (0, 1, 2):
+        for instance in physics.instances:
+            instance.model.opt.iterations = 100
+        for instance in physics.instances[:limited]:
+            instance.model.opt.iterations = 1
+        state, after = physics.step(state, target, table)
+        np.testing.assert_allclose(after.occupancy, [0.0, 0.0, limited / ENVIRONMENTS], rtol=1e-6)
+    physics.close()
+
+
 def test_an_environment_that_was_used_before_is_as_good_as_new(env):
     """Worlds are recycled: neither state nor mass of an earlier episode may be left in them."""
     physics, fresh = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, OBJECTS, 1)
@@ -290,6 +305,7 @@ def optimised():
 
 
 @pytest.mark.timeout(900)
+@pytest.mark.slow
 def test_jax_agrees_with_native(env, optimised):
     """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
     start = above(env.reset_state, 0.2)
@@ -309,7 +325,7 @@ def test_jax_agrees_with_native(env, optimised):
         if not x.contact_found.any() and i < 10:
             for name in ("q", "u", "object_position", "q_velocity", "u_velocity"):
                 np.testing.assert_allclose(getattr(x, name), getattr(y, name), atol=2e-4, err_msg=f"{name} at {i}")
-        assert not x.occupancy.any() and not y.occupancy.any()
+        assert not x.occupancy[:2].any() and not y.occupancy.any()
         force += [np.linalg.norm(after.contact_force, axis=-1).sum((1, 2)) for after in (x, y)]
     assert force[0].max() > 0, "the script must make contact"
     assert not np.asarray(y.diverged).any()

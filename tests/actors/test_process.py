@@ -68,7 +68,7 @@ def invented(episodes: np.ndarray) -> Rollout:
     given = {
         **FORM.zeros(),
         "episodes": episodes,
-        "occupancy": np.zeros((T, 2), np.float32),
+        "occupancy": np.zeros((T, 3), np.float32),
         "has_episode": np.ones(B, bool),
         "trace": Trace(**{name: np.zeros(shape, np.float32) for name, shape in zeros.items()}, **flags),
     }
@@ -165,8 +165,9 @@ def test_an_actor_of_another_version_is_one_line_before_anything_is_built(monkey
 
 
 def test_steps_in_which_the_physics_left_contacts_out_are_counted():
-    occupancy = np.array([[0.5, 0.1], [1.0, 0.2], [1.25, 0.2], [0.3, 1.5]], np.float32)
-    assert process.buffer_occupancy(occupancy) == {"overflow": 2.0, "contacts_peak": 1.25, "rows_peak": 1.5}
+    occupancy = np.array([[0.5, 0.1, 0.0], [1.0, 0.2, 0.5], [1.25, 0.2, 0.25], [0.3, 1.5, 0.25]], np.float32)
+    metrics = {"overflow": 2.0, "contacts_peak": 1.25, "rows_peak": 1.5, "solver_limited": 0.25}
+    assert process.buffer_occupancy(occupancy) == metrics
 
 
 def test_an_episode_that_is_not_finite_costs_neither_the_rollout_nor_the_logs(heard):

@@ -10,7 +10,8 @@ import pytest
 from congrasp.actors.env import GraspEnv, episode_fields, metric_names
 from congrasp.actors.physics.engine import PhysicsState, where_environments
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker, finished_episodes
+from congrasp.actors.rollout import finished_episodes
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common import rotations
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
@@ -153,8 +154,8 @@ def test_success_needs_the_object_to_stay_up(bank):
 
 def _begun(physics, task, conditions):
     """An environment, its state, and what the engine shows of it."""
-    env = GraspEnv(HAND, task, physics)
-    return env, env.reset(conditions), physics.read(None)
+    env = GraspEnv(HAND, task, None)
+    return env, env.state_of(conditions, None), physics.start(conditions.reset_state).read(None)
 
 
 def _advance(env, targets):
@@ -257,7 +258,7 @@ class _Touching:
             contact_position=jnp.zeros((batch, links, CONTACTS_PER_LINK, 3)),
             contact_found=jnp.full((batch, links, CONTACTS_PER_LINK), touching),
             diverged=jnp.zeros(batch, bool),
-            occupancy=jnp.zeros(2),
+            occupancy=jnp.zeros(3),
         )
 
 
@@ -279,16 +280,15 @@ def test_an_environment_that_goes_on_keeps_its_contacts_when_another_restarts(ba
     assert touching[:, 1].tolist() == [False] + [True] * 6
 
 
-def test_a_rollout_compiles_once_wherever_its_parameters_are(bank):
-    """Those of the first policy are committed to no device, those of an update are: a start must not compile twice.
-
-    Nor does the number of steps matter.
-    """
-    worker = _worker(bank)
+def test_workers_of_one_task_share_programs_that_compile_once(bank):
+    """A worker's seed, the number of steps, and whether the parameters are committed to a device do not matter."""
     first = jnp.zeros(1)
     placed = (first, jax.device_put(first, jax.local_devices()[0]), np.zeros(1, np.float32))
     for steps, parameters in enumerate(placed, 1):
+        worker = _worker(bank, seed=steps)
         worker.collect(parameters, steps)
         worker.restart()
-    programs = worker._decide_jit, worker._advance_jit, worker._sample_jit, worker._with_scene_jit
-    assert [program._cache_size() for program in programs] == [1, 1, 1, 1]
+        programs = worker.programs
+    assert programs is _worker(bank).programs
+    compiled = programs.decide, programs.advance, programs.sample, programs.with_scene
+    assert [program._cache_size() for program in compiled] == [1, 1, 1, 1]

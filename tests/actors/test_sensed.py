@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.objects import procedural
@@ -40,7 +40,7 @@ def worker(task):
 
     physics = NativePhysics(HAND, task, OBJECTS, 1)
     return RolloutWorker(
-        HAND, task, physics, bank(), close, batch=BATCH, seed=0, half_precision=False, traced=slice(None), taught=True,
+        HAND, task, physics, bank(), close, batch=BATCH, seed=0, half_precision=False, traced="all", taught=True,
         privileged=OBJECTS,
     )  # fmt: skip
 

@@ -17,8 +17,8 @@ from congrasp.actors.env import GraspEnv, Settings
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.physics.mjx import MjxPhysics
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker
 from congrasp.actors.stress import Frame, Protocol
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common import rotations
 from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.hands import get_hand
@@ -165,6 +165,7 @@ def test_mjx_gets_the_same_force(monkeypatch):
     np.testing.assert_array_equal(pushed.data.xfrc_applied, expected)
 
 
+@pytest.mark.slow
 def test_warp_pushes_with_the_same_force():
     warp = pytest.importorskip("congrasp.actors.physics.warp")
     check_fall(warp.WarpPhysics(HAND, TASK, OBJECTS, mesh_slots=0))
@@ -174,7 +175,7 @@ def lifted(action: np.ndarray, protocol: Protocol | None, steps: int):
     """Scenes and their carried frames after each step of one action, from the table's removal on."""
     task = dataclasses.replace(TASK, approach_steps=0)
     physics = NativePhysics(HAND, task, OBJECTS, 1)
-    env, conditions = GraspEnv(HAND, task, physics), start()
+    env, conditions = GraspEnv(HAND, task, None), start()
     conditions = conditions._replace(hold=jnp.full(BATCH, steps))
     configured = Settings(task.reward, task.control, protocol)
     physics.start(conditions.reset_state)

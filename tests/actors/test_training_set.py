@@ -19,7 +19,7 @@ from congrasp.common.objects.store import Catalogue
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import rows_of, stacked
 from congrasp.common.task.sampling.build import headings_of
-from congrasp.common.task.sampling.sets import load_for
+from congrasp.common.task.sampling.sets import load, load_for
 from congrasp.common.task.sampling.write_sets import make_sets, save
 from tests import draws
 
@@ -80,6 +80,14 @@ def test_an_object_without_a_heading_of_the_split_is_left_out(tmp_path):
     kept = {split: [obj.name for obj in load_for(tmp_path, OBJECTS, split)[0]] for split in get_args(Split)}
     every = [obj.name for obj in OBJECTS]
     assert kept == {"all": every, "training": every, "held-out": every[1:]}
+
+
+def test_sets_without_normals_get_estimated_ones(tmp_path):
+    """As of versions whose sets have none; most are near those of the mesh."""
+    (made,) = make_sets(HAND, TaskConfig(), OBJECTS[1:], 5)
+    exact = made.arrays.pop("surface/normals")
+    normals = load(save(made, tmp_path)).arrays["surface/normals"]
+    assert normals.dtype == np.float32 and np.median(np.sum(normals * exact, -1)) > 0.99
 
 
 @pytest.mark.parametrize("family", procedural.HOUSEHOLD_FAMILIES)

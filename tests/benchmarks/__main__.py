@@ -316,6 +316,28 @@ def arms(
     return 0
 
 
+def creep(
+    policies: tuple[str, ...] = ("human", "sharpa", "allegro"), objects: int = 24, episodes: int = 24, threads: int = 0
+) -> int:
+    """Creep of held objects in mm and degrees, under the old and the new settings of friction and solver.
+
+    Args:
+      policies: Policy files, or names of pretrained policies.
+      objects: Number of procedural objects.
+      episodes: Least number of episodes of a policy.
+      threads: Threads of the physics; 0 takes all cores.
+
+    Examples:
+      python -m tests.benchmarks creep
+      python -m tests.benchmarks creep --policies human --objects 8 --episodes 8
+    """
+    from congrasp.common.runtime.parallel import cores
+    from tests.benchmarks.creep import bench_creep
+
+    bench_creep(policies, objects, episodes, threads or cores())
+    return 0
+
+
 COMMANDS = {
     "pieces": pieces,
     "gallery": gallery,
@@ -331,6 +353,7 @@ COMMANDS = {
     "recovery": recovery,
     "recording": recording,
     "arms": arms,
+    "creep": creep,
 }
 
 if __name__ == "__main__":

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from congrasp.actors.physics import make_physics, resolve_physics
-from congrasp.actors.rollout import Probe, RolloutWorker
+from congrasp.actors.rollout import Probe
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import ObjectsConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.distance import distance_field

@@ -3,6 +3,8 @@
 import signal
 import sys
 
+import pytest
+
 from tests.benchmarks import shutdown
 
 ORPHANING = """
@@ -34,6 +36,7 @@ def test_a_summary_counts_what_was_not_fine():
     assert shutdown.summary(results) == text
 
 
+@pytest.mark.slow
 def test_a_run_that_starts_ends_on_a_signal_and_leaves_nothing_behind():
     for found in shutdown.attempts(2, within=8.0, seed=3):
         assert found.seconds < float("inf") and not found.orphans

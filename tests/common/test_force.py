@@ -86,10 +86,14 @@ def test_the_least_limit_carries_half_of_the_weight():
     np.testing.assert_allclose(found, [4.905, 9.81, 1.0, 20.0], rtol=1e-6)
 
 
+def _uniform(batch, seed):
+    return np.random.default_rng(seed).uniform(size=(batch, 1)).astype(np.float32)
+
+
 def test_draws_are_log_uniform_above_what_the_weight_needs():
     count = 4000
     zero, low = np.zeros(count, int), np.where(np.arange(count) % 2, 1.0, 5.0)
-    limit = np.asarray(FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, low), jax.random.key(0)).limit)
+    limit = np.asarray(FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, low), _uniform(count, 0)).limit)
     for least in (1.0, 5.0):
         own = limit[low == least]
         assert own.min() >= least * 0.999 and own.max() <= 20.001
@@ -102,7 +106,7 @@ def test_draws_are_log_uniform_above_what_the_weight_needs():
 def test_a_drawn_limit_is_valid_and_enough(mass, friction, seed):
     low = np.asarray(least_force(np.full(3, mass), np.full(3, friction)))
     zero = np.zeros(3, int)
-    own = FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, low), jax.random.key(seed))
+    own = FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, low), _uniform(3, seed))
     assert np.asarray(FORCE.valid(Surface(np.zeros((3, 1, 3)), np.zeros((3, 1), bool)), own)).all()
     assert (np.asarray(own.limit) >= low * 0.999).all() and (np.asarray(own.limit) <= 20.001).all()
 

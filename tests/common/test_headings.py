@@ -387,6 +387,7 @@ def covered(obj, hand):
 
 
 @pytest.mark.parametrize("families", ["all", "scans"])
+@pytest.mark.slow
 def test_every_region_has_a_heading_that_can_be_held_or_is_uncovered(families):
     """Over a pool: what is allowed obeys the rules at the place to which the table moved it."""
     hand, uncovered = outline(get_hand("human")), 0

@@ -108,7 +108,7 @@ def _closing(hand):
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep, spec.option.integrator = 0.0025, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.iterations, spec.option.ls_iterations = 8, 20
+    spec.option.iterations, spec.option.ls_iterations = 24, 40
     add_hand(spec, hand)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
@@ -132,6 +132,7 @@ def test_warp_couples_joints_as_mujoco_c_does(hand):
     np.testing.assert_allclose(coupled(hand, q), q, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_mjx_couples_joints_as_mujoco_c_does():
     claw = import_hand(pathlib.Path(__file__).parents[1] / "hands" / "claw.urdf").hand
     tendon = Motor("tendon", {"opposing_root": 1.0, "opposing_middle": 0.5}, 4.0, 0.1, 1.0)

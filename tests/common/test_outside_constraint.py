@@ -50,8 +50,8 @@ class Level(Constraint):
         height = jnp.asarray(bank.points)[..., 2]
         return {"upper": jnp.mean(height > height.mean(-1, keepdims=True), -1)}
 
-    def sample(self, hand, draw, key):
-        return LevelGoal(jax.random.bernoulli(key, draw.own("level")["upper"])[:, None])
+    def sample(self, hand, draw, uniform):
+        return LevelGoal(uniform < draw.own("level")["upper"][:, None])
 
     def labels(self, hand):
         return {"wrist": ("wrist",)}
@@ -93,7 +93,8 @@ def test_nothing_else_must_be_changed():
 def episodes(task):
     """Metrics of short episodes with it; it is sampled, observed, rewarded and measured in them."""
     from congrasp.actors.physics.native import NativePhysics
-    from congrasp.actors.rollout import RolloutWorker, finished_episodes
+    from congrasp.actors.rollout import finished_episodes
+    from congrasp.actors.worker import RolloutWorker
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
     from congrasp.common.task.observation import layout
@@ -108,7 +109,7 @@ def episodes(task):
 
     worker = RolloutWorker(
         hand, task, physics, build_bank(hand, task, objects, 0), policy,
-        batch=batch, seed=0, half_precision=False, traced=slice(None),
+        batch=batch, seed=0, half_precision=False, traced="all",
     )  # fmt: skip
     goal = jax.device_get(worker.state.goal)
     rollout = worker.collect(None, task.approach_steps + task.hold_steps)

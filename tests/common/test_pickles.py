@@ -195,6 +195,7 @@ _MANO = mano_pickle({name: value for name, value in content().items() if name in
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, len(_MANO) - 1), st.binary(min_size=1, max_size=4))
+@pytest.mark.slow
 def test_whatever_a_file_says_it_is_read_or_refused(tmp_path_factory, at, noise):
     path = tmp_path_factory.getbasetemp() / "noise.pkl"
     path.write_bytes(_MANO[:at] + noise + _MANO[at + len(noise) :])

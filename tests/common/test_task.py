@@ -22,9 +22,9 @@ from congrasp.common.task.control import decode, guidance_pose
 from congrasp.common.task.features import features, scene_of
 from congrasp.common.task.geometry import FAR, squash, wrist_pose, wrist_to_joints
 from congrasp.common.task.metrics import errors
-from congrasp.common.task.observation import layout, observe
+from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import reward_terms, terms
-from tests.scenes import HAND, F, K, L, active, moved, near_targets, scene
+from tests.scenes import HAND, F, K, L, active, moved, near_targets, scene, units
 
 TASK = TaskConfig(constraints=PAPER)
 TERMS, MASKS = terms(TASK), ("affordance", "pose_finger", "pose_wrist", "trajectory")
@@ -164,6 +164,33 @@ def test_observation_blocks_by_hand():
         np.testing.assert_allclose(seen[3:], _joint_differences(turn, state.u[b, 3:]), atol=5e-3)
     assert parts["trajectory"].shape == (4, 6 * K)
     np.testing.assert_allclose(squash(np.array([[5.0, 0.0, 0.0]])), [[0.5, 0.0, 0.0]])
+
+
+def test_normals_follow_the_nearest_points_and_leave_everything_else_as_it_was():
+    """n of the surface point nearest to each keypoint, in the wrist frame, and the height -n . d above its plane."""
+    state, surface, goal = scene(10)
+    before = np.asarray(OBSERVE(state, surface, goal))
+    exact = surface._replace(normals=units(np.random.default_rng(0), 4, surface.points.shape[1]))
+    task = dataclasses.replace(TASK, surface_normals=True)
+    found = np.asarray(jax.jit(lambda *given: observe(scene_of(HAND, task, *given)))(state, exact, goal))
+    described = fields(HAND, task)["state"]
+    names = [field.name for field in described]
+    assert names[names.index("nearest") :][:3] == ["nearest", "normal", "height"]
+    start = sum(field.size for field in described[: names.index("normal")])
+    points = HAND.keypoints.shape[0]
+    np.testing.assert_allclose(np.delete(found, np.s_[start : start + 4 * points], 1), before, atol=1e-6)
+    b = 2
+    normal = found[b, start : start + 3 * points].reshape(-1, 3)
+    height = found[b, start + 3 * points : start + 4 * points]
+    wrist = _rotation(state.base_quaternion[b]) * Rotation.from_euler("XYZ", state.u[b, 3:])
+    origin = state.base_position[b] + _rotation(state.base_quaternion[b]).apply(state.u[b, :3])
+    body = _rotation(state.object_quaternion[b])
+    keys = wrist.apply(np.asarray(keypoints(HAND, link_transforms(HAND, state.q[b])))) + origin
+    keys = body.inv().apply(keys - state.object_position[b])  # in the object frame
+    nearest = np.linalg.norm(keys[:, None] - exact.points[b], axis=-1).argmin(1)
+    expected = exact.normals[b][nearest]
+    np.testing.assert_allclose(normal, (wrist.inv() * body).apply(expected), atol=1e-5)
+    np.testing.assert_allclose(height, np.sum((keys - exact.points[b][nearest]) * expected, -1), atol=1e-4)
 
 
 @pytest.mark.parametrize("near", [False, True])

@@ -62,6 +62,7 @@ def test_every_command_line_parses(line):
         main._parsed(words[0], main.load(words[0]), words[1:])
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "docs", str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
@@ -118,6 +119,7 @@ def test_the_mug_is_what_its_code_makes(tmp_path):
 
 
 @pytest.mark.timeout(600)
+@pytest.mark.slow
 def test_the_commands_of_the_tutorials_run(tmp_path, monkeypatch):
     """A stranger's first ten minutes, in a folder with the examples; what takes minutes is marked as text there.
 

@@ -119,6 +119,7 @@ def test_updates_that_die_before_a_checkpoint_are_undone_and_counted(cluster):
     assert final["counters"]["undone"] >= counts["undone"]  # some of them were sent again in time
 
 
+@pytest.mark.slow
 def test_actors_and_learner_stopped_for_fifteen_seconds(cluster):
     learner = cluster.start_learner()
     stopped = cluster.start_actor("a")
@@ -148,6 +149,7 @@ def proxy(cluster):
     made.close()
 
 
+@pytest.mark.slow
 def test_a_link_that_goes_silent_is_noticed_and_comes_back(cluster, proxy):
     learner = cluster.start_learner()
     cluster.start_actor("a", endpoint=proxy.endpoint)
@@ -163,6 +165,7 @@ def test_a_link_that_goes_silent_is_noticed_and_comes_back(cluster, proxy):
     cluster.stop(learner)
 
 
+@pytest.mark.slow
 def test_a_slow_link_slows_its_actor_alone(cluster, proxy):
     """Two rollouts take some five seconds, longer than the three that the actor allows other requests."""
     cluster.options["steps"] = 400  # 560 kB

@@ -133,6 +133,7 @@ jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4)
 """
 
 
+@pytest.mark.slow
 def test_its_batch_is_divided_between_two_devices():
     environment = {
         **os.environ,

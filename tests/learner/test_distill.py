@@ -167,6 +167,7 @@ np.testing.assert_allclose(two.observation.mean, one.observation.mean, atol=1e-5
 """
 
 
+@pytest.mark.slow
 def test_its_batch_is_divided_between_two_devices(teacher):
     environment = {
         **os.environ,

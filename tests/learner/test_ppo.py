@@ -151,7 +151,7 @@ def test_the_ceiling_of_the_noise_falls_geometrically():
     for share in kept[1:5]:
         # The update would raise the first and the last deviation by a half, and lower the second to 0.3.
         risen = jnp.log(jnp.array([1.2, 0.3, 0.075])) if not found else log_std
-        hyper = {"final_std": 0.1, "noise_kept": share}
+        hyper = {"final_std": 0.1, "noise_kept": share, "least_std": 0.0}
         log_std = ppo._settle({"actor": {"log_std": risen}}, log_std, hyper)["actor"]["log_std"]
         found.append(np.exp(log_std))
         log_std = jnp.log(jnp.array([0.8, 0.3, 0.05])) if len(found) == 1 else log_std
@@ -169,6 +169,28 @@ def test_the_last_update_of_a_run_that_settles_leaves_the_final_noise():
         np.testing.assert_allclose(np.exp(moved.params["actor"]["log_std"]), metrics["action_std"], rtol=1e-6)
     assert stds[3] > 0.5 and stds[7] == pytest.approx(0.2, rel=1e-5)
     assert stds[4] <= 0.6 * (0.2 / 0.6) ** 0.25 * (1 + 1e-6)
+
+
+def test_the_noise_has_a_floor_until_the_run_settles():
+    settings = PPOConfig(settling=0.3, least_std=0.35)
+    assert [settings.least_std_at(version, 10) for version in (0, 6, 7, 9, 10)] == [0.35, 0.35, 0.0, 0.0, 0.0]
+    assert PPOConfig(least_std=0.35).least_std_at(10, 10) == 0.35  # a run that never settles
+    hyper = {"final_std": 0.1, "noise_kept": np.inf, "least_std": 0.35}
+    log_std = jnp.log(jnp.array([0.2, 0.35, 0.6]))
+    moved = ppo._settle({"actor": {"log_std": log_std}}, log_std, hyper)
+    np.testing.assert_allclose(np.exp(moved["actor"]["log_std"]), [0.35, 0.35, 0.6], rtol=1e-6)
+
+
+def test_an_update_raises_the_noise_to_its_floor_and_settling_lowers_it_again():
+    """The deviations are 0.6 before each update; a floor of 0.7 is above what an update reaches."""
+    settings = dataclasses.replace(toy.SETTINGS, settling=0.5, final_std=0.2, least_std=0.7)
+    batch, stds = rollout(toy.bundle_of(fresh()), 0), {}
+    for version in (3, 4, 7):
+        moved, metrics = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
+        stds[version] = metrics["action_std"]
+        np.testing.assert_allclose(np.exp(moved.params["actor"]["log_std"]), metrics["action_std"], rtol=1e-6)
+    np.testing.assert_allclose(stds[3], 0.7, rtol=1e-6)
+    assert stds[4] < 0.6 and stds[7] == pytest.approx(0.2, rel=1e-5)
 
 
 def test_a_run_that_settles_lowers_its_rate_in_its_last_update():

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import RolloutWorker, finished_episodes
+from congrasp.actors.rollout import finished_episodes
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import CurriculumConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand

@@ -240,6 +240,7 @@ def job(tmp_path):
 
 
 @pytest.mark.timeout(600)
+@pytest.mark.slow
 def test_two_processes_train_die_and_resume_as_one_or_two(job):
     job.start(10**6, "fresh")
     job.reach(5)

@@ -191,6 +191,7 @@ def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
         studio.choose("pose", "q", [])
 
 
+@pytest.mark.slow
 def test_the_studio_grasps_with_it(policy: PolicyBundle) -> None:
     task = dataclasses.replace(TASK, approach_steps=4, hold_steps=2, hold_steps_max=2)
     grasping = PolicyGrasping(lambda version: dataclasses.replace(policy, task=task), "untrained", threads=1)
@@ -219,6 +220,7 @@ def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp
     assert sum(size for _, size in meta["layout"]) == sum(size for _, size in observation.layout(HAND, TASK))
 
 
+@pytest.mark.slow
 def test_an_evaluation_has_its_row(policy: PolicyBundle) -> None:
     evaluator = Evaluator(policy, procedural.generate_many(2, 1_000_000), physics="native", batch=8)
     sample = evaluator.samples(["fingers"], 6)["fingers"]

@@ -51,6 +51,7 @@ def test_a_policy_that_does_not_know_it_says_so(paper_policy, tmp_path: pathlib.
     assert line.startswith("congrasp: error: The policy does not support the constraint 'force'. It supports heading, ")
 
 
+@pytest.mark.slow
 def test_a_grasp_is_made_with_a_limit(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
     grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
     found = grasper.grasp(MUG, read_request(MUG, HAND, 15, force="3"))
@@ -93,6 +94,7 @@ def test_the_studio_has_a_box_for_it() -> None:
         studio.choose("force", "limit", [True])
 
 
+@pytest.mark.slow
 def test_an_evaluation_has_its_row(policy: PolicyBundle) -> None:
     evaluator = Evaluator(policy, procedural.generate_many(2, 1_000_000), physics="native", batch=8)
     sample = evaluator.samples(["force"], 6)["force"]

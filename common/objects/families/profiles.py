@@ -93,7 +93,7 @@ def extrude(outline: np.ndarray, low: float, high: float, *, taper: float = 1.0,
     """A prism over a star-shaped outline, with one piece for each convex sector.
 
     Args:
-      outline: (V, 2) corners, counterclockwise around the origin, which sees the whole border, m.
+      outline: (V, 2) corners, counterclockwise around the origin, from which all of the border is visible, m.
       low: height of the bottom, m.
       high: height of the top, m.
       taper: factor on the outline at the top.

@@ -15,7 +15,7 @@ _family = functools.partial(draft.enter, BUILDERS)
 _CERAMIC, _METAL, _PLASTIC = (900.0, 1800.0), (800.0, 2200.0), (300.0, 900.0)
 """Densities of walls, which are thicker than those of real vessels."""
 _FILLED = (250.0, 1000.0)
-_FLAT_SIDE = np.cos(np.pi / 16)  # side of a polygon of 16 corners
+_FLAT_SIDE = np.cos(np.pi / 16)  # distance of a side of a 16-sided polygon from its centre, in radii
 
 
 @_family

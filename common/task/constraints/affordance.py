@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 REACH = 0.15
 """Length of the approach before the heading position that is checked against the avoid region, m."""
 MARGIN = 0.01
-"""Distance m that the fingers should keep from the avoid region, m."""
+"""Distance that the fingers should keep from the avoid region (m in the paper), m."""
 SHARPNESS = 0.002
 """tau, m."""
 _NEAR = 0.004
@@ -110,7 +110,7 @@ class Affordance(Constraint):
         """True where the object has both regions, and its graspable one can be approached in the resting pose."""
         return draw.bank.has_affordance[draw.objects, draw.rests]
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> AffordanceGoal:
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> AffordanceGoal:
         """Regions of the object."""
         return AffordanceGoal()
 
@@ -141,12 +141,12 @@ class Affordance(Constraint):
         )
 
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
-        """Nearest-point vectors to the avoid region, and squashed forces on it."""
+        """Nearest-point vectors to the avoid region, and squashed forces from it."""
         own = scene.features.of["affordance"]
         return ([flat(own.nearest), flat(squash(own.force))],)
 
     def earning(self, scene: Scene, touching: Array, force: Array) -> tuple[Array, Array]:
-        """Contacts on the graspable region only: a link that presses on the avoid region earns nothing."""
+        """Contacts on the graspable region only: pressing on the avoid region earns nothing."""
         active, own = scene.goal.active["affordance"][:, None], scene.features.of["affordance"]
         return (
             jnp.where(active, touching & own.touching_graspable, touching),

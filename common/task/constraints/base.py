@@ -159,7 +159,7 @@ class Constraint:
     overrides: ClassVar[tuple[str, ...]] = ()
     """Weaker constraints, or blocks of them, that are inactive when this one is requested."""
     overridden_by: ClassVar[tuple[str, ...]] = ()
-    """Relations to weaker constraints, and constraints that make this one inactive without declaring it themselves."""
+    """Stronger constraints that make this one inactive without listing it in their `overrides`."""
     guides: ClassVar[str] = ""
     """Block whose activity passes the wrist's guidance to `guidance`; empty if it does not guide the wrist."""
     region: ClassVar[int] = 0
@@ -171,6 +171,7 @@ class Constraint:
     weights: ClassVar[tuple[Weight, ...]] = ()
     errors: ClassVar[tuple[ErrorSpec, ...]] = ()
     relations: ClassVar[tuple[Relation, ...]] = ()
+    """Relations to weaker constraints."""
     options: ClassVar[tuple[Option, ...]] = ()
     needs: ClassVar[tuple[str, ...]] = ()
     """Fields of a query, in addition to its goal arrays, that a request for it must contain."""
@@ -210,8 +211,18 @@ class Constraint:
         """
         return draw.allowed
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> Any:
-        """Samples its goal arrays for the drawn episodes, whether or not they request it."""
+    def numbers(self, hand: Hand, task: "TaskConfig") -> int:
+        """Number U of random numbers that `sample` uses for an episode."""
+        return 1
+
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> Any:
+        """Samples its goal arrays for the drawn episodes, whether or not they request it.
+
+        Args:
+          hand: the hand.
+          draw: the drawn episodes.
+          uniform: (B, U) independent random numbers in [0, 1), which depend on no other constraint.
+        """
         raise NotImplementedError
 
     def override(self, hand: Hand, surface: Surface, asked: Mapping[str, Array], goal: Goal) -> Goal:
@@ -375,7 +386,7 @@ class Constraint:
         return self.among(goal.active)
 
     def among(self, blocks: Mapping[str, Array]) -> Array:
-        """(B,) bool: one of its blocks is active; True for a constraint without blocks.
+        """(B,) bool: one of its blocks is active. Only optional constraints have blocks.
 
         A reference pose of which a trajectory keeps only the fingers is therefore active.
         """

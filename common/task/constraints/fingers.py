@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from congrasp.common import chance
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
@@ -58,7 +59,7 @@ class Fingers(Constraint):
     )
     errors = (ErrorSpec("fingers_ratio", "", "hold", 0.0, 0.1, "share of touching links of other fingers"),)
     options = (
-        Option("fingers", "Which fingers may touch the object, such as: thumb index. All by default.", many=True),
+        Option("fingers", "Fingers that may touch the object, such as: thumb index. All by default.", many=True),
     )
     invalid = (_NEEDED, "Allow both.")
 
@@ -72,10 +73,10 @@ class Fingers(Constraint):
         )
         return (block,)
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> FingersGoal:
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> FingersGoal:
         """Samples any set with the thumb; pinch, tripod and all fingers are more likely than others."""
         sets, shares = finger_sets(hand)
-        return FingersGoal(jnp.array(sets)[jax.random.choice(key, len(sets), draw.objects.shape, p=jnp.array(shares))])
+        return FingersGoal(jnp.array(sets)[chance.weighted(uniform[:, 0], shares)])
 
     def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
         """A pinch."""

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -62,11 +61,10 @@ class Force(Constraint):
             ),
         )
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> ForceGoal:
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> ForceGoal:
         """Samples log-uniformly between the least limit for the episode's object and 20 N."""
         low = jnp.log(jnp.minimum(draw.least_force, MOST))
-        drawn = jax.random.uniform(key, draw.objects.shape)
-        return ForceGoal(jnp.exp(low + drawn * (jnp.log(MOST) - low)))
+        return ForceGoal(jnp.exp(low + uniform[:, 0] * (jnp.log(MOST) - low)))
 
     def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
         """A limit of 5 N."""
@@ -119,7 +117,7 @@ class Force(Constraint):
 
 
 def least_force(mass: Array, friction: Array) -> Array:
-    """Least sensible limit in N for objects of this mass (kg) with this friction: m g / (2 mu), at least 1 N.
+    """Least sensible limit in N for objects of this mass (kg) with this friction: m g / (2 mu), between 1 and 20 N.
 
     Thumb and fingers press on opposite sides, each of which carries half of the weight by friction. The fingers share
     their side; the thumb carries the other.

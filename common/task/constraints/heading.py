@@ -3,11 +3,10 @@
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common import rotations
+from congrasp.common import chance, rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
@@ -103,10 +102,10 @@ class Heading(Constraint):
         )
         return (block,)
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> HeadingGoal:
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> HeadingGoal:
         """Samples one of the object's headings for its resting pose and region, moved back clear of the table."""
         bank, where = draw.bank, (draw.objects, draw.region)
-        slot = jax.random.randint(key, draw.objects.shape, 0, bank.heading_index.shape[-1])
+        slot = chance.index(uniform[:, 0], bank.heading_index.shape[-1])
         index = *where, bank.heading_index[*where, draw.rests, slot]
         back = bank.heading_back[*where, draw.rests, slot][:, None]
         direction = bank.heading_direction[index]

@@ -3,7 +3,6 @@
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,7 +23,12 @@ from congrasp.common.task.constraints.base import (
 from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
 from congrasp.common.task.constraints.markers import Ghost, Marker
 from congrasp.common.task.geometry import flat, in_world, square, squared_distances, wrist_to_joints
-from congrasp.common.task.sampling.disturbances import disturbed_fingers, disturbed_wrist
+from congrasp.common.task.sampling.disturbances import (
+    disturbed_fingers,
+    disturbed_wrist,
+    fingers_numbers,
+    wrist_numbers,
+)
 from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
@@ -97,14 +101,18 @@ class Pose(Constraint):
         )
         return fingers, (wrist,)
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> PoseGoal:
+    def numbers(self, hand: Hand, task: "TaskConfig") -> int:
+        """Those of disturbed fingers and of a disturbed wrist."""
+        return fingers_numbers(hand) + wrist_numbers(1)
+
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> PoseGoal:
         """Samples one of the object's reference poses."""
         index = draw.objects, draw.region, draw.reference["pose"]
         q, position, quaternion = (getattr(draw.bank, f"pose_{name}")[index] for name in PoseGoal._fields)
         if draw.disturbance is not None:
-            finger_key, wrist_key = jax.random.split(key)
-            q = disturbed_fingers(hand, q, draw.disturbance, finger_key)
-            wrist = disturbed_wrist(position[:, None], quaternion[:, None], draw.disturbance, wrist_key)
+            fingers, turned = jnp.split(uniform, [fingers_numbers(hand)], -1)
+            q = disturbed_fingers(hand, q, draw.disturbance, fingers)
+            wrist = disturbed_wrist(position[:, None], quaternion[:, None], draw.disturbance, turned)
             position, quaternion = (part[:, 0] for part in wrist)
         return PoseGoal(q, position, quaternion)
 

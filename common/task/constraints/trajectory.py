@@ -25,7 +25,7 @@ from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, h
 from congrasp.common.task.constraints.markers import Marker, Polyline
 from congrasp.common.task.constraints.pose import heading_message
 from congrasp.common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
-from congrasp.common.task.sampling.disturbances import disturbed_wrist
+from congrasp.common.task.sampling.disturbances import disturbed_wrist, wrist_numbers
 from congrasp.common.task.types import Array, Goal, Surface
 
 if TYPE_CHECKING:
@@ -88,7 +88,11 @@ class Trajectory(Constraint):
         ends = draw.bank.trajectory_position[draw.objects, draw.region, :, -1]
         return draw.allowed & jax.vmap(_agrees, (None, 1), 1)(draw, ends)
 
-    def sample(self, hand: Hand, draw: "Draw", key: Array) -> TrajectoryGoal:
+    def numbers(self, hand: Hand, task: "TaskConfig") -> int:
+        """Those of a disturbed wrist."""
+        return wrist_numbers(task.trajectory_points)
+
+    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> TrajectoryGoal:
         """Samples the trajectory to one of the object's reference poses.
 
         A disturbance that would make it contradict an affordance is dropped.
@@ -97,7 +101,7 @@ class Trajectory(Constraint):
         path = TrajectoryGoal(draw.bank.trajectory_position[index], draw.bank.trajectory_quaternion[index])
         if draw.disturbance is None:
             return path
-        disturbed = TrajectoryGoal(*disturbed_wrist(*path, draw.disturbance, key))
+        disturbed = TrajectoryGoal(*disturbed_wrist(*path, draw.disturbance, uniform))
         kept = _agrees(draw, disturbed.position[:, -1])[:, None, None]
         return TrajectoryGoal(*(jnp.where(kept, *pair) for pair in zip(disturbed, path, strict=True)))
 
@@ -141,7 +145,7 @@ class Trajectory(Constraint):
         return {"trajectory_position": -active * far, "trajectory_rotation": -active * turned**2}
 
     def measure(self, scene: Scene) -> dict[str, Array | tuple[Array, Array]]:
-        """Geodesic distance and distance between the wrist and the tracked waypoint."""
+        """Angle and distance between the wrist and the tracked waypoint."""
         position, quaternion = tracked_waypoint(scene, current=True)
         return {
             "trajectory_rad": rotations.angle(scene.features.wrist_quaternion, quaternion),

@@ -9,7 +9,7 @@ import numpy as np
 
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.constraints import known
-from congrasp.common.task.types import Array
+from congrasp.common.task.types import Array, Surface
 
 if TYPE_CHECKING:
     from congrasp.common.task.config import TaskConfig
@@ -26,6 +26,8 @@ class ConstraintBank(NamedTuple):
     """(N, P, 3) surface points."""
     avoid: Array
     """(N, P) bool, the avoid region."""
+    normals: Array
+    """(N, P, 3) outward unit normals at the points."""
     rest: Array
     """(N, R, 7) resting poses in the world frame; unused rows repeat earlier ones."""
     heading_position: Array
@@ -78,6 +80,12 @@ _AXES = {
 
 SHARED = ConstraintBank._fields[:-1]
 """Fields of the bank that do not belong to a single constraint."""
+
+
+def surface_of(task: "TaskConfig", bank: ConstraintBank, objects: Array) -> Surface:
+    """Surfaces (B, P, ...) of the objects (B,), with normals if the task's policy observes them."""
+    normals = bank.normals[objects] if task.surface_normals else None
+    return Surface(bank.points[objects], bank.avoid[objects], normals)
 
 
 def with_columns(hand: Hand, task: "TaskConfig", bank: ConstraintBank) -> ConstraintBank:

@@ -56,7 +56,7 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
       seed: random seed.
 
     Raises:
-      CongraspError: an object has no heading that the hand can reach in any resting pose.
+      CongraspError: an object is too wide or cannot be approached in any resting pose, or all objects lie too flat.
     """
     bank = kept_bank(hand, task, objects, seed, functools.partial(_build, hand, task, objects, seed))
     return with_columns(hand, task, bank)
@@ -253,6 +253,7 @@ def headings_of(
     avoided = obj.non_graspable_points[keep]
     floats = {
         "points": obj.points[keep],
+        "normals": obj.normals[keep],
         "rest": obj.rest_poses[usable],
         **{f"heading_{name}": np.stack([getattr(s, name) for s in sets]) for name in Headings._fields},
         "heading_back": np.take_along_axis(back, index, -1),

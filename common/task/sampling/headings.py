@@ -23,7 +23,7 @@ _BEYOND = 0.01  # the slab ends this far beyond the heading position, at the fin
 _FINGER = 0.012  # thickness of a thin finger that closes from below
 _SIDE = 0.015  # depth of an object's side along the cross-finger axis, in which fingertips need a surface
 _CONE = np.radians(30)  # half angle of the cone of directions around the inward normal, rad
-_OPPOSED = np.cos(np.arctan(1.0))  # least cosine of a normal with that axis: the edge of the cone of friction 1
+_OPPOSED = np.cos(np.arctan(1.0))  # least cosine of a normal with the cross-finger axis: edge of the cone of friction 1
 _TUBE = 0.01  # radius around the approach that must be free in front of the surface point
 _MARGIN = 0.01  # distance of an approach from the avoid region; closing fingers of this thickness must not meet it
 _BACK = 0.015  # greatest distance back from the table: to a hand whose centre is 5 mm inside the surface
@@ -79,8 +79,8 @@ def sample_headings(
 
     Behind a small handle there is no room for fingertips: if fewer than 16 headings of a graspable region remain after
     `attempts` batches, others with half the `inward` are tried. Fewer than `count` are repeated. If none remains on the
-    whole surface, the result is the narrowest of the candidates that satisfy the first rule and violate the fewest
-    others.
+    whole surface, the result consists of the narrowest of the candidates that violate the fewest rules; they satisfy
+    the first one.
 
     Args:
       obj: the object.

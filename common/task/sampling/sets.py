@@ -11,7 +11,8 @@ from congrasp.common.described import check_arrays
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name, read_file
 from congrasp.common.objects import store
-from congrasp.common.objects.spec import GraspObject
+from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
+from congrasp.common.task.normals import estimated_normals
 from congrasp.common.task.sampling.bank import ConstraintBank, stacked
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode
 
@@ -19,10 +20,11 @@ SUFFIX = ".constraints.safetensors"
 REGIONS = ("whole surface", "graspable region")
 """The axis V: constraints for the whole surface, and for the graspable region only."""
 FORMAT = 2
-_LARGEST = 100.0  # tolerance, m or rad
+_LARGEST = 100.0  # bound of all numbers, m or rad
 _MASS = 0.2  # mass in kg of an object whose set was written before sets recorded it
 MEANING = {
     "surface/points": "(P, 3) m, object frame",
+    "surface/normals": "(P, 3) outward unit normals at the points",
     "surface/avoid": "(P,) bool, the point belongs to the avoid region",
     "rest": "(R, 7) resting poses in the world frame, position (m) and quaternion; the table's top is at z = 0",
     "heading/position": "(V, H, 3) m, object frame: target of the hand's centre",
@@ -91,6 +93,7 @@ def _row(made: Message, split: Split) -> ConstraintBank:
     return ConstraintBank(
         points=arrays["surface/points"],
         avoid=arrays["surface/avoid"],
+        normals=arrays["surface/normals"],
         rest=arrays["rest"][usable],
         heading_position=arrays["heading/position"],
         heading_direction=arrays["heading/direction"],
@@ -136,6 +139,8 @@ def load(path: pathlib.Path) -> Message:
         raise CongraspError(f"{path} cannot be read as a constraint set: {error}", remedy) from None
     if message.meta.get("kind") != "constraints" or message.meta.get("format") != FORMAT:
         raise CongraspError(f"{path} is not a constraint set of this version of congrasp.", remedy)
+    if "surface/points" in message.arrays and "surface/normals" not in message.arrays:
+        message = _with_normals(message)
     if missing := sorted(MEANING.keys() - message.arrays.keys()):
         raise CongraspError(f"The constraint set {path} lacks '{missing[0]}'.", remedy)
     try:
@@ -143,6 +148,15 @@ def load(path: pathlib.Path) -> Message:
     except (CongraspError, ValueError) as error:
         raise CongraspError(f"The constraint set {path} is damaged: {str(error).split('. ')[0]}.", remedy) from None
     return message
+
+
+def _with_normals(message: Message) -> Message:
+    """Returns a set of an earlier version with estimated normals; unchanged if its points are not an array (P, 3)."""
+    points = message.arrays["surface/points"]
+    if points.ndim != 2 or points.shape[1] != 3 or not 1 <= len(points) <= SURFACE_POINTS:
+        return message
+    normals = np.array(estimated_normals(points[None])[0])
+    return Message({**message.arrays, "surface/normals": normals}, message.meta)
 
 
 def _check(message: Message) -> None:

@@ -34,7 +34,7 @@ def make_sets(
       bank: an existing bank of these objects, scaled for the hand, whose reference poses are used. None builds one.
 
     Raises:
-      CongraspError: an object has no heading that the hand can reach in any resting pose.
+      CongraspError: see `build_bank`.
     """
     fitting = scale_objects(hand, task, objects)
     rows = rows_of(bank or build_bank(hand, task, fitting, seed))
@@ -88,6 +88,7 @@ def set_of(
         heading_training = for_training(row.heading_position.shape[1], seed)
     arrays = {
         "surface/points": row.points,
+        "surface/normals": row.normals,
         "surface/avoid": row.avoid,
         "rest": row.rest[:rests],
         "heading/position": row.heading_position,

@@ -47,7 +47,7 @@ _TOUCHED = 0.03
 IN_TABLE = 0.005
 """Tolerated depth of a captured hand in the table if no resting pose avoids it, m."""
 _VERTICES = 3
-"""Least number of contact points that makes a part of an object graspable (O+ in the paper)."""
+"""Least number of contact points that makes a part of an object graspable."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,7 +20,7 @@ class Meshes:
     folders: tuple[pathlib.Path, ...]
 
     def beside(self, *folders: pathlib.Path) -> "Meshes":
-        """Returns these folders followed by those of the data set."""
+        """Returns the search folders followed by those of the data set."""
         return Meshes((*self.folders, *folders))
 
     def has(self, name: str) -> bool:
@@ -65,7 +65,7 @@ def import_meshes(
 
     Args:
       meshes: files or folders, with the data set's names of their objects.
-      progress: called with each finished object's name, and the number of objects.
+      progress: called with one line of text for each finished object: its name and the count so far.
 
     Returns:
       The object of each mesh, or the error.

@@ -107,7 +107,7 @@ def robot_spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
 
 
 def _child(source: str, result: str) -> None:
-    """Compiles a file into another; ends if the parent is gone."""
+    """Compiles a file into another; ends a few seconds after `SECONDS`, even if the parent is gone."""
     signal.alarm(SECONDS + 5)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -79,7 +79,7 @@ def grip_objects(width: float) -> list[GraspObject]:
 
 
 def grips(hand: Hand, task: TaskConfig, threads: int) -> list[Grip]:
-    """Returns the best attempt at each of `OBJECTS`: the larger ones, or the smaller ones if those are not held.
+    """Returns the best attempt at each of `OBJECTS`, of the larger size, and of the smaller one unless all survive.
 
     Args:
       hand: the hand.

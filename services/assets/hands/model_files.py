@@ -1,7 +1,7 @@
 """A hand from a URDF or MJCF file: its content is used, and missing values are proposed.
 
 MuJoCo reads the file. Bodies of the hand: `tree`. Capsules of links: `geometry`. Motors, couplings and tendons:
-`motors`. Open and closed poses, from kinematics: `poses`.
+`actuators`. Open and closed poses, from kinematics: `poses`.
 """
 
 import dataclasses
@@ -60,7 +60,7 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     """Imports the hand of a file.
 
     Args:
-      path: URDF (.urdf) or MJCF (.xml); meshes are found by MuJoCo.
+      path: URDF (.urdf), whose meshes are searched as ROS does, or MJCF (.xml).
       choices: name, body of the palm, last body of the thumb and object scale, which are otherwise guessed; collision.
 
     Raises:

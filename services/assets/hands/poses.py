@@ -37,7 +37,11 @@ _THUMB = re.compile(r"thumb|(^|_)th(j?\d|base|prox|hub|mid|dist)", re.IGNORECASE
 
 
 def thumb_of(hand: Hand, wanted: str, notes: list[str]) -> str:
-    """Returns the last link of the finger named as a thumb, or else of the one that best faces all others."""
+    """Returns the last link of the finger named as a thumb, or else of the one that best faces all others.
+
+    Raises:
+      CongraspError: `wanted` is not the last link of a finger.
+    """
     tips = [link.name for link in hand.links if link.tip is not None]
     if wanted:
         if wanted not in tips:

@@ -1,1 +1,1 @@
-"""From files to objects: finding, reading, mending, scaling and cutting meshes."""
+"""From files to objects: finding, reading, repairing, scaling and decomposing meshes."""

@@ -1,7 +1,7 @@
 """New partitions of an object into graspable region and avoid region.
 
-From a mesh of one part, from painted vertices, from a half-space, or from points that were touched. All of them label
-the object's surface points; nothing else about the object changes.
+They come from a mesh of one part, painted vertices, a half-space, or touched points. They relabel the object's surface
+points and pieces; nothing else about the object changes.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from congrasp.services.assets.objects.sources import load_geometry, read_mesh
 LEAST_SHARE = 0.10
 """Least share of the surface that the graspable region must have (paper, section Constraint Setup)."""
 _ON_PART = 0.003  # m; a surface point this near to a part's mesh belongs to the part
-_SAME_BOX = 0.1  # share of an object's length by which the bounding box of its painted file may be off
+_SAME_BOX = 0.1  # tolerance of the bounding box of a painted file, as a share of the object's length
 _COLOUR_TOLERANCE = 60  # largest distance of two colours in RGB that count as one
 
 
@@ -31,9 +31,9 @@ def relabelled(
     Args:
       obj: the object.
       labels: (512,) part of each of its surface points.
-      names: of the parts.
-      graspable: which of them form the graspable region.
-      name: of the new object, if it is to have another.
+      names: names of the parts.
+      graspable: True for each part of the graspable region.
+      name: name of the new object; unchanged if empty.
 
     Raises:
       CongraspError: the graspable region has less than a tenth of the surface.
@@ -64,12 +64,16 @@ def relabelled(
 
 
 def two_parts(obj: GraspObject, graspable: np.ndarray, name: str = "") -> GraspObject:
-    """The object with the surface points `graspable` (512,) bool, and the others to avoid."""
+    """The object with the surface points `graspable` (512,) bool as graspable region, the others as avoid region."""
     return relabelled(obj, np.where(graspable, 0, 1), ("grasp", "avoid"), (True, False), name)
 
 
 def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> np.ndarray:
-    """(512,) bool: surface points x with normal . x >= offset (m), in the object frame."""
+    """(512,) bool: surface points x with normal . x >= offset (m), in the object frame; `normal` has any length.
+
+    Raises:
+      CongraspError: the normal is zero or not finite, or the offset is larger than the object.
+    """
     length = float(np.linalg.norm(normal))
     if not np.isfinite(length) or length < 1e-9:
         raise CongraspError(f"The direction {tuple(normal)} has no length.", "Give three finite numbers, not all zero.")
@@ -111,7 +115,7 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
       colour: red, green and blue, 0 to 255.
 
     Raises:
-      CongraspError: the file has no coloured vertices, none of this colour, or shows something else than the object.
+      CongraspError: the file has no coloured vertices, none of this colour, or shows another object.
     """
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Check the path.")
@@ -135,7 +139,7 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
 
 
 def _check_box(obj: GraspObject, path: pathlib.Path, vertices: np.ndarray) -> None:
-    """Raises a CongraspError if vertices (n, 3), m, object frame, do not span what the object does."""
+    """Raises a CongraspError if the bounding box of vertices (n, 3), m, object frame, is not that of the object."""
     if not len(vertices):
         raise CongraspError(f"{path} has no vertex of finite numbers.", "Export it again.")
     own, other = (np.stack([x.min(0), x.max(0)]) for x in (obj.visual_vertices, vertices))
@@ -155,6 +159,6 @@ def near_points(obj: GraspObject, points: np.ndarray, radius: float) -> np.ndarr
 
 
 def _commonest(rgb: np.ndarray) -> np.ndarray:
-    """The five colours (n, 3) that most rows (N, 3) have."""
+    """The five most frequent colours (n, 3) among rows (N, 3)."""
     colours, counts = np.unique(rgb, axis=0, return_counts=True)
     return colours[np.argsort(-counts)[:5]]

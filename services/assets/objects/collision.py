@@ -50,7 +50,7 @@ def convex_pieces(
       meshes: its surface, m: one of the whole, or one of each part.
       whole: all of them as one.
       given: vertices (V, 3) of the convex pieces in its folder, m; the surface if that has no file.
-      options: how meshes become objects.
+      options: options of the import.
       notes: the selected pieces and their errors are appended.
 
     Raises:

@@ -82,7 +82,7 @@ def _material(material: Any, uv: np.ndarray | None, count: int) -> np.ndarray:
     image = _image(material)
     if image is None or uv is None:
         return np.broadcast_to(np.asarray(material.main_color, float)[:3], (count, 3))
-    tint = getattr(material, "baseColorFactor", None)  # of an OBJ's image nothing is taken away
+    tint = getattr(material, "baseColorFactor", None)  # an OBJ's image has no tint
     if not np.isfinite(uv).all():
         raise ValueError("texture coordinates are not all numbers")
     whole = np.ones(3) if tint is None else np.asarray(tint, float)[:3] / 255

@@ -12,24 +12,24 @@ from congrasp.common.objects.shapes import tessellate
 from congrasp.common.objects.spec import GraspObject
 
 DENSITIES = (500.0, 2500.0)
-"""kg/m^3 between which the mass of a thing of unknown material is kept."""
+"""Limits of the density of an object of unknown material, kg/m^3."""
 PER_SURFACE = 4.0
-"""kg of a thing of unknown material for each m^2 of its surface: 2 mm of wall at 2,000 kg/m^3."""
+"""Mass of an object of unknown material per surface, kg/m^2: 2 mm of wall at 2,000 kg/m^3."""
 HEAVIEST_GUESS = 0.5
-"""kg, the most that a thing of unknown material is taken for."""
+"""Largest mass of an object of unknown material, kg."""
 _SHEET = 5e-4
-"""Metres of mean thickness below which an open mesh is a sheet without thickness."""
+"""Mean thickness below which an open mesh is a sheet without thickness, m."""
 
 
 class Material(NamedTuple):
-    """A material of household things. Wall and thickest are this project's: those of ordinary cups, bottles, boxes."""
+    """A material of household objects. Wall and thickest are estimates for ordinary cups, bottles and boxes."""
 
     density: float
     """kg/m^3."""
     wall: float
-    """m, wall of a hollow thing."""
+    """Wall of a hollow object, m."""
     thickest: float
-    """m, mean thickness (see `mean_thickness`) above which a thing is hollow."""
+    """Mean thickness (see `mean_thickness`) above which an object is hollow, m."""
     source: str
     """Source of the density."""
 
@@ -100,17 +100,17 @@ def mean_thickness(mesh: trimesh.Trimesh) -> float:
 
 
 def hollow(mesh: trimesh.Trimesh, material: Material) -> bool:
-    """True for a body that weighs its wall alone: thicker than things of its material are, or a sheet."""
+    """True for a body whose mass is that of its wall: thicker than objects of its material are, or a sheet."""
     thickness = mean_thickness(mesh)
     return thickness > material.thickest or (not mesh.is_volume and thickness < _SHEET)
 
 
 def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> Weight:
-    """Mass properties of bodies side by side, each solid or `hollow`.
+    """Mass properties of several bodies together, each solid or `hollow`.
 
     Args:
       bodies: surfaces, m, in one frame. A thin shell is solid: its walls have two sides, which enclose the material.
-      materials: of each.
+      materials: material of each body.
     """
     weights = [_weigh(body, material) for body, material in zip(bodies, materials, strict=True)]
     mass = sum(weight.mass for weight in weights)
@@ -135,7 +135,7 @@ def _weigh(mesh: trimesh.Trimesh, material: Material) -> Weight:
 
 
 def _on_surface(mesh: trimesh.Trimesh, mass: float) -> Weight:
-    """Mass properties of a mass that is evenly spread over a surface."""
+    """Mass properties of a mass distributed evenly over a surface."""
     share = mesh.area_faces / mesh.area
     center = share @ mesh.triangles.mean(1)
     corners = mesh.triangles - center
@@ -147,7 +147,7 @@ def _on_surface(mesh: trimesh.Trimesh, mass: float) -> Weight:
 
 
 def guessed_mass(volume: float, area: float) -> float:
-    """Mass in kg of a thing of unknown material, by its volume (m^3) and surface (m^2)."""
+    """Mass in kg of an object of unknown material, by its volume (m^3) and surface (m^2)."""
     low, high = (density * volume for density in DENSITIES)
     return min(max(PER_SURFACE * area, low), high, HEAVIEST_GUESS)
 
@@ -158,7 +158,7 @@ def with_mass(obj: GraspObject, mass: float | None, material: str) -> GraspObjec
     Args:
       obj: an object of convex pieces, each of which is solid or `hollow`.
       mass: kg.
-      material: see `materials_of`; for the mass, where none is given.
+      material: see `materials_of`; determines the mass if `mass` is None. Without both the object is unchanged.
     """
     if mass is None and material:
         of_part = materials_of(material, obj.part_names)

@@ -30,19 +30,19 @@ from congrasp.services.assets.objects.sizes import metres_per_unit
 from congrasp.services.assets.objects.sources import Source, read_mesh
 
 UNLABELLED = ("near half", "far half")
-"""Parts of an object whose files name none."""
+"""Parts of an object without part files."""
 _CACHE_VERSION = 8
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
 
 def import_source(source: Source, options: ImportOptions) -> GraspObject:
-    """Imports one object, or takes it from the cache of finished imports; its `notes` say what the user should know.
+    """Imports one object, or reads it from the cache of finished imports; its `notes` are for the user.
 
-    Its origin moves to the centre of mass; its orientation stays the file's. Parts come from part files; an object
-    without them is labelled by two halves, the slimmer one graspable if a hand can close on it (`cut_to_hold`).
+    Its origin moves to the centre of mass; its orientation stays that of the file. Parts come from part files; an
+    object without them is labelled by two halves, the slimmer one graspable if a hand can close on it (`cut_to_hold`).
 
     Raises:
-      CongraspError: a mesh cannot be used; the line names it, its fault and the remedy.
+      CongraspError: an option is invalid, or a mesh cannot be used; the message names it, its fault and the remedy.
     """
     check_options(options)
     key = _cache_key(source, options)
@@ -60,20 +60,20 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
 def import_sources(
     sources: Sequence[Source], options: ImportOptions
 ) -> Iterator[tuple[int, GraspObject | CongraspError]]:
-    """Imports objects side by side, one for each core: the index of each as it is done, and the object or its fault.
+    """Imports objects in parallel, one for each core; yields the index of each when done, and the object or error.
 
-    Each decomposition is a process of its own, with a deadline and a limit of memory, while the threads of this one
-    wait for it; they keep no program from ending.
+    Each decomposition is a separate process with a deadline and a memory limit, for which daemon threads of this
+    process wait.
 
     Raises:
-      CongraspError: an option cannot be, or nothing comes for much longer than the deadlines of the decompositions.
+      CongraspError: an option is invalid, or no import ends for much longer than the deadlines of the decompositions.
     """
     check_options(options)
     todo = collections.deque(range(len(sources)))
     done: queue.SimpleQueue[tuple[int, GraspObject | Exception]] = queue.SimpleQueue()
 
     def work() -> None:
-        """Imports until there is nothing left to do."""
+        """Imports until no source is left."""
         with contextlib.suppress(IndexError):
             while True:
                 i = todo.popleft()
@@ -173,7 +173,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
 
 
 def _colours(source: Source, factor: float, center: np.ndarray, seed: int, notes: list[str]) -> Colours | None:
-    """Those of the files, in the object's frame."""
+    """Colours of the files, in the object frame; None if they have none, or cannot be read."""
     try:
         found = sample_colours([file.path for file in source.visuals], seed)
     except CongraspError as error:
@@ -211,7 +211,7 @@ def _weighed(
       source: the object's files.
       meshes: its surface, m.
       factor: metres per unit of the files.
-      hulls: vertices (V, 3) of the convex solids that stand for it if it is open, m; the surface's hull if None.
+      hulls: vertices (V, 3) of the convex solids that replace an open surface, m; the surface's hull if None.
       options: material, density and mass.
     """
     whole, text = _joined(meshes), options.material
@@ -236,13 +236,13 @@ def _weighed(
 
 
 def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
-    """A convex piece of vertices (V, 3) around its own middle, relative to the centre of mass."""
+    """A convex piece of vertices (V, 3), with its origin at their mean, relative to the centre of mass."""
     middle = hull.mean(0)
     return Piece("mesh", (0.0, 0.0, 0.0), tuple((middle - center).tolist()), vertices=hull - middle, part=part)
 
 
 def _labelled(pieces: tuple[Piece, ...], points: np.ndarray, labels: np.ndarray) -> tuple[Piece, ...]:
-    """The pieces, each of the part that most of its vertices are nearest to, by labelled (N,) points (N, 3)."""
+    """The pieces with the part to which most of their vertices are nearest, by labels (N,) of points (N, 3)."""
     near = cKDTree(points)
     votes = (labels[near.query(np.asarray(piece.vertices) + piece.pos)[1]] for piece in pieces)
     return tuple(

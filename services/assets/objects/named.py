@@ -29,7 +29,7 @@ class ObjectAt(NamedTuple):
     """Its meshes; None for an object file, and for an object of the generator."""
 
     def load(self, options: ImportOptions = _METRES_OR_ASK) -> GraspObject:
-        """The object; an object file is taken as it is.
+        """The object; the options apply to meshes alone.
 
         Raises:
           CongraspError: it cannot be read or imported.
@@ -42,7 +42,7 @@ class ObjectAt(NamedTuple):
         return generate(int(seed), family)
 
     def digest(self) -> str:
-        """A hash of its files' content; of an object of the generator what it is made of."""
+        """A hash of its files' content; for an object of the generator its family and seed."""
         if not self.source and not self.path.exists():
             return str(self.path)
         files = [file.path for file in self.source.files()] if self.source else [self.path]
@@ -52,11 +52,11 @@ class ObjectAt(NamedTuple):
 def objects_at(path: pathlib.Path) -> list[ObjectAt]:
     """Objects at a path: an object file, the object files of a folder, or else meshes (see `find_sources`).
 
-    FAMILY:SEED, such as mug:7, is an object of the generator, and FAMILY:FIRST-LAST are many of them, where no file has
+    FAMILY:SEED, such as mug:7, is an object of the generator, and FAMILY:FIRST-LAST are many of them, unless a file has
     that name; the families of a group, such as all:0-999, take turns.
 
     Raises:
-      CongraspError: there is nothing of the kind.
+      CongraspError: there is no object at the path.
     """
     if made := _generated(path):
         return made
@@ -76,11 +76,11 @@ def objects_of(
 
     Args:
       path: see `objects_at`.
-      options: how meshes become objects.
-      track: (label, total) -> function to call with the number done; imports may take long.
+      options: options of the import of meshes.
+      track: (label, total) -> function to call with the number of finished imports.
 
     Raises:
-      CongraspError: there is nothing of the kind, or it cannot be read or imported.
+      CongraspError: there is no object at the path, or one cannot be read or imported.
     """
     found = objects_at(path)
     if track is None or not any(one.source for one in found):
@@ -103,7 +103,7 @@ def load_each(
 
     Args:
       found: see `objects_at`.
-      options: how meshes become objects.
+      options: options of the import of meshes.
       on_error: called with each object that cannot be read or imported, and the error; the object is skipped unless
         this raises.
       progress: called with the number of finished meshes.
@@ -159,7 +159,7 @@ def find_object(text: str, folder: str = "objects") -> GraspObject:
 
 
 def _generated(path: pathlib.Path) -> list[ObjectAt]:
-    """The objects of the generator that FAMILY:SEED or FAMILY:FIRST-LAST means; none for any other text.
+    """The objects of the generator named by FAMILY:SEED or FAMILY:FIRST-LAST; empty for any other text.
 
     Raises:
       CongraspError: there is no such family, or the last seed comes before the first.

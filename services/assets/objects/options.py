@@ -17,23 +17,23 @@ class ImportOptions:
     scale: float = 1.0
     """Factor on the size, after the unit."""
     material: str = ""
-    """For the mass where none is given: aluminium, cardboard, ceramic, cork, glass, paper, plastic, rubber, steel or
-    wood; or PART=NAME for parts, such as head=steel,handle=wood. What is too thick for its material is hollow."""
+    """Material for the mass: aluminium, cardboard, ceramic, cork, glass, paper, plastic, rubber, steel or wood; or
+    PART=NAME for parts, such as head=steel,handle=wood. Objects too thick for their material are hollow."""
     density: float | None = None
-    """kg/m^3, instead of a material. Without any, an object weighs 4 kg for each m^2 of its surface, but 500 to 2500
-    kg/m^3, and 0.5 kg at most."""
+    """Density in kg/m^3, instead of a material. Without both, the mass is 4 kg per m^2 of surface, within 500 to 2500
+    kg/m^3, and at most 0.5 kg."""
     mass: float | None = None
     """Mass in kg; a material or a density then only distributes it."""
     time_limit: float = 60.0
     """Seconds for the convex decomposition (CoACD) of one mesh; V-HACD takes over after it."""
     max_pieces: int = MAX_MESH_PIECES
-    """Most convex pieces of an object; more are merged."""
+    """Largest number of convex pieces of an object; more are merged."""
     cache_dir: str = ""
-    """Folder that remembers finished imports; empty means the user's cache folder."""
+    """Folder that caches finished imports; the user's cache folder if empty."""
 
 
 def check_options(options: ImportOptions) -> None:
-    """Raises a CongraspError for numbers that are not positive, and for two densities."""
+    """Raises a CongraspError for numbers that are not positive, and for both a material and a density."""
     for name in ("scale", "density", "time_limit", "max_pieces"):
         value = getattr(options, name)
         if value is not None and not value > 0:

@@ -11,15 +11,15 @@ from congrasp.common.objects.spec import MAX_MESH_VERTICES
 from congrasp.services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME
 
 DEPTH = 1.5e-3
-"""Metres that joining pieces may bury the surface, or stand out from it, while they are few enough."""
+"""Largest depth of the surface in a hull, or distance of the hull from it, for joins below the limit of pieces, m."""
 GROWTH = 0.02
-"""Share of the volume that joining pieces may add while they are few enough."""
+"""Share of the volume that joins may add below the limit of pieces."""
 SQUEEZE = 4e-4
-"""Metres that a side of a piece may be moved inwards."""
+"""Largest displacement of a side of a piece inwards, m."""
 _SAMPLES, _PROBES = 6000, 100  # points on the whole surface, and on the hull of two pieces
 _NEAR = 5e-4  # m; pieces whose boxes are nearer than this are neighbours
 _ON = 1e-4  # m; points of a hull that are nearer to a piece than this belong to it
-_LEAST = 1e-11  # m^3; a piece below is dust of the cutting
+_LEAST = 1e-11  # m^3; smaller pieces are dropped
 
 
 class _Join(NamedTuple):
@@ -36,10 +36,10 @@ class _Join(NamedTuple):
 
 
 class _Merger:
-    """Pieces by number, the neighbours of each, and the joins that could be made."""
+    """Pieces by number, the neighbours of each, and the possible joins."""
 
     def __init__(self, pieces: list[np.ndarray], triangles: np.ndarray, volume: float):
-        """See `merge`."""
+        """Takes the arguments of `merge`."""
         random = np.random.default_rng(0)
         self._surface = shapes.on_triangles(triangles, random.random((_SAMPLES, 3)))[0]
         self._tree = cKDTree(self._surface)
@@ -57,7 +57,7 @@ class _Merger:
                     self._consider(i, j)
 
     def reduce(self, max_pieces: int) -> None:
-        """Makes joins, cheapest first, until none is left or it would be too coarse for so few pieces."""
+        """Makes joins, cheapest first, until none is left; below the limit of pieces only those within tolerances."""
         grown = 0.0
         while self._joins:
             join = heapq.heappop(self._joins)
@@ -73,7 +73,7 @@ class _Merger:
             self._make(join)
 
     def _consider(self, i: int, j: int) -> None:
-        """Enters the join of two pieces, by the depth of the surface points that their hull buries."""
+        """Enters the join of two pieces, by the depth of the surface points in their hull."""
         a, b = self.hulls[i], self.hulls[j]
         hull = shapes.hull_of(np.concatenate([a.points[a.vertices], b.points[b.vertices]]))
         boxed = ((self._surface > hull.min_bound) & (self._surface < hull.max_bound)).all(-1)
@@ -81,7 +81,7 @@ class _Merger:
         self._push(False, i, j, depth, max(0.0, hull.volume - a.volume - b.volume), hull)
 
     def _check(self, join: _Join) -> None:
-        """Enters a join again, with how far its hull stands out from the surface where no piece of the region is."""
+        """Enters a join again, with the distance of its hull from the surface outside of the neighbouring pieces."""
         points, _, _ = shapes.on_triangles(join.hull.points[join.hull.simplices], self._probes)
         i, j = join.first, join.second
         for k in {i, j} | self._neighbors[i] | self._neighbors[j]:
@@ -95,7 +95,7 @@ class _Merger:
         heapq.heappush(self._joins, _Join(cost, checked, i, j, depth, growth, hull))
 
     def _make(self, join: _Join) -> None:
-        """Puts a hull in the place of two pieces."""
+        """Replaces two pieces by their hull."""
         i, j, new = join.first, join.second, self._count
         self._count += 1
         del self.hulls[i], self.hulls[j]
@@ -107,18 +107,18 @@ class _Merger:
 
 
 def merge(pieces: list[np.ndarray], max_pieces: int, triangles: np.ndarray, volume: float) -> list[np.ndarray]:
-    """Joins neighbouring convex pieces until `max_pieces` are left, and on while the shape stays as it is.
+    """Joins neighbouring convex pieces until `max_pieces` are left, and then while the shape is preserved.
 
-    A join costs what its hull adds in volume and how far it leaves the surface, each as a share of what is small enough
-    (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). How far is the depth of the deepest surface point inside of it, or the
-    distance from the surface of its farthest point, by samples. Pieces that do not touch are never joined, so that more
-    than `max_pieces` are left where so many bodies lie apart.
+    The cost of a join is the volume that its hull adds and its deviation from the surface, each as a share of the
+    tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of the deepest surface point in the
+    hull, or the distance of its farthest point from the surface, by samples. Pieces that do not touch are never joined,
+    so that more than `max_pieces` remain if there are more separate bodies.
 
     Args:
       pieces: vertices (V, 3) of each, m.
-      max_pieces: most pieces wanted.
-      triangles: (F, 3, 3) corners of the surface that they stand for, m.
-      volume: of the object, m^3.
+      max_pieces: largest number of pieces.
+      triangles: (F, 3, 3) corners of the surface that they approximate, m.
+      volume: volume of the object, m^3.
     """
     merger = _Merger(pieces, triangles, volume)
     merger.reduce(max_pieces)
@@ -132,7 +132,7 @@ def deepest(hull: ConvexHull, triangles: np.ndarray) -> float:
 
 
 def solid_hull(vertices: np.ndarray) -> ConvexHull | None:
-    """The convex hull of a piece (V, 3), or None if it has no volume worth keeping."""
+    """The convex hull of a piece (V, 3); None if its volume is negligible."""
     try:
         hull = shapes.hull_of(vertices)
     except QhullError:
@@ -168,9 +168,9 @@ def simplify(vertices: np.ndarray, max_vertices: int = MAX_MESH_VERTICES) -> np.
 
 
 def squeeze(vertices: np.ndarray, factor: float) -> np.ndarray:
-    """A piece (V, 3) made thinner by a factor, each side by `SQUEEZE` at most.
+    """A piece (V, 3) made thinner by a factor, each side by at most `SQUEEZE`.
 
-    Hulls of bent walls fill the inner side of the bend; thinner ones are right on average.
+    Hulls of bent walls fill the inner side of the bend; thinner ones have the right mean thickness.
     """
     middle = vertices.mean(0)
     axis = np.linalg.svd(vertices - middle, full_matrices=False)[2][-1]

@@ -21,7 +21,7 @@ def cut_to_hold(obj: GraspObject) -> GraspObject:
     """An object of two halves with the first partition that is covered in all resting poses, or in the most.
 
     Its current halves come first, then their exchange, then cuts across the longest axis that make the graspable half
-    larger or smaller. Its notes say where no half can be held in any resting pose.
+    larger or smaller. If no half can be held in any resting pose, a note is added.
     """
     most = int(covered(obj, use_affordance=False).sum())
     best, score = obj, -1
@@ -47,7 +47,7 @@ def covered(obj: GraspObject, *, use_affordance: bool = True) -> np.ndarray:
 
 
 def _candidates(obj: GraspObject) -> Iterator[GraspObject]:
-    """The object with its own partition, and with others."""
+    """Yields the object with its current partition, then with others."""
     yield obj
     first = int(np.flatnonzero(obj.graspable)[0])
     for cut in _CUTS:

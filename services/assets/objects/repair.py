@@ -7,8 +7,8 @@ from scipy.sparse.csgraph import connected_components
 
 MAX_FACES = 20_000
 """Triangles beyond which a mesh is reduced before anything else is done with it."""
-_REDUCED = 200_000  # of those that come in millions, before their triangles are looked at one by one
-_FEW = 0.05  # share of a mesh that may be missing without changing what it is
+_REDUCED = 200_000  # triangles above which a mesh is reduced before other checks
+_FEW = 0.05  # share of a mesh that may be missing
 _APART = 0.02  # of the mesh's size: bodies whose boxes are nearer than this belong together
 
 
@@ -26,7 +26,7 @@ def without_gaps(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> t
 
 
 def reduced(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh with far too many triangles, with fewer of them; its vertices are merged on the way."""
+    """A mesh of more than `_REDUCED` triangles with fewer of them, and with merged vertices."""
     if len(faces) <= _REDUCED:
         return vertices, faces
     before = len(faces)
@@ -59,7 +59,7 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     high = np.maximum.reduceat(vertices[order], starts) + _APART / 2 * mesh.scale
     body = np.arange(count)
     sizes = np.linalg.norm(high - low, axis=-1)
-    for i in np.argsort(-sizes):  # from the largest on, whatever touches what it has gathered joins it
+    for i in np.argsort(-sizes):  # from the largest on, bodies in contact are merged
         touching = (low[i] <= high).all(-1) & (low <= high[i]).all(-1)
         body[np.isin(body, body[touching])] = body[i]
     if len(np.unique(body)) == 1:
@@ -85,7 +85,7 @@ def _components(faces: np.ndarray, count: int) -> tuple[int, np.ndarray]:
 
 
 def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
-    """The mesh with small holes closed and its triangles facing outwards, where that can be done."""
+    """The mesh with small holes closed and its triangles facing outwards, if possible."""
     holes = _loops(mesh)
     if holes:
         filled = _filled(mesh, holes)
@@ -125,7 +125,7 @@ def _loops(mesh: trimesh.Trimesh) -> list[np.ndarray]:
             end = ends.pop()
             if not ends:
                 del after[path[-1]]
-            if end in path:  # holes that meet in one vertex are holes of their own
+            if end in path:  # holes that meet in one vertex are separate holes
                 first = path.index(end)
                 loops.append(np.array(path[first:]))
                 del path[first:]
@@ -153,19 +153,19 @@ def _wound_alike(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     common = np.asarray(mesh.face_adjacency_edges)
 
     def along(side: int) -> np.ndarray:
-        """(n,) whether triangles run along the common edge from its first to its second vertex."""
+        """(n,) bool, True for triangles that run along the common edge from its first to its second vertex."""
         own = faces[pairs[:, side]]
         place = (own == common[:, :1]).argmax(1)
         return own[np.arange(len(own)), (place + 1) % 3] == common[:, 1]
 
     differ = along(0) == along(1)
-    # Two copies of every triangle, as it is and turned: neighbours that run alike join the other's opposite copy.
+    # Two copies of every triangle, unchanged and turned: neighbours that run alike join the other's opposite copy.
     count = len(faces)
     first = np.concatenate([pairs[:, 0], pairs[:, 0] + count])
     second = np.concatenate([pairs[:, 1] + count * differ, pairs[:, 1] + count * ~differ])
     graph = coo_matrix((np.ones(len(first), bool), (first, second)), (2 * count, 2 * count))
     _, labels = connected_components(graph, directed=False)
-    # Of the two copies of a body one label is taken for all its triangles, the one that most of them have as they are.
+    # Of the two copies of a body, the one in which more triangles are unchanged is used.
     lower = np.minimum(labels[:count], labels[count:])
     turned = labels[:count] != lower
     total = np.bincount(lower, minlength=labels.max() + 1)

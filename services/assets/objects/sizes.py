@@ -10,12 +10,12 @@ from congrasp.common.errors import CongraspError
 Unit = Literal["auto", "guess", "m", "cm", "mm", "in"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
-_PLAUSIBLE = (0.01, 0.6)  # m, longest side of what is taken as metres without asking
-_POSSIBLE = (0.005, 1.0)  # m, of what a unit that was named may lead to
-_LIKELY = (0.02, 0.4)  # m, of what makes a unit worth proposing
+_PLAUSIBLE = (0.01, 0.6)  # m, longest side for which metres are assumed
+_POSSIBLE = (0.005, 1.0)  # m, longest side that a unit of the user may give
+_LIKELY = (0.02, 0.4)  # m, longest side for which a unit is proposed
 _THINNEST = 2e-4  # m
 _SCALES = ((0.01, 1000.0, "mm"), (1.0, 100.0, "cm"), (1000.0, 1.0, "m"))
-"""Up to which length (m) which unit suits, and how many of it are a metre."""
+"""Upper end of the lengths (m) shown in a unit, number of these units in a metre, and the unit."""
 _COMMON = (
     (0.015, "a pea"),
     (0.03, "a grape"),
@@ -33,11 +33,11 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
     """Metres per unit of a file, with the scale.
 
     Args:
-      path: the file, for what is said.
-      sides: the three sides of its mesh, in its own unit.
-      unit: what its numbers are; see `ImportOptions.unit`.
+      path: the file, for messages.
+      sides: the three sides of its mesh, in the file's unit.
+      unit: unit of its numbers; see `ImportOptions.unit`.
       scale: factor on the size, after the unit.
-      notes: what the user should know is added to it.
+      notes: a guess of the unit is appended.
 
     Raises:
       CongraspError: no hand can grasp an object of that size; the remedy is the unit that would fit.
@@ -73,10 +73,10 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
 
 
 def guessed_unit(path: object, sides: tuple[float, float, float]) -> str:
-    """The unit that makes an object for a hand of a mesh with these sides; empty if several do.
+    """The unit in which a mesh with these sides is an object for a hand; empty unless exactly one is likely.
 
     Raises:
-      CongraspError: none does.
+      CongraspError: there is no such unit.
     """
     longest = max(sides)
     if _PLAUSIBLE[0] <= longest <= _PLAUSIBLE[1]:
@@ -91,7 +91,7 @@ def guessed_unit(path: object, sides: tuple[float, float, float]) -> str:
 
 
 def sizes_by_unit(sides: tuple[float, float, float]) -> dict[str, tuple[str, bool]]:
-    """For each unit that a mesh of these sides may have: its size for people, and whether a hand could grasp that."""
+    """For each possible unit of a mesh with these sides: its size as text, and True if a hand could grasp it."""
     return {
         unit: (_size([side * factor for side in sides]), _POSSIBLE[0] <= max(sides) * factor <= _POSSIBLE[1])
         for unit, factor in METRES.items()
@@ -99,19 +99,19 @@ def sizes_by_unit(sides: tuple[float, float, float]) -> dict[str, tuple[str, boo
 
 
 def _size(sides: Sequence[float]) -> str:
-    """Three sides in metres, all in the unit that suits the longest."""
+    """Formats sides, in m, with the unit that suits the longest."""
     longest = max(sides)
     factor, unit = next(((f, u) for limit, f, u in _SCALES if longest < limit), (1e-3, "km"))
     return f"{' x '.join(f'{side * factor:.3g}' for side in sides)} {unit}"
 
 
 def length(metres: float) -> str:
-    """A length with a unit that suits it."""
+    """Formats a length, in m, with a suitable unit."""
     return _size([metres])
 
 
 def size_in_words(sides: Sequence[float] | np.ndarray) -> str:
-    """Three sides, given in metres, in cm, and something about as long."""
+    """Formats three sides, in m, as cm, with a common object of similar length."""
     longest = max(sides)
     like = next((name for limit, name in _COMMON if longest < limit), "an arm")
     return f"{' x '.join(f'{100 * side:.1f}' for side in sides)} cm, about as long as {like}"

@@ -15,9 +15,9 @@ from congrasp.services.assets.objects.headers import MAX_FACES, check_header
 from congrasp.services.assets.objects.kinds import CONVERT, SUFFIXES, kind_of
 
 _GRASPABLE_WORDS = ("handle", "grip", "neck", "stem", "shaft", "body")
-# GraspXL marks the absence of a non-graspable part by a cube of 1 cm here (m).
+# GraspXL marks the absence of a non-graspable part by a cube of 1 cm at this position (m).
 _NO_PART = 0.346408
-_FARTHEST = 1e12  # a coordinate in the file's unit: squares and products of those of a mesh stay finite
+_FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and products are finite
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,11 +39,11 @@ class Source:
     name: str
     path: pathlib.Path
     visuals: tuple[MeshFile, ...]
-    """The surface; part files where these are the surface themselves."""
+    """The surface; the part files if they form the surface together."""
     pieces: tuple[MeshFile, ...] = ()
     """Convex pieces, if it is already decomposed."""
     parts: tuple[MeshFile, ...] = ()
-    """Meshes that show which part of the surface is which."""
+    """Meshes of the parts of the surface."""
 
     @property
     def parts_are_pieces(self) -> bool:
@@ -141,7 +141,7 @@ def load_geometry(path: pathlib.Path, remedy: str, **options: Any) -> Any:
 
 
 def _nested(folder: pathlib.Path) -> list[Source]:
-    """The objects of a folder's own meshes; those of folders below it do not count."""
+    """The objects of the meshes directly in a folder, without those of folders below it."""
     meshes = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
     return _in_folder(folder, meshes) if meshes else []
 
@@ -168,12 +168,12 @@ def _in_folder(folder: pathlib.Path, meshes: list[pathlib.Path]) -> list[Source]
 
 
 def _part(file: pathlib.Path, part: str) -> MeshFile:
-    """The file of a part, graspable where its name is that of a handle."""
+    """The file of a part, which is graspable if its name is that of a handle."""
     return MeshFile(file, "part", part, any(word in part.lower() for word in _GRASPABLE_WORDS))
 
 
 def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
-    """The graspable and the non-graspable file, or none; one of them suffices."""
+    """The graspable file and, if there is one, the non-graspable one; empty without a graspable file."""
     found: dict[bool, pathlib.Path] = {}
     for file in meshes:
         stem = file.stem.lower()
@@ -190,6 +190,6 @@ def _two_parts(meshes: list[pathlib.Path]) -> tuple[MeshFile, ...]:
 
 
 def safe_name(text: str) -> str:
-    """A text as the name of an object, which can be a file name."""
+    """A text as the name of an object, which is valid as a file name."""
     safe = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "_" for c in text).lstrip("._-")
     return safe[:LONGEST_NAME] or "object"

@@ -219,6 +219,7 @@ def test_numbers_that_are_none(folder, option):
         ArmPlanner(ArmOptions(arm=str(folder / "seven.xml"), **{option: "1 2"}), get_hand("allegro"))
 
 
+@pytest.mark.slow
 def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
     shared = [str(folder / "block.stl"), "--hand", "allegro", "--attempts", "8", "--cache-dir", str(folder)]
     shared += ["--arm", str(folder / "seven.xml"), "--out", str(tmp_path)]

@@ -62,6 +62,7 @@ def columns(whole) -> dict[str, np.ndarray]:
     return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_and_parts_make_the_same_shards(whole, tmp_path):
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)

@@ -61,6 +61,7 @@ def test_the_command_measures_rows_by_the_protocol(policy, tmp_path, capsys, mon
         assert sample.torque.shape == (row["episodes"], 25, 20) and 0.0 < sample.torque.max() <= 1.0
 
 
+@pytest.mark.slow
 def test_the_exam_has_a_row_of_the_hands_centre_alone_and_rows_of_loads(evaluator):
     told = []
     row, rules = evaluator.row_by_center(3, told.append)
@@ -95,6 +96,7 @@ def test_a_pool_that_never_allows_a_constraint_is_an_error(evaluator, monkeypatc
         evaluator.episode("trajectory+affordance")
 
 
+@pytest.mark.slow
 def test_an_episode_to_look_at_is_one_of_so_many_attempts(evaluator):
     """The pool has three objects, so that a batch is larger than one attempt, and smaller than nine."""
     for attempts in (1, 9):

@@ -44,6 +44,7 @@ def test_what_slips_in_a_lift_is_measured_from_the_wrist():
     assert cause(lifted, 0.05) == "slipped 0.03 s after the lift began"
 
 
+@pytest.mark.slow
 def test_failures_of_an_untrained_policy_are_drawn():
     config = get_preset("quickstart")
     policy = untrained(dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,))))

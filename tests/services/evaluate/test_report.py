@@ -102,6 +102,7 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
         main.run([*command, "--check", str(tmp_path / "check.json")])
 
 
+@pytest.mark.slow
 def test_the_command_evaluates_draws_and_writes(tmp_path):
     config = RunConfig(task=TaskConfig(constraints=("heading",)), network=NetworkConfig(hidden=(8,), encoder=4))
     bundles.save(untrained(config), tmp_path / "mine.safetensors")

@@ -31,6 +31,7 @@ def policy(tmp_path_factory):
 
 
 @pytest.mark.timeout(600)
+@pytest.mark.slow
 def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, tmp_path, capsys, monkeypatch):
     command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy), "--out", str(tmp_path)]
     command += ["--episodes", "2", "--pool", "2", "--physics", "native"]

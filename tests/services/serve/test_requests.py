@@ -1,5 +1,6 @@
 """Queries: where their fields land, what is completed, and what is refused."""
 
+import dataclasses
 import os
 
 import jax
@@ -15,6 +16,7 @@ from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
+from congrasp.common.task.normals import estimated_normals
 from congrasp.common.wire.codec import Message
 from congrasp.services.serve.requests import Layout
 
@@ -184,3 +186,50 @@ def test_a_bad_query_of_a_batch_spoils_no_other():
     for name, value in fields.items():
         np.testing.assert_allclose(np.asarray(value)[[0, 2]], alone[name][None].repeat(2, 0), atol=1e-6, err_msg=name)
         assert np.isfinite(value).all()
+
+
+CLOSER = TaskConfig(constraints=("heading",), surface_points=8, trajectory_points=3, surface_normals=True)
+UP = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (8, 1))
+
+
+def normals_of(task=CLOSER, **changes):
+    """The normals with which a policy computes features for a query."""
+    layout = Layout(HAND, task)
+    points = "cloud" if task.observation == "camera" else "surface_points"
+    given_arrays = {name: value for name, value in arrays(**changes).items() if name in {*layout.shapes, *changes}}
+    if points == "cloud":
+        given_arrays = {n: x for n, x in given_arrays.items() if "object" not in n} | {points: changes[points]}
+    query = layout.parse(Message(given_arrays, {"constraints": ["heading"]}))
+    fields, checks = layout.complete(query.vectors)
+    if error := layout.find_error(query, np.asarray(checks)):
+        raise error
+    return np.asarray(layout.surface(fields).normals[0])
+
+
+def test_given_normals_are_used_and_missing_ones_are_estimated():
+    points = np.random.default_rng(1).normal(size=(8, 3)).astype(np.float32)
+    np.testing.assert_array_equal(normals_of(surface_points=points, surface_normals=UP), UP)
+    estimated = np.asarray(estimated_normals(points[None]))[0]
+    np.testing.assert_allclose(normals_of(surface_points=points), estimated, atol=1e-5)
+    axes = np.eye(3)[np.arange(8) % 3]
+    twice = {"surface_points": np.repeat(points, 2, 0), "surface_normals": np.repeat(axes, 2, 0)}
+    np.testing.assert_array_equal(normals_of(**twice, surface_avoid=None), axes)
+    # A policy that does not observe normals ignores them.
+    assert "surface_normals" not in parse(surface_normals=UP)[1]
+
+
+@pytest.mark.parametrize(
+    ("normals", "error"),
+    [(2.0 * UP, "'surface_normals' has length 2.000, not 1"), (UP[:5], r"shape \(5, 3\); it must be \(8, 3\)")],
+)
+def test_normals_that_are_none_are_named(normals, error):
+    with pytest.raises(CongraspError, match=error):
+        normals_of(surface_normals=normals)
+
+
+def test_estimated_normals_of_a_cloud_point_toward_its_camera():
+    task = dataclasses.replace(CLOSER, observation="camera")
+    sheet = np.random.default_rng(2).uniform(-0.05, 0.05, (8, 3)) * [1, 1, 0]
+    for side in (1.0, -1.0):
+        found = normals_of(task, cloud=sheet, camera_position=np.array([0.1, 0.0, side]))
+        np.testing.assert_allclose(found, side * UP, atol=1e-3)

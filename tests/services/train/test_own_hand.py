@@ -162,6 +162,7 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.slow
 def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(hand, monkeypatch, tmp_path):
     out = tmp_path / "out"
     out.mkdir()

@@ -76,6 +76,7 @@ def test_a_known_answer_comes_back(run_import, tmp_path):
 
 
 @pytest.mark.parametrize("headings", ["sampled", "demonstrated"])
+@pytest.mark.slow
 def test_a_fifth_of_all_sequences_is_held_out_though_each_has_an_object_of_its_own(run_import, tmp_path, headings):
     for seed, name in enumerate("abcde"):
         case = known.make(f"MyoHand_{name}_lift", name, seed)

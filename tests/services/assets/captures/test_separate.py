@@ -60,6 +60,7 @@ def test_followers_still_follow():
 
 
 @pytest.mark.parametrize("name", ["human", "sharpa"])
+@pytest.mark.slow
 def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
     hand, rng = get_hand(name), np.random.default_rng(3)
     share = rng.uniform(0.0, 1.0, (12, 1))

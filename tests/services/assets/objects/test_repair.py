@@ -113,6 +113,7 @@ def test_two_bodies(brought):
     assert not said
 
 
+@pytest.mark.slow
 def test_millions_of_triangles(brought, monkeypatch):
     monkeypatch.setattr(repair, "_REDUCED", 20_000)
     monkeypatch.setattr(repair, "MAX_FACES", 2_000)

@@ -1,0 +1,250 @@
+"""The single driver of control steps, for training, evaluation, attempts and benchmarks."""
+
+import concurrent.futures
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from congrasp.actors import harvest
+from congrasp.actors.env import EnvState
+from congrasp.actors.harvest import Grasps
+from congrasp.actors.initial import InitialConditions
+from congrasp.actors.physics.engine import Physics
+from congrasp.actors.rollout import ActFunction, Probe, Rollout, Traced, no_probe, programs_of, rollout_of, row_of
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task.config import RewardWeights, TaskConfig
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.types import Array
+
+
+class RolloutWorker:
+    """Environments that continue from one rollout to the next."""
+
+    def __init__(
+        self,
+        hand: Hand,
+        task: TaskConfig,
+        physics: Physics,
+        bank: ConstraintBank | None,
+        policy: ActFunction,
+        *,
+        batch: int,
+        seed: int,
+        half_precision: bool,
+        probe: Probe = no_probe,
+        traced: Traced = "first",
+        staggered: bool = False,
+        taught: bool = False,
+        privileged: Sequence[GraspObject] = (),
+    ):
+        """Creates the worker, and starts episodes if there is a bank.
+
+        Args:
+          hand: the hand.
+          task: the task.
+          physics: the engine, with the objects of the bank.
+          bank: constraint bank of the episodes; without one, `begin` sets the episodes, which do not restart at their
+            end.
+          policy: a pure function; `collect` passes its parameters.
+          batch: number B of environments.
+          seed: seed of episodes and actions.
+          half_precision: rounds observations to half precision, for the policy and for the learner.
+          probe: computes additional values to record at every step.
+          traced: environments whose trace is recorded.
+          staggered: ends the first episodes early at different times, so that short rollouts then contain all phases of
+            the task.
+          taught: records `Rollout.teacher_observation`.
+          privileged: the engine's objects, if `Rollout.privileged` is recorded.
+        """
+        self.programs = programs_of(
+            hand,
+            task,
+            physics,
+            policy,
+            batch=batch,
+            half_precision=half_precision,
+            probe=probe,
+            traced=traced,
+            taught=taught,
+        )
+        self.physics, self.env, self.batch = physics, self.programs.env, batch
+        self._hand, self._task, self._bank, self._staggered = hand, task, _on_device(bank), staggered
+        self._settings, self._stationary = self.env.settings, np.array(False)
+        if privileged:
+            self.adjust(masses=_masses(privileged))
+        self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
+        self.state: EnvState | None = None
+        if bank is not None:
+            self.restart()
+
+    def adjust(self, **settings: Any) -> None:
+        """Changes `Settings` by name from the next control step on; new types or shapes are recompiled."""
+        self._settings = self._settings._replace(**settings)
+
+    def configure(self, weights: RewardWeights, *, stationary: bool) -> None:
+        """Sets the reward weights, and whether the objects of episodes that start from now on are fixed."""
+        self._settings, self._stationary = self._settings._replace(weights=weights), np.array(stationary)
+
+    def replace_objects(self, objects: Sequence[GraspObject], bank: ConstraintBank | None) -> None:
+        """Replaces the objects by as many others, with their bank, for episodes that start from now on."""
+        physics = self.physics.replace_objects(self.state.physics if self.state else None, objects)
+        self._bank = _on_device(bank)
+        if self._settings.masses is not None:
+            self.adjust(masses=_masses(objects))
+        if self.state is not None:
+            self.state = self.state._replace(physics=physics if self.physics.compiled else None)
+            self.take_grasps()
+
+    def restart(self) -> None:
+        """Starts new episodes in every environment."""
+        self._episode_key, key = _split(self._episode_key)
+        conditions = self.programs.sample(self._bank, key, self._stationary)
+        if self._staggered:
+            whole = self._task.approach_steps + np.asarray(conditions.hold)
+            share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
+            conditions = conditions._replace(hold=_on_device(np.int32(conditions.hold - np.floor(share * whole))))
+        self.begin(conditions)
+
+    def begin(self, conditions: InitialConditions) -> None:
+        """Starts these episodes, one in each environment."""
+        kept, conditions = self.state, _on_device(conditions)
+        if self.physics.compiled:
+            self.state = self.programs.begin(conditions, _on_device(kept))
+            return
+        if kept is None:
+            self.physics.start(conditions.reset_state)
+        else:
+            self.physics.reset(None, np.ones(self.batch, bool), conditions.reset_state)
+        state = self.programs.begin(conditions, None)
+        self.state = self.programs.with_scene(state._replace(views=None), self.physics.read(None))
+        if kept is not None:
+            self.state = self.state._replace(grasps=kept.grasps)
+
+    def renew(self, mask: np.ndarray, conditions: InitialConditions) -> None:
+        """Starts these episodes in the masked environments (B,)."""
+        assert self.state is not None, "call `begin` first"
+        conditions = _on_device(conditions)
+        if self.physics.compiled:
+            self.state = self.programs.restart(self.state, mask, conditions)
+            return
+        self.physics.reset(None, mask, conditions.reset_state)
+        state = self.programs.merge(self.state._replace(views=None), mask, conditions)
+        self.state = self.programs.with_scene(state, self.physics.read(None))
+
+    def observe(self) -> Array:
+        """Observation (B, D) of the current control step by the policy."""
+        return self.programs.look(self.state, self._settings).observation
+
+    def compile(self, parameters: Any, steps: int) -> None:
+        """Compiles the programs of `collect` and `renew_references` without running them; for compiled engines.
+
+        Args:
+          parameters: parameters of the policy, as for `collect`.
+          steps: number T of steps.
+        """
+        given, grasps = self._scan_arguments(parameters, self._key), self.state.grasps if self.state else None
+        programs = [self.programs.scan.lower(*given, steps=steps)]
+        programs.append(harvest.renew.lower(self._hand, self._task, self._bank, grasps, self._key))
+        with concurrent.futures.ThreadPoolExecutor(len(programs)) as threads:
+            list(threads.map(lambda program: program.compile(), programs))
+
+    @property
+    def bank(self) -> ConstraintBank:
+        """Current constraint bank of the episodes."""
+        assert self._bank is not None, "these episodes are given"
+        return self._bank
+
+    def weigh_objects(self, weight: np.ndarray) -> None:
+        """Sets the weights (N,) with which episodes that start from now on draw objects."""
+        self._bank = self.bank._replace(weight=jnp.asarray(weight, jnp.float32))
+
+    def renew_references(self) -> None:
+        """Stores the grasps that succeeded since the last call as reference poses in the bank."""
+        self._key, key = _split(self._key)
+        self._bank = harvest.renew(self._hand, self._task, self.bank, self.take_grasps(), key)
+
+    def take_grasps(self) -> Grasps:
+        """Returns the grasps that succeeded since the last call."""
+        assert self.state is not None, "call `begin` first"
+        grasps = self.state.grasps
+        self.state = self.state._replace(grasps=grasps._replace(found=_on_device(np.zeros(self.batch, bool))))
+        return grasps
+
+    def collect(self, parameters: Any, steps: int, progress: Callable[[int], None] = lambda step: None) -> Rollout:
+        """Simulates the next `steps` control steps with these policy parameters.
+
+        Args:
+          parameters: parameters of the policy.
+          steps: number T of steps.
+          progress: called with the number of completed steps, by engines that are not compiled.
+        """
+        assert self.state is not None, "call `begin` first"
+        self._key, key = _split(self._key)
+        self.state = _on_device(self.state._replace(has_finished=np.zeros(self.batch, bool)))
+        if self.physics.compiled:
+            return self._collect_compiled(parameters, key, steps)
+        return self._collect_stepwise(parameters, key, steps, progress)
+
+    def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
+        """Collects a rollout with an engine that JAX cannot trace; see `collect`."""
+        # One more key than steps: the decision after the last step only yields `last_observation`.
+        keys = jax.random.split(key, steps + 1)
+        key_data = np.asarray(jax.random.key_data(keys))
+        parameters, settings = _on_device((parameters, self._settings))
+        assert self.state is not None
+        decision = self.programs.decide(parameters, settings, self.state, keys[0])
+        state = self.state._replace(views=None)
+        rows: list[dict[str, Any]] = []
+        extras = []
+        for step in range(1, steps + 1):
+            _, physics_state = self.physics.step(None, *map(np.asarray, decision.command))
+            decided = decision
+            changed, transition, kept, decision = self.programs.advance(
+                parameters, settings, state, physics_state, decision, key_data[step]
+            )
+            state = state._replace(**changed)
+            rows.append(row_of(decided.seen, decided.action, decided.log_probability, transition))
+            extras.append(kept)
+            if self._bank is not None and np.asarray(transition.terminal).any():
+                self._episode_key, episode_key = _split(self._episode_key)
+                fresh = self.programs.sample(self._bank, episode_key, self._stationary)
+                self.physics.reset(None, transition.terminal, fresh.reset_state)
+                state = self.programs.merge(state, transition.terminal, fresh)
+                physics_state = self.physics.read(None)
+                decision = self.programs.decide(
+                    parameters, settings, self.programs.with_scene(state, physics_state), keys[step]
+                )
+            progress(step)
+        self.state = self.programs.with_scene(state, physics_state)
+        columns, (trace, probed) = jax.tree.map(lambda *x: np.stack(x), *zip(rows, extras, strict=True))
+        return rollout_of(self.state, columns, decision.seen, trace, probed)
+
+    def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
+        """Collects a rollout as one program; see `collect`."""
+        (self.state, self._episode_key), rollout = self.programs.scan(
+            *self._scan_arguments(parameters, key), steps=steps
+        )
+        return rollout
+
+    def _scan_arguments(self, parameters: Any, key: Array) -> tuple[Any, ...]:
+        """Arguments of `_scan` except for the steps."""
+        parameters, bank, carry = _on_device((parameters, self._bank, (self.state, self._episode_key)))
+        return parameters, self._settings, self._stationary, bank, carry, key
+
+
+def _on_device(tree: Any) -> Any:
+    """Commits the arrays to this process's device: uncommitted ones would cause another compilation."""
+    return jax.device_put(tree, jax.local_devices()[0])
+
+
+def _masses(objects: Sequence[GraspObject]) -> Array:
+    """Masses (N,) in kg."""
+    return _on_device(np.array([obj.mass for obj in objects], np.float32))
+
+
+_split = jax.jit(lambda key: tuple(jax.random.split(key)))
+"""Two random keys, in one call."""

@@ -1,0 +1,61 @@
+"""Random draws from uniform numbers.
+
+A reset needs hundreds of numbers for dozens of purposes. Each call of a generator would compile into a program of its
+own, so all numbers come from one call, and the functions below turn them into draws.
+"""
+
+import zlib
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from congrasp.common.task.types import Array
+
+_LEAST = 2.0**-24
+"""Half the step between two uniform numbers in single precision."""
+
+
+def uniforms(key: Array, numbers: Mapping[str, int], batch: int) -> dict[str, Array]:
+    """Random numbers (B, U) in [0, 1) by name, where U is given for each.
+
+    Those of a name depend on the key, the name and U's row alone, not on the other names.
+
+    Args:
+      key: random key.
+      numbers: U by name.
+      batch: B.
+    """
+    widest = max(numbers.values())
+    seeds = np.array([zlib.crc32(name.encode()) for name in numbers], np.uint32)
+
+    def drawn(seed: Array) -> Array:
+        return jax.random.uniform(jax.random.fold_in(key, seed), (widest, batch))
+
+    # Rows are drawn for a name's largest number, so that a narrower one keeps its numbers.
+    blocks = jax.vmap(drawn)(seeds)
+    return {name: blocks[i, :count].T for i, (name, count) in enumerate(numbers.items())}
+
+
+def normal(uniform: Array) -> Array:
+    """Standard normal numbers of uniform ones in [0, 1), of the same shape."""
+    return jax.scipy.special.ndtri(jnp.maximum(uniform, _LEAST))
+
+
+def index(uniform: Array, count: Array | int) -> Array:
+    """Indices below `count` (int), each as likely, of uniform numbers in [0, 1)."""
+    return jnp.minimum((uniform * count).astype(jnp.int32), jnp.asarray(count, jnp.int32) - 1)
+
+
+def weighted(uniform: Array, weights: Array) -> Array:
+    """Indices (B,) int of weights (N,), as likely as these, of uniform numbers (B,)."""
+    total = jnp.cumsum(jnp.asarray(weights))
+    chosen = jnp.searchsorted(total, total[-1] * uniform, side="right")
+    return jnp.minimum(chosen, len(total) - 1).astype(jnp.int32)  # rounding may reach the upper bound
+
+
+def among(uniform: Array, allowed: Array) -> Array:
+    """Indices (B,) int of true flags (B, N), each as likely, of uniform numbers (B,); 0 where no flag is true."""
+    rank = jnp.cumsum(allowed, -1)
+    return jnp.argmax(rank > index(uniform, rank[:, -1])[:, None], -1)
