@@ -83,7 +83,11 @@ def sample(
     uniform = _uniforms(hand, task, key, batch)
     episode = uniform[_TRAINING].T
     objects, rests = chance.weighted(episode[0], bank.weight), chance.index(episode[1], bank.rest.shape[1])
-    wanted = {c.name: uniform[c.name][:, 0] < getattr(task, f"p_{c.name}") for c in optional(task)}
+    # A constraint that is never requested is a constant, so that its share of the program is not even compiled.
+    wanted = {
+        c.name: uniform[c.name][:, 0] < share if (share := getattr(task, f"p_{c.name}")) else jnp.zeros(batch, bool)
+        for c in optional(task)
+    }
     if "affordance" in wanted and "trajectory" in wanted:
         wanted["trajectory"] |= active_blocks(wanted)["affordance"] & (episode[2] < task.p_together)
     disturbance = None

@@ -33,8 +33,8 @@ def uniforms(key: Array, numbers: Mapping[str, int], batch: int) -> dict[str, Ar
     def drawn(seed: Array) -> Array:
         return jax.random.uniform(jax.random.fold_in(key, seed), (widest, batch))
 
-    # Rows are drawn for a name's largest number, so that a narrower one keeps its numbers.
-    blocks = jax.vmap(drawn)(seeds)
+    # Without the barrier, XLA would compute a number again wherever it is used, thirty times in the longest loops.
+    blocks = jax.lax.optimization_barrier(jax.vmap(drawn)(seeds))
     return {name: blocks[i, :count].T for i, (name, count) in enumerate(numbers.items())}
 
 

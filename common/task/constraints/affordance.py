@@ -22,7 +22,7 @@ from congrasp.common.task.constraints.base import (
 )
 from congrasp.common.task.constraints.heading import HeadingGoal
 from congrasp.common.task.constraints.markers import Marker, Paint
-from congrasp.common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, square, squash
+from congrasp.common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, squash
 from congrasp.common.task.sampling.headings import INWARD, MAX_WIDTH
 from congrasp.common.task.types import Array, Goal, Surface
 
@@ -258,10 +258,18 @@ def _spread(which: Array) -> Array:
 
 def _broken(hand: Hand, surface: Surface, headings: HeadingGoal) -> Array:
     """Number (B, n) of rules that headings (B, n, 3) violate, see `redirected`."""
-    offset = surface.points[:, None] - headings.position[:, :, None]
-    depth = jnp.sum(offset * headings.direction[:, :, None], -1)
-    along = jnp.sum(offset * headings.cross[:, :, None], -1)
-    squared = square(offset)
+    # By coordinates, so that the loops over the surface points, the longest of a reset, run along memory.
+    offset = [
+        point[:, None] - position[..., None]
+        for point, position in zip(
+            jnp.moveaxis(surface.points, -1, 0), jnp.moveaxis(headings.position, -1, 0), strict=True
+        )
+    ]
+    depth, along = (
+        sum(way * axis[..., None] for way, axis in zip(offset, jnp.moveaxis(axes, -1, 0), strict=True))
+        for axes in (headings.direction, headings.cross)
+    )
+    squared = sum(way * way for way in offset)
     from_line = squared - depth**2
     inward, avoid = hand.object_scale * INWARD, surface.avoid[:, None]
     before = (depth < -inward - 1.5 * _TUBE) & (depth > -REACH - inward)
