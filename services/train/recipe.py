@@ -76,6 +76,7 @@ def recipe(hand: Hand) -> RunConfig:
             p_force=0.25,
             p_together=0.45,  # trajectory and affordance in 15 % of the episodes (Allegro: 17), without it in 8 (9)
             hold_steps_max=200,
+            surface_normals=True,
             disturbed_references=0.5,
             mass_range=(0.6, 2.4),
             friction_range=(0.6, 1.2),
