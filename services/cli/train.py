@@ -34,7 +34,7 @@ def train(
     listen: str | None = None,
     certs: pathlib.Path | None = None,
     insecure: bool = False,
-    evaluation: int | None = None,
+    evaluation: int = 192,
     metric_writers: tuple[MetricWriter, ...] = ("tensorboard",),
     metrics_port: int = 0,
 ) -> int:
@@ -45,7 +45,8 @@ def train(
 
     Args:
       config: The run.
-      preset: Named configuration to start from: quickstart, full, human, allegro or sharpa.
+      preset: Named configuration to start from: quickstart, full, human, allegro or sharpa; or check, which trains
+        nothing and shows in half a minute that physics, messages, log, server and pictures work here.
       method: Method whose settings are used: ours, a baseline or ablation of the paper (graspxl, dgrasp,
         no-dynamic-center, no-feedforward, two-phase, single-stage), or a policy for robots (student, with a tracker;
         camera, with a depth camera). By default that of the preset, ours.
@@ -68,14 +69,14 @@ def train(
       listen: Endpoint for actors of other machines, such as tls/0.0.0.0:7447; by default only this machine can join.
       certs: The authority's folder (congrasp certs), for mutual TLS.
       insecure: Listen beyond loopback without certificates.
-      evaluation: Episodes of the evaluation before and after training, for each of three seeds; 0 leaves it out. By
-        default 64, and before training for the quickstart preset alone.
+      evaluation: Episodes of the evaluation after training, on held-out objects; 0 leaves it out.
       metric_writers: Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there,
         for `wandb sync`), wandb (needs an account); without a name, none.
       metrics_port: Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none.
 
     Examples:
       congrasp train --preset quickstart --run-dir runs/mine
+      congrasp train --preset check
       congrasp train --preset human --run-dir runs/human --seed 5
     """
     from congrasp.services.train.command import run_training
@@ -92,8 +93,7 @@ def train(
         actors=actors,
         resume=resume,
         initial=initial,
-        evaluation=64 if evaluation is None else evaluation,
-        compared=evaluation is not None or preset == "quickstart",
+        evaluation=evaluation,
         ranks=ranks,
         writers=metric_writers,
         metrics_port=metrics_port,

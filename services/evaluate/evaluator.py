@@ -287,12 +287,6 @@ class Evaluator:
             objects=objects or [obj.name for obj in self.objects],
         )
 
-    def draws(self, name: str, episodes: int, count: int) -> list[Row]:
-        """Evaluates `count` rows of `episodes` each from independent draws, to estimate their variance."""
-        sample = self.samples([name], episodes * count)[name]
-        order = np.arange(len(sample.values["success"])) // episodes
-        return [self.row(name, sample.where(order == i)) for i in range(count)]
-
     def examples(self, name: str, successes: int, failures: int, most: int = 300) -> list[Message]:
         """Returns episodes of a row for inspection, failures first; success requires a hold to the end.
 

@@ -1,4 +1,4 @@
-"""Flow of `congrasp train`: evaluates, trains, evaluates again, and shows results and next steps."""
+"""Flow of `congrasp train`: trains, evaluates, and shows results and next steps."""
 
 import contextlib
 import dataclasses
@@ -18,7 +18,6 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, policy_spec
-from congrasp.common.policy.pretrained import pretrained_file
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.stages import imported, since_start, stages
@@ -39,7 +38,6 @@ from congrasp.learner.run_directory import (
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.scores import Row
-from congrasp.services.evaluate.showcase import showcase
 from congrasp.services.ops.shutdown import on_signal
 from congrasp.services.serve.load import example_episode, one_answer, serving, wait_until_ready
 from congrasp.services.train.learn import learn
@@ -48,9 +46,8 @@ from congrasp.services.train.processes import engine_of, leave_gpus_to, train
 from congrasp.services.viz.render import episode_sheet
 from congrasp.services.viz.sheets import save_png
 
-EPISODE, PRETRAINED = "episode.png", "pretrained.png"
+EPISODE = "episode.png"
 _EVALUATION_OBJECTS = 12
-_SEEDS = 3
 _LINE_SECONDS = 10.0
 _SPACE = 64 << 10  # bytes below which a disk counts as full
 console = Console(highlight=False)
@@ -79,7 +76,6 @@ def run_training(
     actors: int | None,
     resume: bool,
     evaluation: int,
-    compared: bool = True,
     initial: pathlib.Path | None = None,
     writers: Sequence[MetricWriter] = ("tensorboard",),
     metrics_port: int = 0,
@@ -88,10 +84,7 @@ def run_training(
     insecure: bool = False,
     ranks: int = 1,
 ) -> int:
-    """Evaluates, trains, evaluates again and shows the result; `services.cli.train` describes the other arguments.
-
-    Args:
-      compared: also evaluates before training.
+    """Trains, evaluates and shows the result; `services.cli.train` describes the arguments.
 
     Returns:
       The exit code.
@@ -103,10 +96,8 @@ def run_training(
     _check_connections(actors, listen, certs, config.name, insecure=insecure)
     plan = _plan(config, actors, ranks, listens=listen is not None or certs is not None)
     _prepare(run_dir, config, initial, resume=resume)
-    easier_task = _announce(config, run_dir, plan)
+    _announce(config, run_dir, plan)
     with on_signal() as stop:
-        first = evaluation if compared else 0
-        before = _evaluate(untrained(config), config, first, "before training") if first else []
         began = time.monotonic()
         with _Progress(config, ranks) as progress:
             if plan.in_process:
@@ -144,7 +135,7 @@ def run_training(
             return stop.exit_code
         console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
         if evaluation:
-            _show(run_dir, config, evaluation, before, pretrained=easier_task)
+            _show(run_dir, config, evaluation)
         _next_steps(run_dir)
     return 0
 
@@ -203,8 +194,8 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
         )
 
 
-def _announce(config: RunConfig, run_dir: pathlib.Path, plan: _Plan) -> bool:
-    """Prints a summary of the run; returns True if it is easier than the full task."""
+def _announce(config: RunConfig, run_dir: pathlib.Path, plan: _Plan) -> None:
+    """Prints a summary of the run, and in what it is easier than the full task."""
     console.print(
         f"[bold]{config.name}[/]: {config.updates} updates of {plan.ranks * _steps_per_update(config)} steps, "
         f"{plan.ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on '{plan.physics}' in "
@@ -217,17 +208,17 @@ def _announce(config: RunConfig, run_dir: pathlib.Path, plan: _Plan) -> bool:
             f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is --preset {FULL}, for a GPU.",
             soft_wrap=True,
         )
-    return bool(simplifications)
 
 
-def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int, before: list[Row], *, pretrained: bool) -> None:
-    """Shows the results of the training: comparison, a live query, pictures, optionally of the pretrained policy."""
-    policy = bundles.load(run_dir / POLICY_FILE)
-    _compare(before, _evaluate(policy, config, episodes, "after training"))
+def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
+    """Shows the results of the training: success, a picture, and a live query."""
+    row = _evaluate(bundles.load(run_dir / POLICY_FILE), config, episodes, run_dir)
+    console.print(
+        f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval {100 * row.success_low:.1f} to "
+        f"{100 * row.success_high:.1f}): {row.links_at_removal:.1f} links touch the object when the table is removed.",
+        soft_wrap=True,
+    )
     _live_query(run_dir, config.task.hand)
-    _picture(policy, config, run_dir)
-    if pretrained and (best := pretrained_file(config.task.hand)):
-        _pretrained_picture(best, run_dir)
 
 
 def _check(config: RunConfig) -> None:
@@ -341,41 +332,18 @@ def _minutes(seconds: float) -> str:
     return "?" if not np.isfinite(seconds) else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
-def _evaluator(policy: PolicyBundle, config: RunConfig, seed: int, batch: int) -> Evaluator:
-    """Returns an evaluator on held-out objects."""
-    objects = load_pool(
-        ObjectsConfig(families=config.objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
-        if not config.objects.folder
-        else config.objects
-    )
-    return Evaluator(policy, objects, physics="native", batch=batch, threads=cores(), seed=seed, task=config.task)
-
-
-def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, when: str) -> list[Row]:
-    """Evaluates the heading constraint for three draws of episodes, on held-out objects."""
-    console.print(f"Evaluating {when}: {_SEEDS} x {episodes} episodes on {_EVALUATION_OBJECTS} held-out objects …")
-    return _evaluator(policy, config, 0, episodes).draws("heading", episodes, _SEEDS)
-
-
-def _compare(before: list[Row], after: list[Row]) -> None:
-    """Prints metrics before (if measured) and after training, and whether their difference exceeds the noise."""
-    when = "Before and after" if before else "After"
-    console.print(f"{when}, mean ± standard deviation over {_SEEDS} draws of episodes:")
-    for name, label, factor in (
-        ("episode_return", "return", 1.0),
-        ("links_at_removal", "links in contact at removal", 1.0),
-        ("success", "success, %", 100.0),
-    ):
-        old, new = (factor * np.array([getattr(row, name) for row in rows]) for rows in (before, after))
-        if not before:
-            console.print(f"  {label:28s} {new.mean():7.2f} ± {new.std(ddof=1):5.2f}", soft_wrap=True)
-            continue
-        clear = abs(new.mean() - old.mean()) > old.std(ddof=1) + new.std(ddof=1)
-        console.print(
-            f"  {label:28s} {old.mean():7.2f} ± {old.std(ddof=1):5.2f}  ->  {new.mean():7.2f} ± {new.std(ddof=1):5.2f}"
-            f"   {'better than the noise' if clear and new.mean() > old.mean() else 'within the noise, or worse'}",
-            soft_wrap=True,
-        )
+def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, run_dir: pathlib.Path) -> Row:
+    """Evaluates headings on held-out objects, and draws one of the episodes, a success if there is one."""
+    objects = config.objects
+    if not objects.folder:
+        objects = ObjectsConfig(families=objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
+    pool = load_pool(objects)
+    console.print(f"Evaluating {episodes} episodes on {len(pool)} objects that no training sees …")
+    evaluator = Evaluator(policy, pool, batch=episodes, threads=cores(), task=config.task)
+    (row,) = evaluator.rows(["heading"], episodes, keep=True)
+    shown = evaluator.examples("heading", 1, 1)
+    save_png(run_dir / EPISODE, episode_sheet(shown[-1]))
+    return row
 
 
 def _live_query(run_dir: pathlib.Path, hand: str) -> None:
@@ -388,32 +356,12 @@ def _live_query(run_dir: pathlib.Path, hand: str) -> None:
             console.print(one_answer(client, episode), markup=False, soft_wrap=True)
 
 
-def _picture(policy: PolicyBundle, config: RunConfig, run_dir: pathlib.Path) -> None:
-    """Draws a successful episode if a few attempts find one."""
-    evaluator = _evaluator(policy, config, 0, 1)
-    save_png(run_dir / EPISODE, episode_sheet(evaluator.episode("heading", attempts=12)))
-
-
-def _pretrained_picture(policy: pathlib.Path, run_dir: pathlib.Path) -> None:
-    """Shows the result of training the same kind of policy on the full task."""
-    with console.status("The pretrained policy …") as status:
-        grasps = showcase(bundles.load(policy), run_dir / PRETRAINED, lambda text: status.update(f"{text} …"))
-    console.print(
-        f"The pretrained policy of the full task: {sum(grasps.values())} of {len(grasps)} grasps, one under each "
-        f"constraint ({', '.join(grasps)}).",
-        soft_wrap=True,
-    )
-
-
 def _next_steps(run_dir: pathlib.Path) -> None:
     """Prints the location of the results and commands to inspect them."""
     congrasp = _command()
-    pictures = (
-        (EPISODE, "an episode of the trained policy"),
-        (PRETRAINED, "a grasp under each constraint, by the pretrained policy"),
-    )
-    rows = [(str(run_dir / name), why) for name, why in pictures if (run_dir / name).exists()]
+    rows = [(str(run_dir / EPISODE), "an episode of the trained policy")] if (run_dir / EPISODE).exists() else []
     rows += [
+        (f"{congrasp} grasp mug:0 --video", "a grasp by the pretrained policy of the full task; or your own mesh"),
         (f"{congrasp} plot {run_dir}", "learning curves and reward terms"),
         (f"{run_dir / LOGS}/*.mcap", "open in Foxglove or Rerun: plots, hand and object in 3-D"),
         (f"{congrasp} evaluate --policy {run_dir / POLICY_FILE}", "the paper's protocol"),

@@ -5,7 +5,8 @@ import dataclasses
 from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.config import ControlConfig, TaskConfig
+from congrasp.common.task.constraints import optional
 from congrasp.services.train.recipe import recipe
 
 FULL = "full"
@@ -18,19 +19,31 @@ QUICKSTART = RunConfig(
     updates=50,
     physics="native",
     task=TaskConfig(
+        constraints=("heading",),
         headings="above",
-        p_affordance=0.0,
-        p_pose=0.0,
-        p_trajectory=0.0,
-        p_fingers=0.0,
-        p_force=0.0,
+        approach_steps=50,
+        back_off_range=(0.15, 0.15),
+        initial_speed=0.0,
+        # The full task's hands close slowly, which takes several times as many steps to learn.
+        control=ControlConfig(approach_position_limit=0.04, closing_position_limit=0.04),
     ),
     objects=ObjectsConfig(count=16),
     network=NetworkConfig(hidden=(256, 128)),
     ppo=PPOConfig(minibatches=8),
 )
 """Takes minutes on two CPU cores; `easier` lists the simplifications."""
-PRESETS = ("quickstart", FULL, *FULL_FOR)
+CHECK = dataclasses.replace(
+    QUICKSTART,
+    name="check",
+    environments=8,
+    rollout_steps=20,
+    updates=2,
+    objects=ObjectsConfig(count=2),
+    network=NetworkConfig(hidden=(16,)),
+)
+"""Learns nothing: physics, messages, log, server and picture of an installation, in half a minute."""
+_SHORT = {run.name: run for run in (QUICKSTART, CHECK)}
+PRESETS = (*_SHORT, FULL, *FULL_FOR)
 """Names of the presets."""
 
 
@@ -40,16 +53,17 @@ def easier(config: RunConfig) -> list[str]:
     words = []
     if task.headings == "above" and full.task.headings != "above":
         words.append("hands approach from above only")
-    odds = {
-        "an affordance": task.p_affordance,
-        "a reference pose": task.p_pose,
-        "a wrist trajectory": task.p_trajectory,
-        "a choice of fingers": task.p_fingers,
-        "a force limit": task.p_force,
-    }
-    absent = [name for name, probability in odds.items() if not probability]
+    absent = [
+        constraint.title
+        for constraint in optional(full.task)
+        if constraint not in optional(task) or not getattr(task, f"p_{constraint.name}")
+    ]
     if absent:
-        words.append(f"no episode has {' or '.join(absent)}")
+        words.append(f"no episode has another constraint ({', '.join(absent)})")
+    if task.control.closing_position_limit > full.task.control.closing_position_limit:
+        words.append("hands may close fast")
+    if task.approach_steps < full.task.approach_steps:
+        words.append(f"the table is removed after {task.approach_steps} control steps, not {full.task.approach_steps}")
     if not config.objects.folder and config.objects.count < full.objects.count:
         words.append(f"an actor has {config.objects.count} objects, not {full.objects.count}")
     if sum(config.network.hidden) < sum(full.network.hidden):
@@ -71,8 +85,8 @@ def get_preset(name: str, hand: str | None = None) -> RunConfig:
     """
     if name not in PRESETS:
         raise CongraspError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(PRESETS)}.")
-    if name == "quickstart":
-        return with_hand(QUICKSTART, hand)
+    if name in _SHORT:
+        return with_hand(_SHORT[name], hand)
     return recipe(get_hand(hand or (name if name in FULL_FOR else "human")))
 
 
