@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-_VECTORS = ("position", "direction", "cross", "velocity", "force", "points", "vertices", "normals", "pos")
+_VECTORS = ("position", "direction", "cross", "velocity", "force", "points", "cloud", "vertices", "normals", "pos")
 _WRIST = ("u", "u_target", "u_velocity")
 
 

@@ -54,8 +54,10 @@ def mirrored_request(request: GraspRequest) -> GraspRequest:
     return dataclasses.replace(
         request,
         constraints={name: mirror.fields(own) for name, own in request.constraints.items()},
-        surface=None if request.surface is None else mirror.vector(request.surface),
-        normals=None if request.normals is None else mirror.vector(request.normals),
+        **{
+            name: None if (value := getattr(request, name)) is None else mirror.vector(value)
+            for name in ("surface", "cloud", "normals", "camera")
+        },
         wrist=request.wrist and _pose(request.wrist),
         object_pose=request.object_pose and _pose(request.object_pose),
     )

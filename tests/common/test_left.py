@@ -14,7 +14,7 @@ from congrasp.common.hands.skin import skin_of
 from congrasp.common.objects.procedural import generate
 from congrasp.common.objects.shapes import mesh_of
 from congrasp.common.request import GraspRequest
-from congrasp.services.client.left import LeftPolicy
+from congrasp.services.client.left import LeftPolicy, mirrored_request
 from congrasp.services.client.policy import Answer
 
 SIDES = np.diag([-1.0, 1.0, 1.0])
@@ -120,3 +120,13 @@ def test_limits_of_the_left_hand_are_those_of_the_right_one_mirrored():
     np.testing.assert_array_equal(found["limits"]["lower"], [0.0, -4.0, -2.0, -3.0, -0.1, -0.5, -0.6])
     np.testing.assert_array_equal(found["limits"]["upper"], [1.0, 1.0, 5.0, 6.0, 0.4, 0.2, 0.3])
     assert found["limits"]["palm"] == [[-0.01, 0.02, 0.03, 0.04]]
+
+
+def test_everything_that_a_camera_sees_is_mirrored():
+    points = np.array([[1.0, 2.0, 3.0]])
+    request = GraspRequest({}, cloud=points, normals=points, camera=points[0])
+    mirrored = mirrored_request(request)
+    for found in (mirrored.cloud[0], mirrored.normals[0], mirrored.camera):
+        np.testing.assert_array_equal(found, [-1.0, 2.0, 3.0])
+    state = mirror.fields({"cloud": points, "surface_normals": points, "camera_position": points[0]})
+    assert all(np.array_equal(np.ravel(array), [-1.0, 2.0, 3.0]) for array in state.values())
