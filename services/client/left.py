@@ -54,13 +54,18 @@ def mirrored_request(request: GraspRequest) -> GraspRequest:
     return dataclasses.replace(
         request,
         constraints={name: mirror.fields(own) for name, own in request.constraints.items()},
-        **{
-            name: None if (value := getattr(request, name)) is None else mirror.vector(value)
-            for name in ("surface", "cloud", "normals", "camera")
-        },
+        surface=_vectors(request.surface),
+        cloud=_vectors(request.cloud),
+        normals=_vectors(request.normals),
+        camera=_vectors(request.camera),
         wrist=request.wrist and _pose(request.wrist),
         object_pose=request.object_pose and _pose(request.object_pose),
     )
+
+
+def _vectors(array: np.ndarray | None) -> np.ndarray | None:
+    """Mirrored points or directions, if there are any."""
+    return None if array is None else mirror.vector(array)
 
 
 def _answer(answer: Answer) -> Answer:

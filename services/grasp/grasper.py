@@ -205,6 +205,8 @@ class Grasper:
                 order = [i for i in cost.argsort().tolist() if holds[i]]
                 if (found := self._on_arm(self._arm, obj, make, order, refused, progress)) is not None:
                     return found
+                if prescribed(request) is not None:  # further rounds would repeat these attempts
+                    break
                 continue
             index = int(cost.argmin())
             if best is None or cost[index] < best[0]:
