@@ -2,7 +2,6 @@
 
 import concurrent.futures
 import copy
-import functools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -21,6 +20,9 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.config import TaskConfig
 
 _ENVIRONMENT = 860_000  # bytes of a stepped environment: model, data and their stack
+
+
+_physics_state = jax.jit(physics_state, static_argnums=(0, 1))
 
 
 class Scene:
@@ -77,7 +79,6 @@ class NativePhysics:
         self.scenes: list[Scene] = []  # scene of each environment
         self.instances: list[EnvInstance] = []
         self._where = addresses(self._scene(0).model, hand)
-        self._physics_state = jax.jit(functools.partial(physics_state, jnp, self._where))
 
     def start(self, reset_state: ResetState) -> "NativePhysics":
         """Starts environments; see `Physics.start`.
@@ -212,4 +213,6 @@ class NativePhysics:
         """Returns the physics state from the batch's arrays; `diverged` (B,) is passed through."""
         # Copies: the next step writes into the buffers while JAX may still read.
         occupancy = np.array([0.0, 0.0, self._limited.mean()], np.float32)
-        return self._physics_state(self._qpos.copy(), self._qvel.copy(), self._sensors.copy(), diverged, occupancy)
+        arrays = self._qpos.copy(), self._qvel.copy(), self._sensors.copy()
+        state: PhysicsState = _physics_state(jnp, self._where, *arrays, diverged, occupancy)
+        return state

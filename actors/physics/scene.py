@@ -1,6 +1,7 @@
 """MuJoCo model of one scene: hand, object, table, the anchor of a stationary object, contact sensors."""
 
 import dataclasses
+import functools
 
 import mujoco
 import numpy as np
@@ -32,9 +33,9 @@ _CONTACT_FIELDS = (
 _STRONGEST = 2  # reduce="maxforce"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Addresses:
-    """Addresses in a compiled scene that the task reads and writes."""
+    """Addresses in a compiled scene that the task reads and writes; scenes with equal ones share compiled programs."""
 
     wrist_qpos: np.ndarray
     finger_qpos: np.ndarray
@@ -49,6 +50,17 @@ class Addresses:
     weld: int
     motors: np.ndarray
     """Actuators of the fingers; servo torque: gainprm[0] * target + biasprm[1] * angle + biasprm[2] * speed."""
+
+    @functools.cached_property
+    def _key(self) -> tuple[tuple[int, ...], ...]:
+        """All addresses, in order."""
+        return tuple(tuple(np.ravel(getattr(self, field.name)).tolist()) for field in dataclasses.fields(self))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Addresses) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
 
 
 def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
