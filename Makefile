@@ -17,7 +17,9 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CACHE)/jax
 .PHONY: quickstart test test-all check coverage lint docs bench install clean
 .DEFAULT_GOAL := quickstart
 
-quickstart: install
+# What the first minutes need; the other targets add the development dependencies.
+quickstart:
+	$(MAKE) install EXTRA=viz
 	$(VENV)/bin/congrasp train --preset quickstart
 
 # Three workers on two cores: many tests wait for processes that they start or kill.
@@ -56,7 +58,7 @@ $(VENV)/.$(EXTRA): pyproject.toml constraints.txt
 	  { echo "congrasp needs Python 3.11, 3.12 or 3.13. Install one and name it: make PYTHON=python3.12" >&2; exit 2; }
 	@test -x $(VENV)/bin/python || { echo "Making $(VENV) with $(PYTHON)"; $(PYTHON) -m venv $(VENV); } || \
 	  { echo "Python's venv module does not work here. On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 2; }
-	@echo "Installing congrasp[$(EXTRA)] into $(VENV): about 3 GB with what tests need, some minutes the first time"
+	@echo "Installing congrasp[$(EXTRA)] into $(VENV): some minutes the first time (dev: about 3 GB)"
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[$(EXTRA)]'
 	@touch $@
 

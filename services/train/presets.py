@@ -16,7 +16,7 @@ FULL_FOR = ("human", "allegro", "sharpa")
 QUICKSTART = RunConfig(
     name="quickstart",
     environments=64,
-    updates=50,
+    updates=60,
     physics="native",
     task=TaskConfig(
         constraints=("heading",),
@@ -29,7 +29,7 @@ QUICKSTART = RunConfig(
     ),
     objects=ObjectsConfig(count=16),
     network=NetworkConfig(hidden=(256, 128)),
-    ppo=PPOConfig(minibatches=8),
+    ppo=PPOConfig(minibatches=8, settling=0.25),
 )
 """Takes minutes on two CPU cores; `easier` lists the simplifications."""
 CHECK = dataclasses.replace(
