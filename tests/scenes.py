@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import keypoints, link_transforms
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.affordance import AffordanceGoal
@@ -159,3 +160,7 @@ def evaluated(function: Callable[..., Any], scene: Scene, *rest: Any) -> Any:
 @functools.cache
 def _compiled(function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
     return jax.jit(lambda scene, *rest: function(scene._replace(hand=static[0], task=static[1]), *rest))
+
+
+points_of = jax.jit(lambda q: keypoints(HAND, link_transforms(HAND, q)))
+"""Keypoints (..., P, 3) of the human hand in the wrist frame, for finger angles (..., F)."""

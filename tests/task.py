@@ -57,11 +57,18 @@ def command(fingers: float = 0.0, lift: float = 0.0, noise: float = 0.0) -> np.n
     return mean
 
 
-def worker(seed: int = 0, physics: Physics | None = None, **options: Any) -> RolloutWorker:
-    """Environments of the suite's task in which `commanded` acts; options of `RolloutWorker` cost other programs."""
+def worker(seed: int = 0, physics: Physics | None = None, *, renewed: bool = True, **options: Any) -> RolloutWorker:
+    """Environments of the suite's task in which `commanded` acts.
+
+    Args:
+      seed: seed of episodes and actions.
+      physics: the engine.
+      renewed: whether finished episodes restart; otherwise `RolloutWorker.begin` sets the episodes.
+      options: other options of `RolloutWorker`, which cost other programs.
+    """
     physics = physics or NativePhysics(HAND, TASK, OBJECTS, 2)
     settings = {"batch": BATCH, "half_precision": True, "traced": "all", **options}
-    return RolloutWorker(HAND, TASK, physics, bank(), commanded, seed=seed, **settings)
+    return RolloutWorker(HAND, TASK, physics, bank() if renewed else None, commanded, seed=seed, **settings)
 
 
 def placed(tree: Any) -> Any:

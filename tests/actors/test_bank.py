@@ -12,23 +12,20 @@ from congrasp.actors.physics.engine import where_environments
 from congrasp.actors.process.own_references import save_references, with_kept_references
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
-from congrasp.common.objects import procedural
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import surface_of
 from congrasp.common.task.sampling.build import POSES, build_bank, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
+from tests import task as suite
+from tests.task import HAND, TASK
 
-HAND = get_hand("human")
-TASK = TaskConfig()
-OBJECTS = [procedural.generate(1, family) for family in ("hammer", "box")]
+OBJECTS = [suite.OBJECTS[3], suite.OBJECTS[0]]  # a hammer and a box
 F = len(HAND.joints)
 
 
 @pytest.fixture(scope="module")
 def bank():
-    return build_bank(HAND, TASK, OBJECTS, 0)
+    return jax.tree.map(lambda rows: rows[np.array([3, 0])], suite.bank())
 
 
 def test_headings_of_a_flat_object_stay_above_the_table(bank):

@@ -203,7 +203,7 @@ def test_a_longer_hold_changes_neither_success_nor_the_errors(follow):
 
 
 def test_an_object_that_falls_ends_nothing_where_the_task_says_so():
-    """`end_when_fallen`: with it the episode of a fallen object ends, without it the clock ends it, as no truncation."""
+    """Without `end_when_fallen` the clock ends the episode of a fallen object, which is no truncation."""
     physics = NativePhysics(HAND, TASK, suite.OBJECTS, 1)
     first = jax.device_get(physics.start((drawn := suite.episodes(BATCH)).reset_state).read(None))
     env = GraspEnv(HAND, dataclasses.replace(TASK, end_when_fallen=False), None)
