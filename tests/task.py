@@ -46,8 +46,8 @@ def policy() -> PolicyBundle:
 
 def commanded(parameters: Array, observation: Array, key: Array) -> tuple[Array, Array]:
     """A policy for `worker`: acts by its parameters (A + 1,), a mean action and the size of its noise."""
-    action = parameters[:-1] + parameters[-1] * jax.random.normal(key, (len(observation), len(parameters) - 1))
-    return action, -jnp.sum(action**2, -1)
+    noise = jax.random.normal(key, (len(observation), len(parameters) - 1))
+    return parameters[:-1] + parameters[-1] * noise, -0.5 * jnp.sum(noise**2, -1)
 
 
 def command(fingers: float = 0.0, lift: float = 0.0, noise: float = 0.0) -> np.ndarray:

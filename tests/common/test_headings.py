@@ -59,7 +59,7 @@ def defined_opposition(obj, touchable, position, direction, cross, rounding):
     return sides[0].min() < -np.cos(np.pi / 4) + 1e-6 and sides[1].max() > np.cos(np.pi / 4) - 1e-6
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from(FAMILIES), st.booleans(), st.integers(0, 99))
 def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
     obj = generate(seed, family)

@@ -18,16 +18,17 @@ from congrasp.services.record.reader import read_episodes, read_metrics, read_ro
 from tests.benchmarks.second_reading import read_again
 
 pytestmark = pytest.mark.timeout(600)
-UPDATES = 40
+UPDATES, ENVIRONMENTS, STEPS = 20, 8, 40
 SMALL = [
-    *("--updates", str(UPDATES), "--environments", "4", "--rollout-steps", "75", "--checkpoint-every", "3"),
+    *("--updates", str(UPDATES), "--environments", str(ENVIRONMENTS), "--rollout-steps", str(STEPS)),
+    *("--checkpoint-every", "3"),
     *(
         "--log-rollout-worlds",
         "3",
         "--episode-every",
         "1",
         "--objects.count",
-        "2",
+        "4",
         "--objects.families",
         "box",
         "--network.hidden",
@@ -85,18 +86,18 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path):
     assert sorted(file.stem for file in (run_dir / "references").iterdir()) == ["actor-0", "actor-1"]
     assert audit(run_dir).exit_code == 0 and read_again(run_dir)[:4] == (0, 0, 0, 0)
     policy = bundles.load(run_dir / "policy.safetensors")
-    assert policy.transitions == UPDATES * 2 * 4 * 75
+    assert policy.transitions == UPDATES * 2 * ENVIRONMENTS * STEPS
     metrics = read_metrics(run_dir)
     assert any(name.endswith("episode/return") for name in metrics)
     assert next(read_episodes(run_dir)).meta["hand"] == "human"
     sampled = next(read_rollouts(run_dir))
-    assert sampled.arrays["observation"].shape == (75, 3, sum(size for _, size in sampled.meta["layout"]))
-    assert sampled.arrays["action"].shape == (75, 3, 26) and sampled.arrays["last_observation"].shape[0] == 3
-    assert np.isfinite(sampled.arrays["reward"]).all() and sampled.meta["environments"] == 4
+    assert sampled.arrays["observation"].shape == (STEPS, 3, sum(size for _, size in sampled.meta["layout"]))
+    assert sampled.arrays["action"].shape == (STEPS, 3, 26) and sampled.arrays["last_observation"].shape[0] == 3
+    assert np.isfinite(sampled.arrays["reward"]).all() and sampled.meta["environments"] == ENVIRONMENTS
     assert json.loads((run_dir / "config.json").read_text())["updates"] == UPDATES
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_signal_ends_the_run_within_seconds_and_costs_nothing_that_was_accepted(tmp_path, number):
     run_dir = tmp_path / "run"
     command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(run_dir), "--actors", "1", *SMALL]
