@@ -18,7 +18,7 @@ from congrasp.services.record.reader import read_episodes, read_metrics, read_ro
 from tests.benchmarks.second_reading import read_again
 
 pytestmark = pytest.mark.timeout(600)
-UPDATES, ENVIRONMENTS, STEPS = 20, 8, 40
+UPDATES, ENVIRONMENTS, STEPS = 16, 8, 40
 SMALL = [
     *("--updates", str(UPDATES), "--environments", str(ENVIRONMENTS), "--rollout-steps", str(STEPS)),
     *("--checkpoint-every", "3"),
@@ -89,7 +89,7 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner(tmp_path, count
     assert sorted(file.stem for file in (run_dir / "references").iterdir()) == names
     assert audit(run_dir).exit_code == 0 and read_again(run_dir)[:4] == (0, 0, 0, 0)
     policy = bundles.load(run_dir / "policy.safetensors")
-    assert policy.transitions == UPDATES * count * ENVIRONMENTS * STEPS
+    assert policy.transitions == UPDATES * 2 * ENVIRONMENTS * STEPS
     metrics = read_metrics(run_dir)
     assert any(name.endswith("episode/return") for name in metrics)
     assert next(read_episodes(run_dir)).meta["hand"] == "human"
@@ -106,7 +106,7 @@ def test_a_signal_ends_the_run_within_seconds_and_costs_nothing_that_was_accepte
     command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(run_dir), "--actors", "1", *SMALL]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
-        _eventually(lambda: _version(run_dir) >= 4, 300, process)  # of one rollout each
+        _eventually(lambda: _version(run_dir) >= 4, 300, process)  # of two rollouts each
         family = psutil.Process(process.pid).children(recursive=True)
         process.send_signal(number)
         process.communicate(timeout=20)
