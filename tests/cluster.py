@@ -262,6 +262,15 @@ class Cluster:
             self.observer.close()
 
 
+def assert_books_balance(final):
+    """What a learner left when it ended: everything was counted once, and used once."""
+    ledger = final["counters"]
+    assert ledger["accepted"] == ledger["consumed"] + ledger["dropped"] + ledger["queued"]
+    assert ledger["granted"] == ledger["running"] + ledger["redeemed"] + ledger["returned"] + ledger["expired"]
+    assert ledger["consumed"] == len(final["history"])
+    assert len({tuple(identity) for identity in final["history"]}) == len(final["history"])
+
+
 class Proxy:
     """A network between actors and the learner that can be made silent or slow."""
 

@@ -1,16 +1,25 @@
 """Random but valid scenes, goals and surfaces for tests of the task."""
 
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import keypoints, link_transforms
+from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.affordance import AffordanceGoal
+from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.constraints.fingers import FingersGoal
 from congrasp.common.task.constraints.force import ForceGoal
 from congrasp.common.task.constraints.heading import HeadingGoal
 from congrasp.common.task.constraints.pose import PoseGoal
 from congrasp.common.task.constraints.trajectory import TrajectoryGoal
+from congrasp.common.task.features import features
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 
 HAND = get_hand("human")
@@ -131,3 +140,27 @@ def moved(state: SceneState, position: np.ndarray, turn: Rotation) -> SceneState
         object_position_initial=point(state.object_position_initial),
         object_quaternion_initial=attitude(state.object_quaternion_initial),
     )
+
+
+def scene_of(task: TaskConfig, state: SceneState, surface: Surface, goal: Goal) -> Scene:
+    """A scene with its features, which one program computes."""
+    return Scene(HAND, task, state, _features(task)(state, surface, goal), goal)
+
+
+@functools.cache
+def _features(task: TaskConfig) -> Callable[..., Any]:
+    return jax.jit(functools.partial(features, HAND, task))
+
+
+def evaluated(function: Callable[..., Any], scene: Scene, *rest: Any) -> Any:
+    """A function of a scene, compiled as one program: hundreds of single operations would be compiled one by one."""
+    return jax.device_get(_compiled(function, scene.hand, scene.task)(scene._replace(hand=None, task=None), *rest))
+
+
+@functools.cache
+def _compiled(function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
+    return jax.jit(lambda scene, *rest: function(scene._replace(hand=static[0], task=static[1]), *rest))
+
+
+points_of = jax.jit(lambda q: keypoints(HAND, link_transforms(HAND, q)))
+"""Keypoints (..., P, 3) of the human hand in the wrist frame, for finger angles (..., F)."""

@@ -4,7 +4,17 @@ Modules that share hand, task, policy and batch share compiled programs, in one 
 """
 
 import functools
+from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from congrasp.actors.initial import InitialConditions
+from congrasp.actors.physics.engine import Physics
+from congrasp.actors.physics.native import NativePhysics
+from congrasp.actors.rollout import Probe, Programs, no_probe, programs_of
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
@@ -12,6 +22,7 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.task.types import Array
 from congrasp.services.train.command import untrained
 
 HAND, TASK = get_hand("human"), TaskConfig()
@@ -31,3 +42,53 @@ def bank() -> ConstraintBank:
 def policy() -> PolicyBundle:
     """The untrained policy of `CONFIG`."""
     return untrained(CONFIG)
+
+
+def commanded(parameters: Array, observation: Array, key: Array) -> tuple[Array, Array]:
+    """A policy for `worker`: acts by its parameters (A + 1,), a mean action and the size of its noise."""
+    noise = jax.random.normal(key, (len(observation), len(parameters) - 1))
+    return parameters[:-1] + parameters[-1] * noise, -0.5 * jnp.sum(noise**2, -1)
+
+
+def command(fingers: float = 0.0, lift: float = 0.0, noise: float = 0.0) -> np.ndarray:
+    """Parameters of `commanded`: the action of every finger joint, that of the wrist along z, and the noise."""
+    mean = np.zeros(len(HAND.motors) + 7, np.float32)
+    mean[: len(HAND.motors)], mean[len(HAND.motors) + 2], mean[-1] = fingers, lift, noise
+    return mean
+
+
+def worker(seed: int = 0, physics: Physics | None = None, *, renewed: bool = True, **options: Any) -> RolloutWorker:
+    """Environments of the suite's task in which `commanded` acts.
+
+    Args:
+      seed: seed of episodes and actions.
+      physics: the engine.
+      renewed: whether finished episodes restart; otherwise `RolloutWorker.begin` sets the episodes.
+      options: other options of `RolloutWorker`, which cost other programs.
+    """
+    physics = physics or NativePhysics(HAND, TASK, OBJECTS, 2)
+    settings = {"batch": BATCH, "half_precision": True, "traced": "all", **options}
+    return RolloutWorker(HAND, TASK, physics, bank() if renewed else None, commanded, seed=seed, **settings)
+
+
+def placed(tree: Any) -> Any:
+    """The arrays on this process's device, as a worker places them: others would compile its programs again."""
+    return jax.device_put(tree, jax.local_devices()[0])
+
+
+def programs(probe: Probe = no_probe) -> Programs:
+    """The programs of `worker`."""
+    settings = {"batch": BATCH, "half_precision": True, "probe": probe, "traced": "all", "taught": False}
+    return programs_of(HAND, TASK, NativePhysics, commanded, **settings)
+
+
+def episodes(count: int, episode_bank: ConstraintBank | None = None) -> InitialConditions:
+    """Initial conditions of many episodes of the suite's task, by the program that draws those of `worker`.
+
+    Args:
+      count: number of episodes, rounded up to a multiple of `BATCH`.
+      episode_bank: a bank with the shapes of that of the suite; by default, that.
+    """
+    given, keys = placed((episode_bank or bank(), jax.random.split(jax.random.key(3), -(-count // BATCH))))
+    drawn = [jax.device_get(programs().sample(given, key, np.array(False))) for key in keys]
+    return jax.tree.map(lambda *rows: np.concatenate(rows), *drawn)

@@ -10,25 +10,26 @@ import pytest
 from congrasp.actors.harvest import Grasps, renew
 from congrasp.actors.physics.engine import where_environments
 from congrasp.actors.process.own_references import save_references, with_kept_references
-from congrasp.common import rotations
+from congrasp.common import rotations as module
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
-from congrasp.common.objects import procedural
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import surface_of
 from congrasp.common.task.sampling.build import POSES, build_bank, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
+from tests import task as suite
+from tests.compiled import Compiled
+from tests.task import HAND, TASK
 
-HAND = get_hand("human")
-TASK = TaskConfig()
-OBJECTS = [procedural.generate(1, family) for family in ("hammer", "box")]
+OBJECTS = [suite.OBJECTS[3], suite.OBJECTS[0]]  # a hammer and a box
 F = len(HAND.joints)
+rotations = Compiled(module)
+references = jax.jit(make_references, static_argnums=(0, 4))
+ends_of = jax.jit(lambda q: capsules(HAND, link_transforms(HAND, q)).reshape(-1, 3))
 
 
 @pytest.fixture(scope="module")
 def bank():
-    return build_bank(HAND, TASK, OBJECTS, 0)
+    return jax.tree.map(lambda rows: rows[np.array([3, 0])], suite.bank())
 
 
 def test_headings_of_a_flat_object_stay_above_the_table(bank):
@@ -71,7 +72,7 @@ def test_references_below_the_table_are_not_valid():
     poses = Poses(jnp.zeros((2, F)), positions, jnp.stack([_pointing(-1.0), _pointing(1.0)]))
     upright, upside_down = [0, 0, 0.05, 1, 0, 0, 0], [0, 0, 0.05, 0, 1, 0, 0]
     rest = jnp.array([[upright, upside_down]] * 2, jnp.float32)
-    path, turns, valid = make_references(HAND, poses, rest, jax.random.key(0), TASK.trajectory_points)
+    path, turns, valid = references(HAND, poses, rest, jax.random.key(0), TASK.trajectory_points)
     assert path.shape == (2, TASK.trajectory_points, 3) and turns.shape == (2, TASK.trajectory_points, 4)
     np.testing.assert_array_equal(valid, [[True, False], [False, True]])
 
@@ -79,14 +80,14 @@ def test_references_below_the_table_are_not_valid():
 def test_references_with_fingers_in_the_table_are_not_valid():
     """From above, the lowest finger a centimetre over the table and a centimetre in it."""
     q, down = jnp.zeros((1, F)), _pointing(-1.0)
-    ends = capsules(HAND, link_transforms(HAND, q)).reshape(-1, 3)
+    ends = ends_of(q)
     height = rotations.rotate(jnp.broadcast_to(down, (len(ends), 4)), ends)[:, 2]
     reach = float(jnp.max(np.repeat(HAND.capsule_radii, 2) - height))
     assert reach > 0.1
     position = jnp.array([[0.0, 0.0, reach + 0.01 - 0.05], [0.0, 0.0, reach - 0.01 - 0.05]])
     poses = Poses(jnp.tile(q, (2, 1)), position, jnp.stack([down, down]))
     rest = jnp.array([[[0, 0, 0.05, 1, 0, 0, 0]]] * 2, jnp.float32)
-    *_, valid = make_references(HAND, poses, rest, jax.random.key(0), TASK.trajectory_points)
+    *_, valid = references(HAND, poses, rest, jax.random.key(0), TASK.trajectory_points)
     np.testing.assert_array_equal(valid, [[True], [False]])
 
 

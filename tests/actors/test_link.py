@@ -175,37 +175,6 @@ def test_rollout_is_sent_under_one_identity_until_it_is_answered(ends):
     assert len({id(message) for message in learner.received}) == 1 and len(learner.received) == 4
 
 
-def test_rollout_survives_a_restart_of_the_learner(ends):
-    hub, make = ends
-    first, link = Learner(hub), make()
-    link.config(60)
-    first.transport.close()
-    outcome = link.upload(rollout(5), TICKET)
-    assert link.acquire_ticket(0.2) is None and link.weights(-1) is None
-    time.sleep(0.3)
-    assert not outcome.done()
-    second = Learner(hub, session_id="2")
-    assert outcome.result(60) == "accepted"
-    assert second.received[0].meta["sequence"] == 0
-    assert link.weights(0).meta["version"] == 0  # the number is the same, the learner is not
-
-
-def test_another_training_is_told_to_the_caller_who_starts_over(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make()
-    link.config(60)
-    learner.state["run_id"] = "f"
-    outcome = link.upload(rollout(), TICKET)
-    with pytest.raises(RunRestarted, match="run id f after e"):
-        outcome.result(60)
-    for use in (lambda: link.upload(rollout(), TICKET), lambda: link.acquire_ticket(1), lambda: link.weights(0)):
-        with pytest.raises(RunRestarted):
-            use()
-    assert link.config(60).run_id == "f"
-    assert link.upload(rollout(), TICKET).result(60) == "accepted"
-    assert [message.meta["sequence"] for message in learner.received] == [0, 1]
-
-
 @pytest.mark.parametrize("by", ["ticket", "weights", "announcement"])
 def test_another_training_is_noticed_by_every_way(ends, by):
     hub, make = ends
@@ -333,9 +302,3 @@ def test_closing_gives_up_what_is_on_its_way(ends):
     assert link.flush(1)
     with pytest.raises(CongraspError, match="closed"):
         link.upload(rollout(), TICKET)
-
-
-def test_liveliness(ends):
-    hub, make = ends
-    link = make()
-    assert hub.tokens == [KEYS.alive("actor", "a", link.incarnation)]

@@ -3,26 +3,16 @@
 import subprocess
 import sys
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from congrasp.actors.physics import ENGINES, Engine, make_physics, resolve_physics
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.worker import RolloutWorker
-from congrasp.common.config import NetworkConfig, RunConfig, run_config_from_json, to_json
+from congrasp.common.config import RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
-from congrasp.common.objects import procedural
-from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.evaluator import Evaluator
-from congrasp.services.train.command import untrained
-
-HAND, TASK = get_hand("human"), TaskConfig()
-OBJECTS = procedural.generate_many(2, 0, ("box", "cylinder"))
-BATCH = 4
+from tests import task as suite
+from tests.task import BATCH, HAND, OBJECTS, TASK
 
 
 class CountingPhysics(NativePhysics):
@@ -44,24 +34,16 @@ def registered(monkeypatch):
 
 def test_rollouts_are_made_on_it():
     physics = make_physics("counting", HAND, TASK, OBJECTS, threads=1)
-
-    def policy(parameters, observation, key):
-        return 0.3 * jax.random.normal(key, (BATCH, len(HAND.joints) + 6)), jnp.zeros(BATCH)
-
-    bank = build_bank(HAND, TASK, OBJECTS, 0)
-    rollout = RolloutWorker(HAND, TASK, physics, bank, policy, batch=BATCH, seed=0, half_precision=False).collect(
-        None, 3
-    )
+    rollout = suite.worker(physics=physics).collect(suite.command(noise=0.3), 3)
     assert CountingPhysics.steps == 3 * BATCH and np.all(np.isfinite(rollout.reward))
     physics.close()
 
 
+@pytest.mark.slow
 def test_an_evaluation_takes_its_batch_from_its_row():
-    policy = untrained(RunConfig(network=NetworkConfig(hidden=(8,))))
-    (row,) = Evaluator(policy, OBJECTS, physics="counting", threads=1).rows(["heading"], 2 * BATCH)
-    task = policy.task
+    (row,) = Evaluator(suite.policy(), OBJECTS, physics="counting", threads=1).rows(["heading"], 2 * BATCH)
     assert row.episodes == 2 * BATCH
-    assert CountingPhysics.steps == 2 * BATCH * (task.approach_steps + task.hold_steps)
+    assert CountingPhysics.steps == 2 * BATCH * (TASK.approach_steps + TASK.hold_steps)
 
 
 def test_a_run_and_errors_name_it():

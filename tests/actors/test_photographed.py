@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,15 +10,16 @@ import pytest
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.worker import RolloutWorker
 from congrasp.common import rotations
-from congrasp.common.hands import get_hand
-from congrasp.common.objects import procedural
 from congrasp.common.task import observation, privileged
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.control import decode
 from congrasp.common.task.sampling.build import build_bank
+from tests import task as suite
+from tests.scenes import evaluated
+from tests.task import HAND
 
-HAND = get_hand("human")
-OBJECTS = [procedural.generate(0, "cylinder")]
+OBJECTS = suite.OBJECTS[1:2]
+# A policy that is shown a camera's cloud, in episodes of 20 control steps.
 TASK = TaskConfig(
     constraints=("heading",), surface_points=64, approach_steps=16, hold_steps=4, hold_steps_max=4, history=3,
     observation="camera", surface_normals=True, sensing=SensingConfig(period=(0.05, 0.05)),
@@ -29,16 +31,12 @@ BATCH = 2
 def running():
     """Environments after 18 of an episode's 20 control steps, in which the fingers close."""
 
-    def close(parameters, seen, key):
-        action = jnp.zeros((len(seen), len(HAND.motors) + 6)).at[:, : len(HAND.motors)].set(0.8)
-        return action, jnp.zeros(len(seen))
-
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     worker = RolloutWorker(
-        HAND, TASK, physics, build_bank(HAND, TASK, OBJECTS, 0), close, batch=BATCH, seed=0, half_precision=False,
-        traced="all", taught=True, privileged=OBJECTS,
+        HAND, TASK, physics, build_bank(HAND, TASK, OBJECTS, 0), suite.commanded, batch=BATCH, seed=0,
+        half_precision=False, traced="all", taught=True, privileged=OBJECTS,
     )  # fmt: skip
-    return worker, worker.collect(None, 18)
+    return worker, worker.collect(suite.command(fingers=0.8), 18)
 
 
 def test_the_true_pose_changes_neither_observation_nor_targets(running):
@@ -52,20 +50,22 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
         contact_force=physics_state.contact_force + 5.0,
     )
     away = state.reset_state._replace(object_position=state.reset_state.object_position + 0.2)
-    before, after = (
-        env.seen(env.with_scene(one, physics))
-        for one, physics in ((state, physics_state), (state._replace(reset_state=away), moved))
-    )
-    np.testing.assert_array_equal(observation.observe(before), observation.observe(after))
-    action = jnp.ones((BATCH, len(HAND.motors) + 6))
-    for one, other in zip(decode(before, TASK.control, action), decode(after, TASK.control, action), strict=True):
-        np.testing.assert_array_equal(one, other)
+    away = state._replace(reset_state=away)
     elsewhere = state.camera._replace(cloud=state.camera.cloud._replace(points=state.camera.cloud.points + 0.01))
     tilted = state.camera._replace(cloud=state.camera.cloud._replace(normals=-state.camera.cloud.normals))
-    turned = env.seen(env.with_scene(state._replace(camera=tilted), physics_state))
-    assert np.abs(observation.observe(turned) - observation.observe(before)).max() > 0.1
-    shifted = env.seen(env.with_scene(state._replace(camera=elsewhere), physics_state))
-    assert np.abs(observation.observe(shifted) - observation.observe(before)).max() > 0.009
+
+    @jax.jit
+    def shown(state, physics_state):
+        scene = env.seen(env.with_scene(state, physics_state))
+        return observation.observe(scene), decode(scene, TASK.control, jnp.ones((BATCH, len(HAND.motors) + 6)))
+
+    (before, targets), (after, others) = shown(state, physics_state), shown(away, moved)
+    np.testing.assert_array_equal(before, after)
+    for one, other in zip(targets, others, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for camera, least in ((tilted, 0.1), (elsewhere, 0.009)):
+        changed, _ = shown(state._replace(camera=camera), physics_state)
+        assert np.abs(changed - before).max() > least
 
 
 def test_normals_of_the_cloud_point_toward_the_camera(running):
@@ -90,7 +90,7 @@ def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):
     np.testing.assert_allclose(np.min(ages, 0), 0.0, atol=1e-5)
     scene = worker.env.seen(state)
     np.testing.assert_array_equal(scene.state.object_position, 0.0)
-    own = observation.observe(scene)
+    own = evaluated(observation.observe, scene)
     start = sum(size for name, size in observation.layout(HAND, TASK)[:1])
     block = np.asarray(own[:, start : start + 4 * 64]).reshape(BATCH, 64, 4)
     features = scene.features

@@ -10,7 +10,6 @@ import numpy as np
 import psutil
 import pytest
 
-from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics import resolve_physics
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.mjx import MjxPhysics
@@ -18,27 +17,29 @@ from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.physics.slots import LEAVES, Pool
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling.build import build_bank
-from tests import draws
+from tests import task as suite
+from tests.task import HAND, TASK
 
-HAND = get_hand("human")
-TASK = TaskConfig(p_pose=0.0, p_trajectory=0.0, p_affordance=0.0, initial_speed=0.0, preshape=False)
 OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "cylinder", "mug"])]
 ENVIRONMENTS = 3
 
 
-def one_each(objects: Sequence[GraspObject]) -> InitialConditions:
-    """Fresh episodes, one for each object."""
-    bank = build_bank(HAND, TASK, objects, 0)
-    fresh = draws.sample(HAND, TASK, bank, jax.random.key(1), len(objects))
-    index = jnp.arange(len(objects))
-    rest = bank.rest[index, 0]
-    start = fresh.reset_state._replace(object_index=index, object_position=rest[:, :3], object_quaternion=rest[:, 3:])
-    return fresh._replace(reset_state=start)
+def one_each(objects: Sequence[GraspObject]) -> ResetState:
+    """Starts of the suite's episodes, one for each object, in its likeliest resting pose."""
+    drawn = suite.episodes(suite.BATCH).reset_state
+    start = jax.tree.map(lambda rows: rows[np.arange(len(objects)) % len(rows)], drawn)
+    rest = np.array([obj.rest_poses[0] for obj in objects], np.float32)
+    index = np.arange(len(objects), dtype=np.int32)
+    return start._replace(
+        object_index=index, object_position=rest[:, :3], object_quaternion=rest[:, 3:], q=_opened(len(objects)),
+        u_velocity=np.zeros((len(objects), 6), np.float32),
+    )  # fmt: skip
+
+
+def _opened(count: int) -> np.ndarray:
+    return np.tile(HAND.q_open, (count, 1)).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def servoed(start: ResetState) -> tuple[ResetState, np.ndarray]:
 def test_gains_scale_the_finger_servos_alone(env):
     """After one substep a joint at rest has the speed that the torque kp * ahead gave it: proportional to the gain."""
     physics = NativePhysics(HAND, dataclasses.replace(TASK, control_dt=0.0005, substeps=1), [OBJECTS[0]] * 3, 1)
-    start, target = servoed(env.reset_state._replace(object_index=np.zeros(ENVIRONMENTS, int)))
+    start, target = servoed(env._replace(object_index=np.zeros(ENVIRONMENTS, int)))
     state = physics.start(start)
     _, after = physics.step(state, target, np.ones(ENVIRONMENTS, bool))
     speed = np.abs(np.asarray(after.q_velocity)).max(1)
@@ -88,24 +89,24 @@ def test_gains_scale_the_finger_servos_alone(env):
 
 def test_objects_rest_and_the_hand_stays_without_commands(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(above(env.reset_state, 0.3))
-    still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.reset_state.q)], 1)
+    state = physics.start(above(env, 0.3))
+    still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.q)], 1)
     for _ in range(50):
         state, after = physics.step(state, still, np.ones(ENVIRONMENTS, bool))
-    np.testing.assert_allclose(after.object_position, env.reset_state.object_position, atol=2e-3)
-    np.testing.assert_allclose(after.q, env.reset_state.q, atol=1e-3)  # gravity on the hand is compensated
+    np.testing.assert_allclose(after.object_position, env.object_position, atol=2e-3)
+    np.testing.assert_allclose(after.q, env.q, atol=1e-3)  # gravity on the hand is compensated
     assert not after.contact_found.any() and not after.diverged.any()
     physics.close()
 
 
 def test_a_removed_table_lets_objects_fall_freely(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(above(env.reset_state, 0.3))
-    still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.reset_state.q)], 1)
+    state = physics.start(above(env, 0.3))
+    still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.q)], 1)
     table = np.array([True, False, False])
     for _ in range(20):
         state, after = physics.step(state, still, table)
-    drop = np.asarray(env.reset_state.object_position)[:, 2] - after.object_position[:, 2]
+    drop = np.asarray(env.object_position)[:, 2] - after.object_position[:, 2]
     assert abs(drop[0]) < 2e-3
     np.testing.assert_allclose(drop[1:], 0.5 * 9.81 * 0.2**2, rtol=0.05)
     physics.close()
@@ -113,14 +114,14 @@ def test_a_removed_table_lets_objects_fall_freely(env):
 
 def test_a_stationary_object_stays_when_pushed(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    start = above(env.reset_state, 0.19)._replace(stationary=np.ones(ENVIRONMENTS, bool))
+    start = above(env, 0.19)._replace(stationary=np.ones(ENVIRONMENTS, bool))
     state = physics.start(start)
     touched = np.zeros(ENVIRONMENTS, bool)
     for step in range(40):
         state, after = physics.step(state, grasp(start, step), np.ones(ENVIRONMENTS, bool))
         touched |= after.contact_found.any((1, 2))
     assert touched.any()
-    np.testing.assert_allclose(after.object_position, env.reset_state.object_position, atol=4e-3)
+    np.testing.assert_allclose(after.object_position, env.object_position, atol=4e-3)
     physics.close()
 
 
@@ -128,8 +129,8 @@ def test_a_scaled_mass_is_the_mass_of_a_heavier_object(env):
     """Its inertia and the weights of its constraints change with it."""
     heavy = [dataclasses.replace(obj, mass=3 * obj.mass, inertia=3 * obj.inertia) for obj in OBJECTS]
     scaled, compiled = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, heavy, 1)
-    scaled.start(env.reset_state._replace(mass_scale=np.full(ENVIRONMENTS, 3.0)))
-    compiled.start(env.reset_state._replace(mass_scale=np.ones(ENVIRONMENTS)))
+    scaled.start(env._replace(mass_scale=np.full(ENVIRONMENTS, 3.0)))
+    compiled.start(env._replace(mass_scale=np.ones(ENVIRONMENTS)))
     names = {name for name in dir(mujoco.MjModel) if name.startswith(("body_", "dof_"))} - {"dof_M0"}  # the compiler's
     for ours, theirs in zip(scaled.instances, compiled.instances, strict=True):
         for name in names:
@@ -212,9 +213,9 @@ def test_gains_hold_half_a_kilogram_without_shaking():
 def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(env, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     physics = NativePhysics(HAND, TASK, OBJECTS, 2)
-    start = above(env.reset_state, 0.3)
+    start = above(env, 0.3)
     state = physics.start(start)
-    still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.reset_state.q)], 1)
+    still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.q)], 1)
     state, _ = physics.step(state, still, np.ones(ENVIRONMENTS, bool))
     physics.instances[1].data.qvel[:] = np.nan
     state, after = physics.step(state, still, np.ones(ENVIRONMENTS, bool))
@@ -228,7 +229,7 @@ def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(en
 
 
 def test_environments_whose_solver_reached_its_limit_are_counted(env):
-    start = jax.tree.map(np.asarray, env.reset_state)
+    start = jax.tree.map(np.asarray, env)
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     state = physics.start(start)
     target, table = grasp(start, 0), np.ones(ENVIRONMENTS, bool)
@@ -245,7 +246,7 @@ def test_environments_whose_solver_reached_its_limit_are_counted(env):
 def test_an_environment_that_was_used_before_is_as_good_as_new(env):
     """Worlds are recycled: neither state nor mass of an earlier episode may be left in them."""
     physics, fresh = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, OBJECTS, 1)
-    start = above(env.reset_state, 0.19)
+    start = above(env, 0.19)
     everywhere = np.ones(ENVIRONMENTS, bool)
     state = physics.start(start._replace(mass_scale=np.full(ENVIRONMENTS, 3.0), stationary=everywhere))
     for step in range(30):
@@ -264,7 +265,7 @@ def test_an_environment_that_was_used_before_is_as_good_as_new(env):
 
 def test_reset_changes_only_the_masked_environments(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    start = above(env.reset_state, 0.3)
+    start = above(env, 0.3)
     state = physics.start(start)
     moving = np.concatenate([np.full((ENVIRONMENTS, 6), 0.05), np.asarray(start.q)], 1)
     for _ in range(10):
@@ -308,7 +309,7 @@ def optimised():
 @pytest.mark.slow
 def test_jax_agrees_with_native(env, optimised):
     """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
-    start = above(env.reset_state, 0.2)
+    start = above(env, 0.2)
     # Without the hand's contacts with itself and the table, which take minutes to compile there.
     task = dataclasses.replace(TASK, hand_self_collision=False, hand_table_collision=False)
     native = NativePhysics(HAND, task, OBJECTS, 1)
@@ -339,7 +340,7 @@ def test_jax_agrees_with_native(env, optimised):
     again = other.read(other.reset(b, mask, jax.tree.map(jnp.asarray, start)))
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(again.u[1:], y.u[1:], atol=1e-6)
-    start, target = servoed(env.reset_state)
+    start, target = servoed(env)
     a, b = native.start(start), jax.device_put(other.start(jax.tree.map(jnp.asarray, start)), device)
     for _ in range(5):
         (a, x), (b, y) = native.step(a, target, table), step(b, jnp.asarray(target), jnp.asarray(table))
@@ -352,7 +353,7 @@ def test_environments_that_do_not_fit_into_the_memory_are_one_clear_line(env, mo
     monkeypatch.setattr("congrasp.actors.physics.native.psutil.virtual_memory", lambda: free)
     native = NativePhysics(HAND, TASK, OBJECTS, 1)
     with pytest.raises(CongraspError, match=r"environments of MuJoCo C need .* GB are free.*smaller --environments"):
-        native.start(env.reset_state)
+        native.start(env)
     native.close()
 
 
@@ -364,7 +365,7 @@ def test_a_demanded_gpu_that_is_missing_is_one_clear_line():
 
 def test_object_velocity_is_in_the_world_frame(env):
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    state = physics.start(above(env.reset_state, 0.3))
+    state = physics.start(above(env, 0.3))
     instance = physics.instances[0]
     spin = np.array([0.0, 0.0, 3.0])  # about the world's vertical
     quaternion = jnp.asarray(instance.data.qpos[physics._where.object_qpos[3:]], jnp.float32)

@@ -32,7 +32,7 @@ OTHERS = [procedural.generate(i, family) for i, family in enumerate(["ring", "cy
 
 
 def _starts(objects: Sequence[GraspObject]) -> ResetState:
-    return jax.tree.map(jnp.asarray, above(one_each(objects).reset_state, 0.19))
+    return jax.tree.map(jnp.asarray, above(one_each(objects), 0.19))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_primitives_and_meshes_of_one_pool_agree_with_native(start):
 
 
 def test_gains_of_each_environment_agree_with_native():
-    start, target = servoed(one_each(OBJECTS).reset_state)
+    start, target = servoed(one_each(OBJECTS))
     native, warp = NativePhysics(HAND, TASK, OBJECTS, 1), WarpPhysics(HAND, TASK, OBJECTS)
     step, table = jax.jit(warp.step), np.ones(len(OBJECTS), bool)
     a, b = native.start(start), warp.start(jax.tree.map(jnp.asarray, start))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from congrasp.actors.env import GraspEnv, episode_fields, metric_names
 from congrasp.actors.physics.engine import PhysicsState, where_environments
@@ -13,51 +14,31 @@ from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import finished_episodes
 from congrasp.actors.worker import RolloutWorker
 from congrasp.common import rotations
-from congrasp.common.hands import get_hand
-from congrasp.common.hands.kinematics import grasp_frame, hand_center, keypoints, link_transforms
+from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
 from congrasp.common.objects import procedural
-from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import PAPER
+from congrasp.common.task.constraints import blocks
+from congrasp.common.task.geometry import hand_center
 from congrasp.common.task.observation import layout
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.types import CONTACTS_PER_LINK, Action
-from tests import draws
+from tests import task as suite
+from tests.task import BATCH, HAND, TASK
 
-HAND = get_hand("human")
-TASK = TaskConfig(approach_steps=50, back_off_range=(0.15, 0.15), initial_speed=0.0, preshape=False)
-OBJECTS = procedural.generate_many(4, 0, ("box", "cylinder", "mug", "hammer"))
-BATCH = 8  # of most workers here, so that their programs are compiled once
-DRAWN = 4000
-SIZE = sum(size for _, size in layout(HAND, TASK))
+STEPS = TASK.approach_steps + TASK.hold_steps
+NOISY, STILL = suite.command(noise=0.3), suite.command()
 
 
 @pytest.fixture(scope="module")
-def bank():
-    return build_bank(HAND, TASK, OBJECTS, 0)
-
-
-@pytest.fixture(scope="module")
-def drawn(bank):
+def drawn():
     """So many episodes that shares of them can be counted."""
-    task = dataclasses.replace(TASK, constraints=PAPER)
-    return draws.sample(HAND, task, bank, jax.random.key(0), DRAWN)
+    return suite.episodes(2000)
 
 
-def _noise(parameters, observation, key):
-    action = 0.3 * jax.random.normal(key, (observation.shape[0], len(HAND.joints) + 6))
-    return action, -jnp.sum(action**2, -1)
-
-
-def _worker(bank, seed=0):
-    physics = NativePhysics(HAND, TASK, OBJECTS, 2)
-    return RolloutWorker(HAND, TASK, physics, bank, _noise, batch=BATCH, seed=seed, half_precision=True)
-
-
-def test_masks_are_drawn_as_in_the_paper(drawn):
+def test_masks_have_the_shares_of_the_task(drawn):
     named = {block: np.asarray(active, float) for block, active in drawn.goal.active.items()}
-    assert list(named) == ["affordance", "pose_finger", "pose_wrist", "trajectory"]
-    assert abs(named["trajectory"].mean() - 0.5) < 0.08
-    assert abs(named["pose_finger"].mean() - 0.5) < 0.08
+    assert set(named) == set(blocks(TASK))
+    for block, share in (("trajectory", TASK.p_trajectory), ("pose_finger", TASK.p_pose)):
+        assert abs(named[block].mean() - share) < 0.08
     assert np.all(named["pose_wrist"] == named["pose_finger"] * (1 - named["trajectory"]))
     assert not np.any(named["affordance"] * named["pose_finger"])  # the pose overrides it
     assert np.all(np.asarray(drawn.hold) == TASK.hold_steps)
@@ -65,25 +46,35 @@ def test_masks_are_drawn_as_in_the_paper(drawn):
 
 def test_the_hand_starts_at_the_first_waypoint_or_backed_off_along_the_heading(drawn):
     start, goal, *_ = drawn
-    trajectory = np.asarray(goal.active["trajectory"])
-    first = rotations.compose_pose(
-        start.object_position,
-        start.object_quaternion,
-        goal["trajectory"].position[:, 0],
-        goal["trajectory"].quaternion[:, 0],
+    trajectory = goal.active["trajectory"]
+    turn = Rotation.from_quat(start.object_quaternion, scalar_first=True)
+    first = turn.apply(goal["trajectory"].position[:, 0]) + start.object_position
+    _raised_at_most((start.base_position - first)[trajectory])
+    # Otherwise v points along v-bar, and the hand centre lies before p-bar by a distance of the range.
+    direction, v, center, target = (part[~trajectory] for part in jax.device_get(_heading(start, goal)))
+    np.testing.assert_allclose(v, direction, atol=1e-4)
+    level = np.linalg.norm(direction[:, :2], axis=-1)
+    aside = level > 0.1
+    away, direction = (target - center)[aside], direction[aside]
+    back = np.linalg.norm(away[:, :2], axis=-1) / level[aside]
+    _raised_at_most(back[:, None] * direction - away)
+    near, far = TASK.back_off_range
+    assert near - 1e-3 < back.min() < near + 0.02 and far - 0.02 < back.max() < far + 1e-3
+    pose = goal.active["pose_finger"]
+    np.testing.assert_allclose(start.q[pose], goal["pose"].q[pose], atol=1e-6)
+
+
+@jax.jit
+def _heading(start, goal):
+    """Desired and actual direction of the hand, its centre and the desired one, all in the world frame."""
+    allowed = goal["fingers"].allowed | ~goal.active["fingers"][:, None]
+    center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, start.q)), allowed)
+    return (
+        rotations.rotate(start.object_quaternion, goal["heading"].direction),
+        rotations.rotate(start.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, center.shape)),
+        rotations.rotate(start.base_quaternion, center) + start.base_position,
+        rotations.rotate(start.object_quaternion, goal["heading"].position) + start.object_position,
     )
-    _raised_at_most(np.asarray(start.base_position - first[0])[trajectory])
-    # Otherwise v points along v-bar, and the hand centre lies 15 cm before p-bar.
-    direction = np.asarray(rotations.rotate(start.object_quaternion, goal["heading"].direction))
-    v = np.asarray(rotations.rotate(start.base_quaternion, jnp.broadcast_to(grasp_frame(HAND).heading, (DRAWN, 3))))
-    np.testing.assert_allclose(v[~trajectory], direction[~trajectory], atol=1e-4)
-    center = hand_center(HAND, keypoints(HAND, link_transforms(HAND, start.q)))
-    center = np.asarray(rotations.rotate(start.base_quaternion, center) + start.base_position)
-    target = np.asarray(rotations.rotate(start.object_quaternion, goal["heading"].position) + start.object_position)
-    _raised_at_most((center + TASK.back_off * direction - target)[~trajectory])
-    pose = np.asarray(goal.active["pose_finger"])
-    np.testing.assert_allclose(np.asarray(start.q)[pose], np.asarray(goal["pose"].q)[pose], atol=1e-6)
-    np.testing.assert_allclose(np.asarray(start.q)[~pose], np.tile(HAND.q_open, (DRAWN - pose.sum(), 1)), atol=1e-6)
 
 
 def _raised_at_most(difference: np.ndarray) -> None:
@@ -92,10 +83,11 @@ def _raised_at_most(difference: np.ndarray) -> None:
     assert difference[:, 2].min() > -1e-4 and (difference[:, 2] < 1e-4).mean() > 0.9
 
 
-def test_rollouts_go_through_whole_episodes_and_on(bank):
-    worker = _worker(bank)
-    first = worker.collect(None, 75)
-    assert first.observation.shape == (75, BATCH, SIZE) and first.observation.dtype == np.float16
+def test_rollouts_go_through_whole_episodes_and_on():
+    worker = suite.worker()
+    first = worker.collect(NOISY, STEPS)
+    size = sum(size for _, size in layout(HAND, TASK))
+    assert first.observation.shape == (STEPS, BATCH, size) and first.observation.dtype == np.float16
     assert np.isfinite(np.asarray(first.observation, np.float32)).all()
     terminal = np.asarray(first.terminal)
     assert terminal[-1].all() and not terminal[:-1].any()
@@ -104,23 +96,23 @@ def test_rollouts_go_through_whole_episodes_and_on(bank):
     np.testing.assert_allclose(episodes["episode/return"], np.asarray(first.reward).sum(0), rtol=1e-3)
     terms = sum(values for name, values in episodes.items() if name.startswith("term/"))
     np.testing.assert_allclose(terms, episodes["episode/return"], rtol=1e-3, atol=1e-2)
-    assert np.all(episodes["episode/length"] == 75)
-    # The table goes after fifty steps.
-    np.testing.assert_array_equal(first.trace.table, np.arange(1, 76) < TASK.approach_steps)
-    second = worker.collect(None, 30)
+    assert np.all(episodes["episode/length"] == STEPS)
+    present = np.arange(1, STEPS + 1) < TASK.approach_steps
+    np.testing.assert_array_equal(first.trace.table, np.tile(present[:, None], BATCH))
+    second = worker.collect(NOISY, 30)
     assert not np.asarray(second.terminal).any() and not len(finished_episodes(second, TASK)["episode/return"])
     # The first observation of a rollout is the last one of the rollout before.
     np.testing.assert_array_equal(second.observation[0], first.last_observation)
     assert np.all(np.asarray(worker.state.time) == 30)
     worker.restart()
     assert not np.asarray(worker.state.time).any()
-    third = worker.collect(None, 1)
-    np.testing.assert_allclose(third.trace.object_position[0], worker.state.reset_state.object_position[0], atol=0.01)
-    _other_objects_take_the_place_of_the_first_ones(worker)
+    third = worker.collect(NOISY, 1)
+    np.testing.assert_allclose(third.trace.object_position[0], worker.state.reset_state.object_position, atol=0.01)
+    _replaced_objects_rest_where_they_were_placed(worker)
     worker.physics.close()
 
 
-def _other_objects_take_the_place_of_the_first_ones(worker):
+def _replaced_objects_rest_where_they_were_placed(worker):
     others = procedural.generate_many(4, 50, ("can", "dish", "wrench", "piggy"))
     bank = build_bank(HAND, TASK, others, 1)
     worker.replace_objects(others, bank)
@@ -130,94 +122,104 @@ def _other_objects_take_the_place_of_the_first_ones(worker):
     heights = np.asarray(worker.state.reset_state.object_position)[:, 2]
     for i, height in zip(index, heights, strict=True):
         assert np.abs(others[i].rest_poses[:, 2] - height).min() < 1e-5
-    worker.collect(None, 3)
-    # Each lies where it was put: a wrong shape would fall, or be thrown up by the table.
+    worker.collect(NOISY, 3)
+    # A wrong shape would fall, or the table would throw it up.
     np.testing.assert_allclose(np.asarray(worker.state.views.true.state.object_position)[:, 2], heights, atol=2e-3)
 
 
-def test_success_needs_the_object_to_stay_up(bank):
-    """With idle hands far away every object falls, and nobody is credited."""
-    task = dataclasses.replace(TASK, back_off=0.5, p_pose=0.0, p_trajectory=0.0)
-    away = build_bank(HAND, task, OBJECTS, 0)
-    physics = NativePhysics(HAND, task, OBJECTS, 2)
-    still = lambda p, o, k: (jnp.zeros((o.shape[0], 26)).at[:, 20:23].set(-20.0), jnp.zeros(o.shape[0]))  # noqa: E731
-    worker = RolloutWorker(HAND, task, physics, away, still, batch=BATCH, seed=0, half_precision=True)
-    rollout = worker.collect(None, 75)
-    episodes = finished_episodes(rollout, task)
+def test_success_needs_the_object_to_stay_up():
+    """Hands that go up from half a metre above the table touch nothing: every object falls, and none succeeds."""
+    worker, drawn = suite.worker(), suite.episodes(BATCH)
+    far = drawn.reset_state.base_position + np.array([0.0, 0.0, 0.5], np.float32)
+    worker.begin(drawn._replace(reset_state=drawn.reset_state._replace(base_position=far)))
+    rollout = worker.collect(suite.command(lift=20.0), STEPS)
+    episodes = finished_episodes(rollout, TASK)
     assert np.asarray(rollout.terminal)[-1].all() and not np.asarray(rollout.truncated).any()
-    untouched = episodes["episode/links_at_removal"] == 0
-    assert untouched.any()
-    assert not episodes["episode/success"][untouched].any()
-    assert (episodes["term/drop"][untouched] < 0).all()
-    physics.close()
+    assert not episodes["episode/links_at_removal"].any() and not episodes["episode/success"].any()
+    assert (episodes["term/drop"] < 0).all()
+    worker.physics.close()
 
 
-def _begun(physics, task, conditions):
-    """An environment, its state, and what the engine shows of it."""
-    env = GraspEnv(HAND, task, None)
-    return env, env.state_of(conditions, None), physics.start(conditions.reset_state).read(None)
+@pytest.fixture
+def follow():
+    """A function that returns the state after steps whose readouts of the engine are invented, and its transitions."""
+    worker = suite.worker()
+
+    def run(hold, steps, shown):
+        """`shown(step, first)` is the readout of a step, from 1 on, of episodes that hold for so long."""
+        worker.begin(suite.episodes(BATCH)._replace(hold=np.full(BATCH, hold, np.int32)))
+        programs, key_data = worker.programs, np.asarray(jax.random.key_data(jax.random.key(0)))
+        parameters, settings, key = suite.placed((STILL, worker.env.settings, jax.random.key(0)))
+        first, state, transitions = jax.device_get(worker.physics.read(None)), worker.state, []
+        decision = programs.decide(parameters, settings, state, key)
+        state = state._replace(views=None)
+        for step in range(1, steps + 1):
+            changed, transition, _, decision = programs.advance(
+                parameters, settings, state, shown(step, first), decision, key_data
+            )
+            state = state._replace(**changed)
+            transitions.append(jax.device_get(transition))
+        return dict(zip(episode_fields(TASK), np.asarray(state.finished).T, strict=True)), transitions
+
+    yield run
+    worker.physics.close()
 
 
-def _advance(env, targets):
-    """A control step of which the engine's part is given."""
-    step = jax.jit(lambda state, after: env.advance(state, targets, after, env.settings))
-    return lambda state, after: step(state._replace(views=None), after)
+def _touched(first, force, fallen, drop=0.06):
+    """A readout in which one link presses with a force, and objects fell by more than the 5 cm that count."""
+    found, forces = np.zeros_like(first.contact_found), np.zeros_like(first.contact_force)
+    found[:, 0, 0], forces[:, 0, 0, 0] = True, force
+    position = first.object_position.copy()
+    position[fallen, 2] -= drop
+    return first._replace(contact_found=found, contact_force=forces, object_position=position)
 
 
-def test_a_lifted_object_that_stays_is_a_success(bank):
-    """The protocol's bookkeeping on invented readouts: held up, against dropped by more than 5 cm."""
-    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    env, state, after = _begun(physics, TASK, draws.sample(HAND, TASK, bank, jax.random.key(2), 2))
-    found = np.zeros(after.contact_found.shape, bool)
-    found[:, 0, 0] = True
-    after = after._replace(contact_found=found)
-    advance = _advance(env, Action(state.q_target, state.u_target))
-    for step in range(75):
-        position = np.array(after.object_position)
-        if step >= 55:
-            position[1, 2] = state.reset_state.object_position[1, 2] - 0.06
-        state, _ = advance(state, after._replace(object_position=position))
-    finished = dict(zip(episode_fields(TASK), np.asarray(state.finished).T, strict=True))
-    np.testing.assert_array_equal(finished["episode/success"], [1.0, 0.0])
-    assert set(metric_names(TASK)) <= {name.removeprefix("episode/") for name in finished}
-    physics.close()
-
-
-@pytest.mark.parametrize(("end_when_fallen", "ends"), [(False, [90, 90]), (True, [90, 81])])
-def test_a_longer_hold_changes_neither_success_nor_the_errors(bank, end_when_fallen, ends):
-    """Errors and forces are those of the paper's 25 steps; only `held` looks at the end of the hold."""
-    task = dataclasses.replace(TASK, hold_steps_max=40, end_when_fallen=end_when_fallen)
-    physics = NativePhysics(HAND, task, OBJECTS, 1)
-    drawn = draws.sample(HAND, task, bank, jax.random.key(2), 2)
-    env, state, after = _begun(physics, task, drawn._replace(hold=jnp.full(2, 40)))
-    found, force = (
-        np.zeros(after.contact_found.shape, bool),
-        np.zeros(after.contact_force.shape, np.float32),
+def test_a_lifted_object_that_stays_is_a_success(follow):
+    finished, _ = follow(
+        TASK.hold_steps, STEPS, lambda step, first: _touched(first, 1.0, [1] if step > TASK.approach_steps + 5 else [])
     )
-    found[:, 0, 0] = True
-    advance = _advance(env, Action(state.q_target, state.u_target))
-    terminal, truncated = [], []
-    for step in range(1, 91):
-        position = np.array(after.object_position)
-        position[1, 2] -= 0.06 if step > 80 else 0.0
-        pressed = force.copy()
-        pressed[:, 0, 0, 0] = 3.0 if step <= 75 else 30.0
-        shown = after._replace(object_position=position, contact_found=found, contact_force=pressed)
-        state, transition = advance(state, shown)
-        terminal.append(np.asarray(transition.terminal))
-        truncated.append(np.asarray(transition.truncated))
-    finished = dict(zip(episode_fields(task), np.asarray(state.finished).T, strict=True))
-    np.testing.assert_array_equal(np.argmax(terminal, 0) + 1, ends)
-    # The clock ends both episodes at step 90: of an object that is up it is truncation, of a fallen one it is not.
-    np.testing.assert_array_equal(np.argwhere(truncated), [[89, 0]])
-    np.testing.assert_array_equal(finished["episode/success"], [1.0, 1.0])
-    np.testing.assert_array_equal(finished["episode/held"], [1.0, 0.0])
-    np.testing.assert_allclose(finished["episode/force_sum"], [3.0, 3.0], rtol=1e-5)
+    np.testing.assert_array_equal(finished["episode/success"], np.arange(BATCH) != 1)
+    assert set(metric_names(TASK)) <= {name.removeprefix("episode/") for name in finished}
+
+
+def test_a_longer_hold_changes_neither_success_nor_the_errors(follow):
+    """Errors and forces are those of the paper's 25 steps; only `held` depends on the end of the hold.
+
+    The first object falls in step 131 of 140, after these; its episode ends there.
+    """
+
+    def shown(step, first):
+        return _touched(first, 3.0 if step <= STEPS else 30.0, [0] if step > STEPS + 5 else [])
+
+    finished, transitions = follow(TASK.hold_steps + 15, STEPS + 15, shown)
+    terminal = np.array([transition.terminal for transition in transitions])
+    truncated = np.array([transition.truncated for transition in transitions])
+    np.testing.assert_array_equal(np.argmax(terminal, 0) + 1, [STEPS + 6, *[STEPS + 15] * (BATCH - 1)])
+    # The clock ends the others: an end of an object that is up is a truncation.
+    np.testing.assert_array_equal(np.argwhere(truncated), [[STEPS + 14, i] for i in range(1, BATCH)])
+    assert finished["episode/success"].all()
+    np.testing.assert_array_equal(finished["episode/held"], np.arange(BATCH) > 0)
+    np.testing.assert_allclose(finished["episode/force_sum"], 3.0, rtol=1e-5)
+
+
+def test_an_object_that_falls_ends_nothing_where_the_task_says_so():
+    """Without `end_when_fallen` the clock ends the episode of a fallen object, which is no truncation."""
+    physics = NativePhysics(HAND, TASK, suite.OBJECTS, 1)
+    first = jax.device_get(physics.start((drawn := suite.episodes(BATCH)).reset_state).read(None))
+    env = GraspEnv(HAND, dataclasses.replace(TASK, end_when_fallen=False), None)
+    state = env.state_of(drawn._replace(hold=np.full(BATCH, TASK.hold_steps + 1, np.int32)), None)
+    state = state._replace(time=jnp.full(BATCH, STEPS - 1))
+    advance = jax.jit(
+        lambda state, after: env.advance(state, Action(state.q_target, state.u_target), after, env.settings)
+    )
+    for end in (False, True):
+        state, transition = advance(state._replace(views=None), _touched(first, 1.0, slice(None)))
+        assert (np.asarray(transition.terminal) == end).all() and not np.asarray(transition.truncated).any()
     physics.close()
 
 
-def test_workers_with_the_same_seed_agree_bit_for_bit(bank):
-    a, b = (_worker(bank, seed=5).collect(None, 20) for _ in range(2))
+def test_workers_with_the_same_seed_agree_bit_for_bit():
+    a, b = (suite.worker(seed=5).collect(NOISY, 20) for _ in range(2))
     np.testing.assert_array_equal(a.reward, b.reward)
     np.testing.assert_array_equal(a.observation, b.observation)
 
@@ -262,33 +264,65 @@ class _Touching:
         )
 
 
-def test_an_environment_that_goes_on_keeps_its_contacts_when_another_restarts(bank):
-    worker = RolloutWorker(HAND, TASK, _Touching(), bank, _noise, batch=2, seed=0, half_precision=False)
+def test_a_continuing_environment_keeps_its_contacts_when_another_restarts():
+    """The program of a compiled engine is one loop, which shares nothing with the programs of the other tests."""
+    physics = _Touching()
+    worker = RolloutWorker(
+        HAND, TASK, physics, suite.bank(), suite.commanded, batch=2, seed=0, half_precision=False, traced="none"
+    )
     state = worker.state
     worker.state = state._replace(
-        time=jnp.array([70, 70]),
+        time=jnp.array([120, 120]),
         hold=jnp.array([25, 100]),
         success=state.success._replace(links_at_removal=jnp.ones(2)),
     )
-    rollout = worker.collect(None, 7)
+    rollout = worker.collect(NOISY, 7)
     flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation
     assert np.argwhere(rollout.truncated).tolist() == [[4, 0]]
     touching = np.asarray(rollout.observation)[..., flags : flags + len(HAND.links)].all(-1)
     assert np.asarray(rollout.terminal)[:, 0].tolist() == [False] * 4 + [True, False, False]
-    # World 0 begins anew at step 5 and has not touched yet; in the very first step nobody has.
+    # Environment 0 restarts at step 5 without contacts; the very first step has none either.
     assert touching[:, 0].tolist() == [False, True, True, True, True, False, True]
     assert touching[:, 1].tolist() == [False] + [True] * 6
 
 
-def test_workers_of_one_task_share_programs_that_compile_once(bank):
+def test_workers_of_one_task_share_programs_that_compile_once():
     """A worker's seed, the number of steps, and whether the parameters are committed to a device do not matter."""
-    first = jnp.zeros(1)
-    placed = (first, jax.device_put(first, jax.local_devices()[0]), np.zeros(1, np.float32))
-    for steps, parameters in enumerate(placed, 1):
-        worker = _worker(bank, seed=steps)
+    programs, sizes = suite.programs(), set()
+    for steps, parameters in enumerate((NOISY, jnp.asarray(NOISY), suite.placed(NOISY)), 1):
+        worker = suite.worker(seed=steps)
         worker.collect(parameters, steps)
         worker.restart()
-        programs = worker.programs
-    assert programs is _worker(bank).programs
-    compiled = programs.decide, programs.advance, programs.sample, programs.with_scene
-    assert [program._cache_size() for program in compiled] == [1, 1, 1, 1]
+        assert worker.programs is programs
+        compiled = programs.decide, programs.advance, programs.sample, programs.with_scene
+        sizes.add(tuple(program._cache_size() for program in compiled))
+        worker.physics.close()
+    assert len(sizes) == 1
+
+
+@pytest.mark.parametrize(("name", "most"), [("sample", 4100), ("advance", 4750), ("decide", 1630)])
+def test_programs_stay_small(name, most):
+    """Compiling costs in proportion to a program's equations; a bound is a tenth above what there is."""
+    worker, programs = suite.worker(), suite.programs()
+    still, settings, key = suite.placed((STILL, worker.env.settings, jax.random.key(0)))
+    readout, state = worker.physics.read(None), worker.state
+    decision = programs.decide(still, settings, state, key)
+    arguments = {
+        "sample": (suite.bank(), key, np.array(False)),
+        "decide": (still, settings, state, key),
+        "advance": (still, settings, state._replace(views=None), readout, decision, jax.random.key_data(key)),
+    }
+    counted = _equations(jax.make_jaxpr(getattr(programs, f"_{name}"))(*arguments[name]).jaxpr)
+    assert 0.6 * most < counted <= most, counted
+    worker.physics.close()
+
+
+def _equations(program) -> int:
+    """Equations of a jaxpr and of those within it."""
+    inner = [[part for value in equation.params.values() for part in _programs_in(value)] for equation in program.eqns]
+    return sum(sum(map(_equations, parts)) if parts else 1 for parts in inner)
+
+
+def _programs_in(value):
+    values = value if isinstance(value, (tuple, list)) else (value,)
+    return [getattr(one, "jaxpr", one) for one in values if hasattr(one, "eqns") or hasattr(one, "jaxpr")]

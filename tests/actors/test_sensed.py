@@ -1,56 +1,48 @@
 """Environments whose policy sees what a robot's sensors show, beside what a teacher sees."""
 
 import dataclasses
-import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.worker import RolloutWorker
-from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import motor_positions
-from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import observation, privileged
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.teaching import extra
+from tests import task as suite
+from tests.scenes import evaluated
+from tests.task import HAND
 
-HAND = get_hand("human")
-OBJECTS = [procedural.generate(0, "cylinder")]
+OBJECTS = suite.OBJECTS[1:2]
+BATCH, DELAY, LATENCY = 2, 3, 2
+# A policy that is shown a tracker's poses, in episodes of 20 control steps.
 TASK = TaskConfig(
-    constraints=("heading",), surface_points=64, approach_steps=16, hold_steps=4, hold_steps_max=4, history=4
-)
-BATCH, DELAY = 2, 3
-
-
-@functools.cache
-def bank():
-    return build_bank(HAND, TASK, OBJECTS, 0)
-
-
-def worker(task):
-    """Environments whose wrist follows its guidance while the fingers close."""
-
-    def close(parameters, seen, key):
-        action = jnp.zeros((len(seen), len(HAND.motors) + 6)).at[:, : len(HAND.motors)].set(0.8)
-        return action, jnp.zeros(len(seen))
-
-    physics = NativePhysics(HAND, task, OBJECTS, 1)
-    return RolloutWorker(
-        HAND, task, physics, bank(), close, batch=BATCH, seed=0, half_precision=False, traced="all", taught=True,
-        privileged=OBJECTS,
-    )  # fmt: skip
+    constraints=("heading",), surface_points=64, approach_steps=16, hold_steps=4, hold_steps_max=4, history=6,
+    observation="tracked",
+    sensing=SensingConfig(delay=(DELAY * 0.01, DELAY * 0.01), latency=(LATENCY * 0.01, LATENCY * 0.01)),
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def late():
-    """Environments with a tracker that is late, and 18 of an episode's 20 control steps."""
-    sensing = SensingConfig(delay=(DELAY * 0.01, DELAY * 0.01))
-    running = worker(dataclasses.replace(TASK, observation="tracked", sensing=sensing))
-    return running, running.collect(None, 18)
+    """Environments with a tracker and servos that are late, and 18 of an episode's 20 control steps.
+
+    The wrist follows its guidance while the fingers close.
+    """
+    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+    bank = build_bank(HAND, TASK, OBJECTS, 0)
+    running = RolloutWorker(
+        HAND, TASK, physics, bank, suite.commanded, batch=BATCH, seed=0, half_precision=False, traced="all",
+        taught=True, privileged=OBJECTS,
+    )  # fmt: skip
+    yield running, running.collect(suite.command(fingers=0.8), 18)
+    physics.close()
 
 
 def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
@@ -59,7 +51,8 @@ def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
     for age in range(TASK.history):
         now = 17 - age
         np.testing.assert_allclose(readings.q[:, age], trace.q[now], atol=1e-6)
-        np.testing.assert_allclose(readings.u_target[:, age], trace.u_target[now], atol=1e-6)
+        if age >= LATENCY:  # the trace has the targets that the servos followed
+            np.testing.assert_allclose(readings.u_target[:, age], trace.u_target[now + LATENCY], atol=1e-6)
         np.testing.assert_allclose(readings.object_position[:, age], trace.object_position[now - DELAY], atol=1e-6)
         np.testing.assert_allclose(readings.object_quaternion[:, age], trace.object_quaternion[now - DELAY], atol=1e-6)
     seen, true = running.env.seen(running.state).state, running.env.scene_of(running.state).state
@@ -70,27 +63,26 @@ def test_a_late_tracker_shows_the_pose_of_so_many_steps_ago(late):
     assert not seen.contact_force.any()
 
 
-def test_servos_follow_the_target_of_so_many_steps_ago():
+def test_servos_follow_the_target_of_so_many_steps_ago(late):
     """The teacher sees the targets that they follow, the student its newest ones."""
-    running = worker(dataclasses.replace(TASK, observation="tracked", sensing=SensingConfig(latency=(0.02, 0.02))))
-    running.collect(None, 6)
+    running, rollout = late
     env, state = running.env, running.state
     readings, action = state.readings, jnp.zeros((BATCH, len(HAND.motors) + 6))
-    _, (command, _) = env.targets(state, action, env.settings)
-    np.testing.assert_allclose(command[:, :6], readings.u_target[:, 1], atol=1e-6)
-    np.testing.assert_allclose(command[:, 6:], motor_positions(HAND, readings.q_target[:, 1]), atol=1e-6)
-    np.testing.assert_array_equal(env.scene_of(state).state.q_target, readings.q_target[:, 2])
+    _, (command, _) = jax.jit(env.targets)(state, action, env.settings)
+    np.testing.assert_allclose(command[:, :6], readings.u_target[:, LATENCY - 1], atol=1e-6)
+    np.testing.assert_allclose(command[:, 6:], motor_positions(HAND, readings.q_target[:, LATENCY - 1]), atol=1e-6)
+    np.testing.assert_array_equal(env.scene_of(state).state.q_target, readings.q_target[:, LATENCY])
     np.testing.assert_array_equal(env.seen(state).state.q_target, readings.q_target[:, 0])
-    assert np.abs(readings.q_target[:, 0] - readings.q_target[:, 2]).max() > 0.1
+    moving = np.abs(np.diff(rollout.trace.q_target, axis=0)).max((1, 2))
+    assert moving.max() > 0.05 and moving[: LATENCY - 1].max() == 0.0  # nothing is followed before it arrives
 
 
 def test_a_teacher_sees_all_beside_a_student(late):
     _, rollout = late
-    task = dataclasses.replace(TASK, observation="tracked")
-    sizes = [sum(size for _, size in layout) for layout in (observation.layout(HAND, task), full_layout(task))]
+    sizes = [sum(size for _, size in layout) for layout in (observation.layout(HAND, TASK), full_layout(TASK))]
     assert [rollout.observation.shape[-1], rollout.teacher_observation.shape[-1] - extra(HAND)] == sizes
     start = 0
-    for field in observation.fields(HAND, TASK)["state"]:
+    for field in observation.fields(HAND, dataclasses.replace(TASK, observation="full"))["state"]:
         part = rollout.teacher_observation[1:, :, start : start + field.size]
         start += field.size
         if field.name == "q":
@@ -102,9 +94,8 @@ def test_a_teacher_sees_all_beside_a_student(late):
 
 def test_the_critic_sees_the_trackers_and_the_true_state(late):
     running, rollout = late
-    task = dataclasses.replace(TASK, observation="tracked", sensing=SensingConfig(delay=(0.03, 0.03)))
-    names = [name for name, _ in privileged.layout(HAND, task)]
-    size = sum(size for _, size in privileged.layout(HAND, task))
+    names = [name for name, _ in privileged.layout(HAND, TASK)]
+    size = sum(size for _, size in privileged.layout(HAND, TASK))
     assert rollout.privileged.shape == (18, BATCH, size) and rollout.last_privileged.shape == (BATCH, size)
     numbers = dict(zip(names, np.moveaxis(rollout.privileged, -1, 0), strict=False))
     np.testing.assert_array_equal(numbers["delay"], DELAY)
@@ -115,8 +106,8 @@ def test_the_critic_sees_the_trackers_and_the_true_state(late):
     np.testing.assert_array_equal(
         rollout.privileged[..., len(names) - 1 :], rollout.teacher_observation[..., : -extra(HAND)]
     )
-    scene = running.env.privileged(running.state)
-    np.testing.assert_allclose(rollout.last_privileged[:, len(names) - 1 :], observation.observe(scene), atol=1e-6)
+    observed = evaluated(observation.observe, running.env.privileged(running.state))
+    np.testing.assert_allclose(rollout.last_privileged[:, len(names) - 1 :], observed, atol=1e-6)
 
 
 def running_start(late):
@@ -127,7 +118,7 @@ def running_start(late):
 def test_a_fresh_episode_begins_with_fresh_readings(late):
     """The last test of `late`: its episodes end after two more control steps."""
     running, _ = late
-    rollout = running.collect(None, 2)
+    rollout = running.collect(suite.command(fingers=0.8), 2)
     assert rollout.terminal[-1].all()
     readings, start = running.state.readings, running.state.reset_state
     for age in range(TASK.history):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,41 +14,25 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors import stress as protocols
 from congrasp.actors.attempts import Attempts, Phases
-from congrasp.actors.env import GraspEnv, Settings
 from congrasp.actors.initial import RequestedEpisodes
 from congrasp.actors.physics.mjx import MjxPhysics
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.stress import Frame, Protocol
-from congrasp.actors.worker import RolloutWorker
-from congrasp.common import rotations
-from congrasp.common.config import NetworkConfig, RunConfig
-from congrasp.common.hands import get_hand
-from congrasp.common.objects import procedural
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.task import plausibility
-from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import CONSTRAINTS, optional
-from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.task.constraints import optional
 from congrasp.common.task.types import Surface
-from congrasp.services.train.command import untrained
-from tests import draws, scripted
+from tests import task as suite
+from tests.task import BATCH, HAND, OBJECTS, TASK
 
-HAND = get_hand("human")
 WITHOUT_MESHES = set(protocols.ASSESSED) - {"hand_mesh_mm"}
 """What is measured of a hand whose file has no visual meshes."""
-TASK = TaskConfig(
-    **{f"p_{constraint.name}": 0.0 for constraint in CONSTRAINTS if constraint.optional},
-    approach_steps=50,
-    back_off_range=(0.15, 0.15),
-    initial_speed=0.0,
-    preshape=False,
-    end_when_fallen=False,
-)
-OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "cylinder"])]
-BATCH = 2
+NEVER = 10_000
+"""Control steps after which no test goes on."""
+MASSES = tuple(obj.mass for obj in OBJECTS)
 
 
-def protocol(height: float = 0.15, start: int = 0, masses: tuple[float, ...] = (0.2, 0.4)) -> Protocol:
+def protocol(height: float = 0.15, start: int = 0, masses: tuple[float, ...] = MASSES) -> Protocol:
     steps = protocols.lift_steps(TASK, height)
     return Protocol(np.float32(start), np.float32(height), np.float32(start + steps), np.array(masses, np.float32))
 
@@ -85,11 +70,14 @@ def test_every_lift_is_smooth_and_ends_where_it_should(height):
     np.testing.assert_allclose(np.diff(found.height), way, atol=kink + 1e-6)
 
 
+_push = jax.jit(lambda protocol, time, index, scale: protocols.push(protocol, TASK, time, index, scale))
+
+
 def test_pushes_follow_one_another_along_the_axes_of_the_world():
     steps, first = protocols.push_steps(TASK), TASK.approach_steps + protocols.lift_steps(TASK)
     index, scale = np.array([1]), np.array([1.5], np.float32)
     forces = [
-        np.asarray(protocols.push(protocol(), TASK, np.array([time]), index, scale))[0]
+        np.asarray(_push(protocol(masses=(0.2, 0.4)), np.float32([time]), index, scale))[0]
         for time in [0, first - 1, *(first + steps * np.arange(12) + steps // 2), first + 12 * steps]
     ]
     assert not np.any([forces[0], forces[1], forces[-1]])
@@ -102,20 +90,23 @@ def test_pushes_follow_one_another_along_the_axes_of_the_world():
 
 @functools.cache
 def start():
-    """Two objects at rest, with the hand far above them and not quite aligned."""
-    fresh = draws.sample(HAND, TASK, build_bank(HAND, TASK, OBJECTS, 0), jax.random.key(1), BATCH)
-    rest = np.array([obj.rest_poses[0] for obj in OBJECTS], np.float32)
+    """Objects at rest and headings alone, with the hand far above and not quite aligned."""
+    fresh = suite.episodes(BATCH)
+    goal = dataclasses.replace(fresh.goal, active=jax.tree.map(np.zeros_like, fresh.goal.active))
+    index = np.arange(BATCH) % len(OBJECTS)
+    rest = np.array([OBJECTS[i].rest_poses[0] for i in index], np.float32)
     aligned = Rotation.from_quat(fresh.reset_state.base_quaternion, scalar_first=True)
-    turns = (aligned * Rotation.from_euler("x", [[20], [-40]], degrees=True)).as_quat(scalar_first=True)
+    turns = aligned * Rotation.from_euler("x", np.linspace(-40, 40, BATCH)[:, None], degrees=True)
     state = fresh.reset_state._replace(
-        object_index=np.arange(BATCH),
+        object_index=index.astype(np.int32),
         object_position=rest[:, :3],
         object_quaternion=rest[:, 3:],
-        base_position=rest[:, :3] + [0.0, 0.0, 0.4],
-        base_quaternion=turns.astype(np.float32),
-        q=np.tile(HAND.q_open, (BATCH, 1)),
+        base_position=rest[:, :3] + np.float32([0.0, 0.0, 0.4]),
+        base_quaternion=turns.as_quat(scalar_first=True).astype(np.float32),
+        u_velocity=np.zeros((BATCH, 6), np.float32),
+        q=np.tile(HAND.q_open, (BATCH, 1)).astype(np.float32),
     )
-    return fresh._replace(reset_state=jax.tree.map(jnp.asarray, state))
+    return fresh._replace(reset_state=state, goal=goal)
 
 
 def falls(physics, force: np.ndarray, steps: int = 10):
@@ -130,9 +121,9 @@ def falls(physics, force: np.ndarray, steps: int = 10):
 
 def check_fall(physics):
     """A free object under gravity and a force moves by (f / m + g) t^2 / 2, and does not turn."""
-    force = np.array([[0.6, -0.4, 1.0], [0.0, 0.8, -0.5]], np.float32)
+    force = np.tile(np.float32([[0.6, -0.4, 1.0], [0.0, 0.8, -0.5]]), (BATCH // 2, 1))
     after = falls(physics, force)
-    masses = np.array([obj.mass for obj in OBJECTS])[:, None]
+    masses = np.array([OBJECTS[i].mass for i in start().reset_state.object_index])[:, None]
     seconds = 10 * TASK.control_dt
     expected = (force / masses + [0.0, 0.0, -9.81]) * seconds
     np.testing.assert_allclose(after.object_velocity, expected, rtol=0.01, atol=0.01)
@@ -156,7 +147,10 @@ def test_native_pushes_with_a_force_and_forgets_it_at_a_reset():
 def test_mjx_gets_the_same_force(monkeypatch):
     """What MJX makes of `xfrc_applied` is MuJoCo's; compiling it takes over a minute."""
     monkeypatch.setattr("congrasp.actors.physics.mjx.mjx.step", lambda model, data: data)
-    physics, force = MjxPhysics(HAND, TASK, OBJECTS), np.array([[0.6, -0.4, 1.0], [0.0, 0.8, -0.5]], np.float32)
+    physics, force = (
+        MjxPhysics(HAND, TASK, OBJECTS),
+        np.random.default_rng(0).normal(size=(BATCH, 3)).astype(np.float32),
+    )
     state = physics.start(start().reset_state)
     target = np.zeros((BATCH, 6 + len(HAND.joints)), np.float32)
     pushed, _ = jax.jit(physics.step)(state, target, np.zeros(BATCH, bool), force)
@@ -171,85 +165,90 @@ def test_warp_pushes_with_the_same_force():
     check_fall(warp.WarpPhysics(HAND, TASK, OBJECTS, mesh_slots=0))
 
 
-def lifted(action: np.ndarray, protocol: Protocol | None, steps: int):
-    """Scenes and their carried frames after each step of one action, from the table's removal on."""
-    task = dataclasses.replace(TASK, approach_steps=0)
-    physics = NativePhysics(HAND, task, OBJECTS, 1)
-    env, conditions = GraspEnv(HAND, task, None), start()
-    conditions = conditions._replace(hold=jnp.full(BATCH, steps))
-    configured = Settings(task.reward, task.control, protocol)
-    physics.start(conditions.reset_state)
-    state = env.with_scene(env.state_of(conditions, None), physics.read(None))
-    decide = jax.jit(lambda state: env.targets(state, action, configured))
-    advance = jax.jit(lambda state, target, after: env.advance(state, target, after, configured))
-    seen = []
-    for _ in range(steps):
-        target, command = decide(state)
-        _, after = physics.step(None, *command)
-        state, _ = advance(state, target, after)
-        seen.append((*state.views.true, state.frame, after))
-    physics.close()
-    return seen
+class Seen(NamedTuple):
+    """Recorded samples of the plausibility, and what the policy's frame shows."""
+
+    sample: plausibility.Sample
+    wrist_position: Any
+    u: Any
+    u_velocity: Any
+    object_position: Any
+
+
+def seen(scene, index, data) -> Seen:
+    state = scene.state
+    found = plausibility.sample(scene, index, data)
+    return Seen(found, scene.features.wrist_position, state.u, state.u_velocity, state.object_position)
+
+
+def under(given: Protocol, conditions, time: int = 0):
+    """Environments under a protocol from a step of their episodes on; they have programs of their own."""
+    worker = suite.worker(probe=seen, renewed=False)
+    worker.begin(conditions)
+    worker.state = worker.state._replace(time=jnp.full_like(worker.state.time, time))
+    worker.adjust(protocol=given, probe_data=distance_field(OBJECTS))
+    return worker
+
+
+def released(given: Protocol, steps: int):
+    """A rollout from the table's removal on, in which the wrist comes to its guidance."""
+    worker = under(given, start(), TASK.approach_steps)
+    rollout = worker.collect(suite.command(), steps)
+    worker.physics.close()
+    return rollout
 
 
 def test_a_lift_is_unseen_by_the_policy_and_takes_the_wrist_along():
-    action = np.zeros((BATCH, len(HAND.joints) + 6), np.float32)
-    masses = tuple(obj.mass for obj in OBJECTS)
-    still = lifted(action, None, 215)
-    moving = lifted(action, protocol(start=145, masses=masses), 215)  # when the wrist has come to its guidance
-    for (scene, features, frame, after), (other, others, none, _) in zip(moving, still, strict=True):
-        assert not np.any(none.height)
-        # What is seen is the same within half a millimetre: targets are held for a control step each.
-        np.testing.assert_allclose(features.wrist_position, others.wrist_position, atol=5e-4)
-        np.testing.assert_allclose(scene.u, other.u, atol=1e-3)
-        np.testing.assert_allclose(scene.u_velocity[:, :3], other.u_velocity[:, :3], atol=0.01)
-        # The object falls, in the world; the frame leaves it below.
-        below = np.asarray(after.object_position) - np.asarray(frame.height)[:, None] * [0.0, 0.0, 1.0]
-        np.testing.assert_allclose(scene.object_position, below, atol=1e-6)
-    assert np.asarray(moving[-1][2].height) == pytest.approx(0.15, abs=1e-6)
-    risen = rotations.rotate(start().reset_state.base_quaternion, moving[-1][3].u[:, :3] - still[-1][3].u[:, :3])
+    """It begins when the wrist has come to its guidance. Objects fall, in the world; the frame leaves them below."""
+    still, moving = (
+        released(protocol(start=begin)._replace(push_start=np.float32(NEVER)), 215) for begin in (NEVER, 145)
+    )
+    # The policy sees the same within half a millimetre: targets are held for a control step each.
+    for name, size, tolerance in (("wrist_position", 3, 5e-4), ("u", 3, 1e-3), ("u", 6, 5e-3), ("u_velocity", 3, 0.01)):
+        shown = (getattr(rollout.probed, name)[..., :size] for rollout in (moving, still))
+        np.testing.assert_allclose(*shown, atol=tolerance, err_msg=name)
+    height = np.zeros(215)
+    height[145:] = frames(0.15).height[1:71]
+    up = height[:, None, None] * np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(moving.probed.object_position, moving.trace.object_position - up, atol=1e-6)
+    np.testing.assert_allclose(moving.trace.wrist_position - up, moving.probed.wrist_position, atol=1e-6)
+    assert height[-1] == pytest.approx(0.15, abs=1e-6)
+    turns = Rotation.from_quat(start().reset_state.base_quaternion, scalar_first=True)
+    risen = turns.apply((moving.trace.u - still.trace.u)[-1, :, :3])
     np.testing.assert_allclose(risen, np.tile([0.0, 0.0, 0.15], (BATCH, 1)), atol=5e-4)
 
 
 def test_pushes_reach_the_object_through_the_environment():
-    action = np.zeros((BATCH, len(HAND.joints) + 6), np.float32)
-    masses = np.array([obj.mass for obj in OBJECTS], np.float32)
-    begin = protocol(masses=tuple(masses))._replace(push_start=np.float32(2))
-    velocity = np.array([np.asarray(after.object_velocity) for *_, after in lifted(action, begin, 12)])
-    np.testing.assert_allclose(velocity[1, :, 0], 0.0, atol=1e-3)
-    np.testing.assert_allclose(velocity[11, :, 0], 0.5 * 9.81 * 10 * TASK.control_dt, rtol=0.02)
-    np.testing.assert_allclose(velocity[11, :, 1], 0.0, atol=5e-3)
-
-
-def worker(task: TaskConfig, **arguments) -> RolloutWorker:
-    physics = NativePhysics(HAND, task, OBJECTS, 1)
-    bank, act = build_bank(HAND, task, OBJECTS, 0), scripted.close(HAND, task)
-    return RolloutWorker(HAND, task, physics, bank, act, batch=4, seed=0, half_precision=False, **arguments)
+    """Half of the weight along x from the third step on."""
+    rollout = released(protocol(start=NEVER)._replace(push_start=np.float32(2)), 12)
+    way = np.diff(rollout.trace.object_position, axis=0) / TASK.control_dt
+    np.testing.assert_allclose(way[0, :, 0], 0.0, atol=1e-3)
+    # The speed over a control step is that in its middle, but for half a substep.
+    np.testing.assert_allclose(way[-1, :, 0], 0.5 * 9.81 * 9.5 * TASK.control_dt, rtol=0.03)
+    np.testing.assert_allclose(way[-1, :, 1], 0.0, atol=5e-3)
 
 
 def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
-    task = dataclasses.replace(TASK, approach_steps=20, hold_steps=10, hold_steps_max=10)
-    plain, *probed = worker(task), worker(task, probe=plausibility.sample), worker(task, probe=plausibility.sample)
-    after = protocols.stress_steps(task)
-    for each in probed:
-        each.adjust(protocol=protocols.stress(task, OBJECTS, 10), probe_data=distance_field(OBJECTS))
-    ended, measured = probed
+    steps, after = TASK.approach_steps + TASK.hold_steps, protocols.stress_steps(TASK)
+    plain = suite.worker(renewed=False)
+    conditions, acts = suite.episodes(BATCH), suite.command(fingers=0.5)
+    plain.begin(conditions)
+    ended, measured = (under(protocols.stress(TASK, OBJECTS, TASK.hold_steps), conditions) for _ in range(2))
     measured.state = measured.state._replace(after=jnp.full_like(measured.state.after, after))
-    bare, one, other = (each.collect(None, 30) for each in (plain, ended, measured))
-    np.testing.assert_array_equal(one.action, other.action)
+    bare, one, other = (each.collect(acts, steps) for each in (plain, ended, measured))
+    np.testing.assert_array_equal(one.observation, other.observation)
+    assert one.has_episode.all() and one.terminal[-1].all() and other.has_episode.all()
     np.testing.assert_array_equal(one.episodes, other.episodes)
-    np.testing.assert_array_equal(bare.action, one.action)
     # A program without the probe may round otherwise, and what is left of two lengths is as wrong as these are.
-    np.testing.assert_allclose(bare.episodes, one.episodes, rtol=1e-5, atol=1e-6)
-    assert one.terminal[-1].all() and one.has_episode.all() and other.has_episode.all() and not other.terminal.any()
-    rest = measured.collect(None, after)
-    assert [program._cache_size() for program in (measured._decide_jit, measured._advance_jit)] == [1, 1]
+    np.testing.assert_allclose(bare.episodes, one.episodes, rtol=1e-5, atol=1e-5)
+    assert not other.terminal.any()
+    rest = measured.collect(acts, after)
     np.testing.assert_array_equal(rest.episodes, one.episodes)
     assert not rest.has_episode.any() and rest.terminal[-1].all() and not rest.terminal[:-1].any()
-    samples = jax.tree.map(lambda *x: np.concatenate(x), other.probed, rest.probed)
-    found = protocols.assess(samples, np.ones(4, bool), task, 10)
+    samples = jax.tree.map(lambda *x: np.concatenate(x), other.probed.sample, rest.probed.sample)
+    found = protocols.assess(samples, np.ones(BATCH, bool), TASK, TASK.hold_steps)
     assert set(found) == WITHOUT_MESHES and all(np.isfinite(value).all() for value in found.values())
-    short = protocols.assess(other.probed, np.ones(4, bool), task, 10)
+    short = protocols.assess(other.probed.sample, np.ones(BATCH, bool), TASK, TASK.hold_steps)
     assert np.isnan(short["push_survival"]).all() and short["wrist_speed"] == pytest.approx(found["wrist_speed"])
     for each in (plain, ended, measured):
         each.physics.close()
@@ -284,25 +283,25 @@ def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
 
 
 def test_attempts_with_a_lift_end_higher_in_the_world():
-    task = dataclasses.replace(TASK, approach_steps=60, hold_steps=5)
-    policy = untrained(RunConfig(task=task, network=NetworkConfig(hidden=(8,))))
-    obj, count = OBJECTS[1], task.surface_points
-    drawn = draws.sample(HAND, task, build_bank(HAND, task, [obj], 0), jax.random.key(0), 2)
+    """They have programs of their own: a lift off the table, and the policy of a bundle."""
+    obj, count, hold = OBJECTS[1], TASK.surface_points, TASK.hold_steps
+    drawn = suite.episodes(4 * BATCH)
+    drawn = jax.tree.map(lambda rows: rows[drawn.reset_state.object_index == 1][:2], drawn)
     rest = np.concatenate([drawn.reset_state.object_position, drawn.reset_state.object_quaternion], -1)
     surface = Surface(np.tile(obj.points[:count], (2, 1, 1)), np.tile(obj.non_graspable_points[:count], (2, 1)))
-    asked = {constraint.name: np.zeros(2, bool) for constraint in optional(task)}
-    attempts = Attempts(HAND, task, policy, threads=1, phases=Phases(lift=0.06, hold=0.0))
+    asked = {constraint.name: np.zeros(2, bool) for constraint in optional(TASK)}
+    attempts = Attempts(HAND, TASK, suite.policy(), threads=1, phases=Phases(lift=0.06, hold=0.0))
     outcome = attempts.run(obj, RequestedEpisodes(drawn.goal, asked, surface, rest))
     attempts.close()
-    lift = protocols.lift_steps(task, 0.06)
-    assert attempts.steps == 60 + lift + 5 == len(outcome.trace.q)
-    dt = task.control_dt
-    assert attempts.begins == {"grasp": 0.0, "lift": 60 * dt, "hold": pytest.approx((60 + lift) * dt)}
+    approach, lift = TASK.approach_steps, protocols.lift_steps(TASK, 0.06)
+    assert attempts.steps == approach + lift + hold == len(outcome.trace.q)
+    dt = TASK.control_dt
+    assert attempts.begins == {"grasp": 0.0, "lift": approach * dt, "hold": pytest.approx((approach + lift) * dt)}
     assert set(outcome.metrics) > WITHOUT_MESHES
-    way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[59]
-    slid = (outcome.trace.u[-1] - outcome.trace.u[59])[:, :3]
-    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[60:, :, 2], axis=0).max() < 0.02)
-    # The untrained hand leaves the object, and the table under it stands: it is where it was, and not held.
+    way = outcome.trace.wrist_position[-1] - outcome.trace.wrist_position[approach - 1]
+    slid = (outcome.trace.u[-1] - outcome.trace.u[approach - 1])[:, :3]
+    assert (way[:, 2] > 0.04).all() and (np.diff(outcome.trace.wrist_position[approach:, :, 2], axis=0).max() < 0.02)
+    # The untrained hand leaves the object, and the table under it remains: it is where it was, and not held.
     assert outcome.trace.table.all() and not outcome.metrics["held"].any()
     assert (outcome.trace.object_position[-1, :, 2] > 0.5 * rest[:, 2]).all()
     np.testing.assert_allclose(np.linalg.norm(way, axis=-1), np.linalg.norm(slid, axis=-1), atol=1e-5)

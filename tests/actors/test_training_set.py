@@ -21,7 +21,7 @@ from congrasp.common.task.sampling.bank import rows_of, stacked
 from congrasp.common.task.sampling.build import headings_of
 from congrasp.common.task.sampling.sets import load, load_for
 from congrasp.common.task.sampling.write_sets import make_sets, save
-from tests import draws
+from tests import task as suite
 
 HAND = get_hand("human")
 OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
@@ -38,17 +38,22 @@ def folders(tmp_path_factory):
 
 
 def _run(**objects) -> RunConfig:
-    return RunConfig(objects=ObjectsConfig(count=3, **objects))
+    return RunConfig(objects=ObjectsConfig(count=2, **objects))
 
 
-def test_a_folder_takes_the_place_of_procedural_objects_and_others_may_stand_beside_it(folders):
-    assert [obj.name for obj in training_set(HAND, _run(), 0).objects] == [
-        obj.name for obj in procedural.generate_many(3, 0)
-    ]
-    assert [obj.name for obj in training_set(HAND, _run(folder=folders[0]), 0).objects] == ["box_0", "mug_7"]
-    mixed = training_set(HAND, _run(folder=folders[0], procedural=4, folder_share=0.75), 0)
-    assert len(mixed.objects) == 6 and len(mixed.bank.points) == 6
-    np.testing.assert_allclose(mixed.bank.weight, [0.375] * 2 + [0.0625] * 4)
+@pytest.fixture(scope="module")
+def scanned(folders):
+    """The training set of the folder alone."""
+    return training_set(HAND, _run(folder=folders[0]), 0)
+
+
+def test_a_folder_replaces_procedural_objects_or_is_mixed_with_them(folders, scanned):
+    names = [obj.name for obj in training_set(HAND, _run(), 0).objects]
+    assert names == [obj.name for obj in procedural.generate_many(2, 0)]
+    assert [obj.name for obj in scanned.objects] == ["box_0", "mug_7"]
+    mixed = training_set(HAND, _run(folder=folders[0], procedural=2, folder_share=0.75), 0)
+    assert len(mixed.objects) == 4 and len(mixed.bank.points) == 4
+    np.testing.assert_allclose(mixed.bank.weight, [0.375] * 2 + [0.125] * 2)
 
 
 def test_constraint_sets_keep_their_split_and_their_references(folders):
@@ -121,8 +126,8 @@ def test_an_object_that_lies_too_flat_is_in_no_episode():
     assert row["weight"] == 0 and np.isfinite(row["heading_position"]).all()
 
 
-def test_objects_of_different_sizes_stack_and_come_apart_again(folders):
-    bank = training_set(HAND, _run(folder=folders[0]), 0).bank
+def test_objects_of_different_sizes_stack_and_come_apart_again(scanned):
+    bank = scanned.bank
     rows = rows_of(bank)
     for a, b in zip(stacked(rows), bank, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -138,7 +143,7 @@ def test_objects_of_different_sizes_stack_and_come_apart_again(folders):
     np.testing.assert_array_equal(both.pose_q[1], rows[1].pose_q)
 
 
-def test_objects_are_drawn_as_often_as_their_weights_say(folders):
-    bank = training_set(HAND, _run(folder=folders[0]), 0).bank._replace(weight=np.array([1.0, 3.0], np.float32))
-    drawn = draws.sample(HAND, TaskConfig(), bank, jax.random.key(0), 4000)
-    assert 0.72 < np.mean(np.asarray(drawn.reset_state.object_index) == 1) < 0.78
+def test_objects_are_drawn_as_often_as_their_weights_say():
+    bank = suite.bank()._replace(weight=np.array([1.0, 3.0, 0.0, 4.0], np.float32))
+    drawn = suite.episodes(2000, bank).reset_state.object_index
+    assert np.bincount(drawn, minlength=4) / len(drawn) == pytest.approx([1 / 8, 3 / 8, 0.0, 1 / 2], abs=0.03)

@@ -1,18 +1,18 @@
 """Creep of held objects under two settings of friction and solver, for the same episodes of the same policy."""
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.physics.native import NativePhysics, Scene
-from congrasp.actors.rollout import RolloutWorker, Trace, finished_episodes
+from congrasp.actors.rollout import Trace, finished_episodes
+from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import ObjectsConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool, scale_objects
 from congrasp.common.policy import bundle as bundles
-from congrasp.common.policy.bundle import act_by_mean
+from congrasp.common.policy.bundle import acting
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.plan import batches, plan_row
@@ -99,11 +99,11 @@ def _run(name: str, solver: Solver, count: int, episodes: int, threads: int) -> 
         task,
         physics,
         None,
-        functools.partial(act_by_mean, bundle.spec.layout),
+        acting(bundle.spec.layout, mean=True),
         batch=plan.total,
         seed=0,
         half_precision=False,
-        traced=slice(None),
+        traced="all",
     )
     ((conditions, _),) = batches(hand, task, bank, plan, 0, plan.total)
     worker.begin(conditions._replace(hold=np.full(plan.total, hold, np.int32)))

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from congrasp.common import rotations
+from congrasp.common import rotations as module
 from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
@@ -26,8 +26,10 @@ from congrasp.common.task.types import Goal, Surface
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.learner.algorithms.protocol import random_policy
 from congrasp.services.export.policy import export_policy
+from tests.compiled import Compiled
 
 HAND = get_hand("allegro")
+rotations = Compiled(module)
 NETWORK = NetworkConfig(hidden=(32,), encoder=4, points=(8, 16))
 POINTS = 64
 TASK = TaskConfig(hand="allegro", surface_points=POINTS, observation="camera", history=2)
@@ -41,13 +43,14 @@ def cube():
     return jnp.asarray(np.concatenate(faces)[None], jnp.float32)
 
 
+_facing = jax.jit(camera.facing)
 FRONTS = [((0.5, 0.0, 0.0), [1]), ((0.0, -0.5, 0.0), [2]), ((0.3, 0.3, 0.3), [1, 3, 5])]
 
 
 @pytest.mark.parametrize(("eye", "front"), FRONTS)
 def test_the_faces_towards_the_camera_are_visible(eye, front):
     """Hidden faces show at most their rim, within two rows of 8.3 mm: the grid's cells are 11 mm."""
-    seen = np.asarray(camera.facing(jnp.array([eye]), cube()))[0]
+    seen = np.asarray(_facing(jnp.array([eye]), cube()))[0]
     assert seen.reshape(6, 64).mean(1)[front].min() > 0.9
     points = np.asarray(cube())[0][seen]
     depth = np.min([0.03 - points[:, face // 2] * (1 if face % 2 else -1) for face in front], 0)
@@ -62,8 +65,9 @@ def test_a_capsule_hides_what_is_behind_it():
     assert hidden.tolist() == [[True, True, False, False, True]]
 
 
-def cameras(sensing, pose, points, goal, key=0):
-    sensors = draw_sensors(sensing, 0.01, jax.random.key(key), len(pose))
+@functools.partial(jax.jit, static_argnums=0)
+def cameras(sensing, pose, points, goal):
+    sensors = draw_sensors(sensing, 0.01, jax.random.key(0), len(pose))
     return camera.begin(TASK, sensors, 3, pose, Surface(points, points[..., 2] > 0.02), goal)
 
 
@@ -147,7 +151,7 @@ def cloud_block():
     raise AssertionError
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_order_of_the_points_does_not_matter(seed):
     rng, policy, block = np.random.default_rng(seed), bundle(), cloud_block()

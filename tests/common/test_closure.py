@@ -1,6 +1,8 @@
 """The one-parameter family of finger poses."""
 
-import jax.numpy as jnp
+import functools
+
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,8 +24,19 @@ from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transf
 HANDS = ("human", "allegro", "sharpa")
 
 
+@functools.cache
+def _compiled(hand):
+    """Closure pose and keypoints of a hand, each as one program."""
+    points = jax.jit(lambda q: keypoints(hand, link_transforms(hand, q)))
+    return jax.jit(functools.partial(closure_pose, hand)), points
+
+
 def _tips(hand, q):
-    return np.asarray(keypoints(hand, link_transforms(hand, jnp.asarray(q))))[len(hand.links) :]
+    return np.asarray(_compiled(hand)[1](np.asarray(q, np.float32)))[len(hand.links) :]
+
+
+def _pose(hand, closures):
+    return np.asarray(_compiled(hand)[0](np.float32(closures)))
 
 
 @pytest.mark.parametrize("name", HANDS)
@@ -39,7 +52,7 @@ def test_gaps_are_those_between_skins_along_the_cross_finger_axis(name):
     hand = get_hand(name)
     cross, radii = grasp_frame(hand).cross, hand.keypoint_radii[len(hand.links) :]
     for closure, gap in zip(CLOSURES, table_of_gaps(hand), strict=True):
-        tips = _tips(hand, np.asarray(closure_pose(hand, np.float32([closure]))))
+        tips = _tips(hand, _pose(hand, [closure]))
         skins = (tips[1:] - tips[0]) @ cross - radii[1:] - radii[0]
         assert gap == pytest.approx(skins.min(), abs=1e-4)
 
@@ -58,21 +71,24 @@ def test_the_widest_pose_opens_by_a_quarter_and_faces_the_object_as_the_open_one
 
 def test_closures_meet_the_three_poses_and_mix_between_them():
     hand = get_hand("human")
-    ends = np.asarray(closure_pose(hand, np.float32([[-1.0], [0.0], [1.0]])))
+    ends = _pose(hand, [[-1.0], [0.0], [1.0]])
     np.testing.assert_allclose(ends, [wide_angles(hand), hand.q_open, hand.q_closed], atol=1e-6)
-    half = np.asarray(closure_pose(hand, np.float32([-0.5])))
+    half = _pose(hand, [-0.5])
     np.testing.assert_allclose(half, (wide_angles(hand) + hand.q_open) / 2, atol=1e-6)
     apart = np.linspace(-1, 1, len(hand.joints), dtype=np.float32)
     for joint, closure in enumerate(apart):
-        own = np.asarray(closure_pose(hand, np.float32([closure])))[joint]
-        assert np.asarray(closure_pose(hand, apart))[joint] == pytest.approx(own, abs=1e-6)
+        own = _pose(hand, [closure])[joint]
+        assert _pose(hand, apart)[joint] == pytest.approx(own, abs=1e-6)
+
+
+_preshape = jax.jit(functools.partial(preshape, get_hand("human")))
 
 
 @settings(deadline=None, max_examples=20)
 @given(width=st.floats(0.0, 0.12), margin=st.floats(0.015, 0.06))
 def test_a_preshaped_hand_is_wider_than_the_object_by_the_margin_or_as_wide_as_it_opens(width, margin):
     hand = get_hand("human")
-    q = np.asarray(preshape(hand, np.float32([width]), np.float32(margin)))[0]
+    q = np.asarray(_preshape(np.float32([width]), np.float32(margin)))[0]
     tips, radii = _tips(hand, q), hand.keypoint_radii[len(hand.links) :]
     gap = ((tips[1:] - tips[0]) @ grasp_frame(hand).cross - radii[1:] - radii[0]).min()
     assert gap == pytest.approx(min(width + margin, widest_gap(hand)), abs=2e-3)

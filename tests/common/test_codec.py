@@ -51,14 +51,14 @@ def assert_equal(left, right):
         assert right.arrays[name].tobytes() == np.ascontiguousarray(array).tobytes()
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(arrays, metas)
 def test_round_trip_is_exact(arrays, meta):
     message = Message(arrays, meta)
     assert_equal(message, decode(encode(message)))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=30)
 @given(arrays, metas)
 def test_safetensors_reads_what_encode_writes(arrays, meta):
     read = safetensors.numpy.load(encode(Message(arrays, meta)))
@@ -201,7 +201,7 @@ def test_every_flipped_bit_is_found():
                 decode(bytes(damaged))
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=100)
 @given(st.data())
 def test_damaged_bytes_raise_nothing_else(data):
     damaged = bytearray(WHOLE)
@@ -211,14 +211,7 @@ def test_damaged_bytes_raise_nothing_else(data):
     _decode_or_refuse(bytes(damaged))
 
 
-@settings(deadline=None, max_examples=200)
-@given(st.binary(max_size=200))
-def test_random_bytes_raise_nothing_else(data):
-    _decode_or_refuse(data)
-    _decode_or_refuse(min(len(data), 8).to_bytes(8, "little") + data)
-
-
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=100)
 @given(st.dictionaries(st.sampled_from("xyz"), st.fixed_dictionaries({
     "dtype": st.sampled_from(["F32", "BOOL", "U8", "F64", ""]) | json_values,
     "shape": st.lists(st.integers(-1, 2**70) | st.integers(0, 4), max_size=10) | json_values,

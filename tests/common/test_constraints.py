@@ -1,7 +1,6 @@
 """What every constraint must keep to, so that all that is derived from its one file fits together."""
 
 import dataclasses
-import functools
 import itertools
 from collections import Counter
 
@@ -15,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from congrasp.actors.initial import InitialConditions, sample
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.objects import procedural
 from congrasp.common.request import GraspRequest
 from congrasp.common.task import metrics
 from congrasp.common.task.config import RewardWeights, TaskConfig
@@ -30,17 +28,16 @@ from congrasp.common.task.constraints import (
     require_known,
 )
 from congrasp.common.task.constraints.priority import active_blocks
-from congrasp.common.task.features import scene_of
+from congrasp.common.task.features import scene_of as traced_scene
 from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import GRASP, reward_terms, terms
-from congrasp.common.task.sampling.build import build_bank
-from tests.scenes import HAND, active, moved, scene
+from tests import task as suite
+from tests.scenes import HAND, active, evaluated, moved, scene, scene_of
+from tests.task import TASK
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
 OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional)
-TASK = TaskConfig(constraints=NAMES)
-OBJECTS = [procedural.generate(1, family) for family in ("hammer", "mug")]
-BATCH = 256
+DRAWN = 256
 CHANGES = {"fingers": {"heading", "distance", "heading_position"}, "force": {"force_excess"}}
 """Blocks and reward terms of others that a constraint changes: hand centre and distance of the set, and f_max."""
 each = pytest.mark.parametrize("constraint", CONSTRAINTS, ids=NAMES)
@@ -50,12 +47,7 @@ each_optional = pytest.mark.parametrize("constraint", OPTIONAL, ids=lambda const
 @pytest.fixture(scope="module")
 def whole():
     """A scene in which every constraint is active."""
-    return scene_of(HAND, TASK, *scene(9))
-
-
-@pytest.fixture(scope="module")
-def bank():
-    return build_bank(HAND, TASK, OBJECTS, 0)
+    return scene_of(TASK, *scene(9))
 
 
 def _without(whole, constraint):
@@ -68,7 +60,7 @@ def _without(whole, constraint):
 def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
     described, sizes = fields(HAND, TASK), dict(layout(HAND, TASK))
     names = constraint.blocks or (constraint.name,)
-    observed = constraint.observe(whole)
+    observed = evaluated(constraint.observe, whole)
     assert len(observed) == len(names) == len(constraint.fields(HAND, TASK))
     for name, parts in zip(names, observed, strict=True):
         assert [part.shape[-1] for part in parts] == [field.size for field in described[name]], name
@@ -77,7 +69,7 @@ def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
 
 
 def test_the_observation_is_as_wide_as_its_layout(whole):
-    assert observe(whole).shape == (4, sum(size for _, size in layout(HAND, TASK)))
+    assert evaluated(observe, whole).shape == (4, sum(size for _, size in layout(HAND, TASK)))
     assert dict(layout(HAND, TASK))["mask"] == len(blocks(TASK)) == 6
 
 
@@ -103,9 +95,9 @@ def test_names_are_unique_over_all_constraints():
 
 @each
 def test_what_it_declares_is_what_it_computes(constraint, whole):
-    paid, measured = constraint.reward(whole), constraint.measure(whole)
-    assert list(paid) == [weight.name for weight in constraint.weights]
-    assert list(measured) == [error.name for error in constraint.errors]
+    paid, measured = evaluated(constraint.reward, whole), evaluated(constraint.measure, whole)
+    assert sorted(paid) == sorted(weight.name for weight in constraint.weights)
+    assert sorted(measured) == sorted(error.name for error in constraint.errors)
     for error in constraint.errors:
         assert isinstance(measured[error.name], tuple) == (error.unit == ""), error.name  # ratios have no unit
         assert error.tolerance >= 0 and error.scale > 0 and error.unit in ("rad", "m", "")
@@ -120,7 +112,7 @@ def test_what_it_declares_is_what_it_computes(constraint, whole):
 def test_it_shows_pays_and_forbids_nothing_while_it_is_inactive(constraint, whole):
     off = _without(whole, constraint)
     start, mask = 0, dict(zip(blocks(TASK), range(len(blocks(TASK))), strict=True))
-    on_observation, off_observation = np.asarray(observe(whole)), np.asarray(observe(off))
+    on_observation, off_observation = evaluated(observe, whole), evaluated(observe, off)
     for name, size in layout(HAND, TASK):
         block = slice(start, start + size)
         start += size
@@ -131,12 +123,12 @@ def test_it_shows_pays_and_forbids_nothing_while_it_is_inactive(constraint, whol
             np.testing.assert_array_equal(off_observation[:, block] == 0, np.tile(np.isin(range(6), silent), (4, 1)))
         elif name not in CHANGES.get(constraint.name, ()):
             np.testing.assert_array_equal(on_observation[:, block], off_observation[:, block], err_msg=name)
-    assert not any(np.any(value) for value in constraint.reward(off).values())
+    assert not any(np.any(value) for value in evaluated(constraint.reward, off).values())
     touching, force = whole.features.touching, whole.features.force
     for before, after in zip((touching, force), constraint.earning(off, touching, force), strict=True):
         np.testing.assert_array_equal(before, after)
     # Nor does it change what the others are paid, but for contacts that it forbids and what it declares.
-    others, paid = (reward_terms(one, RewardWeights()) for one in (whole, off))
+    others, paid = (evaluated(reward_terms, one, RewardWeights()) for one in (whole, off))
     own = {weight.name for weight in constraint.weights}
     for name in set(terms(TASK)) - own - {"contact", "force"} - CHANGES.get(constraint.name, set()):
         np.testing.assert_array_equal(others[name], paid[name], err_msg=name)
@@ -209,7 +201,7 @@ def test_errors_and_rewards_do_not_depend_on_where_the_scene_is(seed):
 @jax.jit
 def _judged(state, surface, goal):
     """Observation, reward terms and errors of a scene."""
-    made = scene_of(HAND, TASK, state, surface, goal)
+    made = traced_scene(HAND, TASK, state, surface, goal)
     return observe(made), reward_terms(made, RewardWeights()), metrics.errors(made)
 
 
@@ -246,17 +238,14 @@ def test_active_blocks(asked):
     assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
 
 
-# The older emitters (see conftest.py) round the last bit otherwise in programs of more constraints.
-@functools.partial(jax.jit, static_argnums=0, compiler_options={"xla_cpu_use_fusion_emitters": True})
-def _draw(task: TaskConfig, bank, shares: dict[str, float]) -> InitialConditions:
-    return sample(HAND, dataclasses.replace(task, **shares), bank, jax.random.key(3), BATCH)
+def _drawn(names: tuple[str, ...], never: str = "") -> InitialConditions:
+    """Episodes under these constraints, each of which half of them request, but one that none requests.
 
-
-def _drawn(names: tuple[str, ...], bank, never: str = "") -> InitialConditions:
-    """Episodes under these constraints, each of which half of them request, but one that none requests."""
-    task = dataclasses.replace(TASK, constraints=names)
+    Not compiled as one program, in which the order of operations, and so the last bit, depends on the constraints.
+    """
     shares = {f"p_{c.name}": 0.5 * (c.name != never) for c in OPTIONAL if c.name in names}
-    return _draw(task, bank, shares)
+    task = dataclasses.replace(TASK, constraints=names, **shares)
+    return jax.device_get(sample(HAND, task, suite.bank(), jax.random.key(3), DRAWN))
 
 
 def _same(some: InitialConditions, more: InitialConditions, but: str, moved: np.ndarray | None = None) -> None:
@@ -283,16 +272,16 @@ def _same(some: InitialConditions, more: InitialConditions, but: str, moved: np.
 
 
 @each_optional
-def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint, bank):
+def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint):
     """A policy that knows a constraint, of which no episode has it, learns from the same episodes."""
     others = tuple(name for name in NAMES if name != constraint.name)
-    some, all_of_them = _drawn(others, bank), _drawn(NAMES, bank, never=constraint.name)
+    some, all_of_them = _drawn(others), _drawn(NAMES, never=constraint.name)
     assert not any(np.any(all_of_them.goal.active[block]) for block in constraint.blocks)
     _same(some, all_of_them, constraint.name)
 
 
-def test_episodes_with_fingers_are_those_without_in_all_else(bank):
-    some, more = _drawn(PAPER, bank), _drawn((*PAPER, "fingers"), bank)
+def test_episodes_with_fingers_are_those_without_in_all_else():
+    some, more = _drawn(PAPER), _drawn((*PAPER, "fingers"))
     _same(some, more, "fingers", np.asarray(more.goal.active["fingers"]))
     chosen = np.asarray(more.goal.active["fingers"])
     pose = np.asarray(more.goal.active["pose_finger"])

@@ -14,13 +14,12 @@ from congrasp.common.task import metrics
 from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import PAPER, get_constraint
 from congrasp.common.task.constraints.force import ForceGoal, least_force
-from congrasp.common.task.features import scene_of
 from congrasp.common.task.observation import fields
 from congrasp.common.task.reward import reward_terms, terms
 from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.types import Surface
 from congrasp.services.grasp.parse import read_request
-from tests.scenes import HAND, L, active, scene
+from tests.scenes import HAND, L, active, evaluated, scene, scene_of
 
 FORCE = get_constraint("force")
 TASK = TaskConfig(constraints=("heading", "force"))
@@ -32,7 +31,6 @@ def pressing(on: bool = True, limit: float = 3.0):
     state, surface, goal = (jax.tree.map(lambda array: array[:1], part) for part in scene(0))
     goal = goal.replace("force", limit=np.array([limit], np.float32))
     made = scene_of(
-        HAND,
         TASK,
         state,
         surface,
@@ -45,7 +43,7 @@ def pressing(on: bool = True, limit: float = 3.0):
 
 
 def test_observation_by_hand():
-    ((limit, over),) = FORCE.observe(pressing())
+    ((limit, over),) = evaluated(FORCE.observe, pressing())
     np.testing.assert_allclose(limit, [[0.15]])
     expected = np.zeros((1, L))
     expected[0, THUMB], expected[0, MIDDLE] = 2 / 7, 17 / 22  # 2 and 17 N too much, over as much and 5 N
@@ -54,16 +52,19 @@ def test_observation_by_hand():
 
 
 def test_reward_by_hand():
-    np.testing.assert_allclose(FORCE.reward(pressing())["force_over"], [-12.0])  # 2 N, and 10 of the 17
-    assert not np.any(FORCE.reward(pressing(on=False))["force_over"])
-    np.testing.assert_allclose(reward_terms(pressing(), RewardWeights())["force_over"], [-0.6])
+    np.testing.assert_allclose(evaluated(FORCE.reward, pressing())["force_over"], [-12.0])  # 2 N, and 10 of the 17
+    assert not np.any(evaluated(FORCE.reward, pressing(on=False))["force_over"])
+    np.testing.assert_allclose(evaluated(reward_terms, pressing(), RewardWeights())["force_over"], [-0.6])
 
 
 @pytest.mark.parametrize(("limit", "most"), [(3.0, 3.0), (12.0, 5.0)])
 def test_force_beyond_the_limit_earns_nothing(limit, most):
     """f_max is the smaller one of 5 N and the limit."""
     unit, weights = RewardWeights(**dict.fromkeys(terms(TASK), 1.0), force_max=5.0), HAND.contact_weights
-    paid, free = reward_terms(pressing(limit=limit), unit), reward_terms(pressing(on=False, limit=limit), unit)
+    paid, free = (
+        evaluated(reward_terms, pressing(limit=limit), unit),
+        evaluated(reward_terms, pressing(on=False, limit=limit), unit),
+    )
     expected = weights[THUMB] + weights[INDEX] * 2 / most + weights[MIDDLE]
     np.testing.assert_allclose(paid["force"], [expected], rtol=1e-6)
     np.testing.assert_allclose(paid["force_excess"], [-(5 - most) - (20 - most)], rtol=1e-6)
@@ -72,7 +73,7 @@ def test_force_beyond_the_limit_earns_nothing(limit, most):
 
 
 def test_error_is_the_share_of_steps_in_which_a_link_presses_too_hard():
-    hard, soft = metrics.errors(pressing()), metrics.errors(pressing(limit=20.5))
+    hard, soft = evaluated(metrics.errors, pressing()), evaluated(metrics.errors, pressing(limit=20.5))
     assert (hard["force_ratio"][0], soft["force_ratio"][0]) == (1.0, 0.0)
     sums, yes, no = metrics.empty_sums(TASK, 1), np.ones(1, bool), np.zeros(1, bool)
     for step, hold in ((hard, no), (hard, yes), (soft, yes), (soft, yes), (soft, yes)):
@@ -114,7 +115,7 @@ def test_a_drawn_limit_is_valid_and_enough(mass, friction, seed):
 @settings(max_examples=25, deadline=None)
 @given(st.floats(0.5, 30.0), st.floats(1.0, 3.0))
 def test_a_lower_limit_never_pays_more(limit, factor):
-    lower, higher = (reward_terms(pressing(limit=x), RewardWeights()) for x in (limit, factor * limit))
+    lower, higher = (evaluated(reward_terms, pressing(limit=x), RewardWeights()) for x in (limit, factor * limit))
     assert lower["force_over"] <= higher["force_over"] + 1e-6
     assert lower["force_excess"] <= higher["force_excess"] + 1e-6
 
@@ -145,7 +146,7 @@ def test_words():
 def test_tasks_that_do_not_know_it_are_paid_as_before():
     """f_max stays a number, whatever limit the goal holds."""
     state, surface, goal = scene(3)
-    paid = reward_terms(scene_of(HAND, TaskConfig(constraints=PAPER), state, surface, goal), RewardWeights())
+    paid = evaluated(reward_terms, scene_of(TaskConfig(constraints=PAPER), state, surface, goal), RewardWeights())
     assert "force_over" not in paid
-    total = np.linalg.norm(scene_of(HAND, TASK, state, surface, goal).features.force, axis=-1)
+    total = np.linalg.norm(scene_of(TASK, state, surface, goal).features.force, axis=-1)
     np.testing.assert_allclose(paid["force_excess"], -0.01 * np.clip(total - 5.0, 0, 50).sum(-1), rtol=1e-5)

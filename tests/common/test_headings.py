@@ -3,7 +3,7 @@
 import dataclasses
 from types import SimpleNamespace
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -59,7 +59,7 @@ def defined_opposition(obj, touchable, position, direction, cross, rounding):
     return sides[0].min() < -np.cos(np.pi / 4) + 1e-6 and sides[1].max() > np.cos(np.pi / 4) - 1e-6
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10_000), st.sampled_from(FAMILIES), st.booleans(), st.integers(0, 99))
 def test_sampled_headings_obey_the_papers_rules(seed, family, affordance, draw):
     obj = generate(seed, family)
@@ -229,20 +229,23 @@ def test_clearing_the_table_backs_out_along_the_direction():
     np.testing.assert_array_equal(cleared.direction, headings.direction)
 
 
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("family", FAMILIES)
-def test_every_family_can_be_reached_in_its_likeliest_pose(family):
-    for seed in range(3):
-        obj = generate(seed, family)
-        headings = sample_headings(obj, np.random.default_rng(0), use_affordance=False)
-        assert feasible(clear_table(headings, obj.rest_poses[0]), obj.rest_poses[0]).mean() > 0.1
+def test_every_family_can_be_reached_in_its_likeliest_pose(family, seed):
+    obj = generate(seed, family)
+    headings = sample_headings(obj, np.random.default_rng(0), use_affordance=False)
+    assert feasible(clear_table(headings, obj.rest_poses[0]), obj.rest_poses[0]).mean() > 0.1
 
 
 @pytest.mark.parametrize("family", ["bottle", "mug", "teapot", "hammer", "pan", "flashlight", "camera", "cup", "ring"])
-def test_parts_that_are_made_to_be_held_can_be(family):
-    for seed in range(3):
-        obj = generate(seed, family)
-        headings = sample_headings(obj, np.random.default_rng(0), use_affordance=True)
-        assert max(feasible(clear_table(headings, pose), pose).mean() for pose in obj.rest_poses) > 0.1
+@pytest.mark.parametrize("seed", SEEDS)
+def test_parts_that_are_made_to_be_held_can_be(family, seed):
+    obj = generate(seed, family)
+    headings = sample_headings(obj, np.random.default_rng(0), use_affordance=True)
+    assert max(feasible(clear_table(headings, pose), pose).mean() for pose in obj.rest_poses) > 0.1
 
 
 def test_a_hand_needs_room_below_its_centre():
@@ -309,8 +312,8 @@ def test_a_table_that_the_outline_clears_is_clear_of_the_hand(name):
     frame = grasp_frame(hand)
     own = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)], -1)
     turn = np.einsum("hij,kj->hik", np.stack([v, w, np.cross(v, w)], -1), own)
-    transforms = link_transforms(hand, jnp.array(hand.q_open))
-    ends = np.asarray(capsules(hand, transforms)).reshape(-1, 3) - frame.center
+    ends = jax.jit(lambda q: capsules(hand, link_transforms(hand, q)))(hand.q_open)
+    ends = np.asarray(ends).reshape(-1, 3) - frame.center
     opened = CLOSURES.tolist().index(0.0)
     lowest = np.einsum("hj,ej->he", turn[:, 2], ends) - np.repeat(hand.capsule_radii, 2)
     np.testing.assert_allclose(depth_below(outline(hand), up)[opened], -lowest.min(-1), atol=1e-6)

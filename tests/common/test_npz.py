@@ -36,7 +36,9 @@ def test_arrays_come_back(tmp_path):
 @pytest.mark.parametrize(
     ("members", "why"),
     [
-        pytest.param({"a.npy": _npy((1 << 30,), "|u1", bytes(1 << 30))}, "512 MB", id="inflates to 1 GB"),
+        pytest.param(
+            {"a.npy": _npy((1 << 30,), "|u1", bytes(1 << 30))}, "512 MB", id="inflates to 1 GB", marks=pytest.mark.slow
+        ),
         pytest.param({f"{i}.npy": _npy((64 << 20,), "|u1", bytes(64 << 20)) for i in range(9)}, "512 MB", id="nine"),
         pytest.param({"a.npy": _npy((1 << 40,))}, "bytes, which is not", id="claims 8 TB"),
         pytest.param({"a.npy": _npy((1 << 62, 8))}, "bytes, which is not", id="claims more than there is"),

@@ -34,15 +34,15 @@ def test_nothing_else_must_be_changed():
 def reward():
     """It is paid with its weight, beside the others."""
     from congrasp.common.task.config import RewardWeights, TaskConfig
-    from congrasp.common.task.features import scene_of
     from congrasp.common.task.reward import reward_terms, terms
-    from tests.scenes import HAND, scene
+    from tests.scenes import evaluated, scene, scene_of
 
     task, (state, surface, goal) = TaskConfig(), scene(0, batch=3)
     start = state.object_position_initial * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.1]
     risen = start + np.array([[0.0, 0.0, 0.05], [0.0, 0.0, -0.05], [0.0, 0.0, 0.8]])
     state = state._replace(object_position=risen, object_position_initial=start)
-    paid = reward_terms(scene_of(HAND, task, state, surface, goal), dataclasses.replace(RewardWeights(), height=3.0))
+    weights = dataclasses.replace(RewardWeights(), height=3.0)
+    paid = evaluated(reward_terms, scene_of(task, state, surface, goal), weights)
     np.testing.assert_allclose(paid["height"], [3.0 * 0.05, 0.0, 3.0 * 0.2], rtol=1e-5)
     assert set(paid) == set(terms(task)) and "height" in terms(task)
 

@@ -1,5 +1,6 @@
 """The paper's priority rules."""
 
+import functools
 import itertools
 
 import jax
@@ -7,22 +8,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
+from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task.constraints.priority import explain, resolve
-from tests.scenes import HAND, scene
+from tests.scenes import HAND, points_of, scene
 
 
 def _flags(affordance: bool = False, pose: bool = False, trajectory: bool = False) -> dict[str, np.ndarray]:
     return {"affordance": np.full(4, affordance), "pose": np.full(4, pose), "trajectory": np.full(4, trajectory)}
 
 
-_compiled = jax.jit(lambda surface, asked: resolve(HAND, surface, asked, _flags(affordance=True)))
+resolved = jax.jit(functools.partial(resolve, HAND))
 
 
 def _resolve(affordance: bool, pose: bool, trajectory: bool):
     _, surface, asked = scene(0)
-    return asked, resolve(HAND, surface, asked, _flags(affordance, pose, trajectory))
+    return asked, resolved(surface, asked, _flags(affordance, pose, trajectory))
 
 
 @pytest.mark.parametrize(("affordance", "pose", "trajectory"), list(itertools.product([False, True], repeat=3)))
@@ -47,8 +49,6 @@ def test_a_lone_heading_stays_as_asked():
 
 @pytest.mark.parametrize("trajectory", [False, True])
 def test_an_overridden_heading_is_that_of_the_overriding_reference(trajectory):
-    from scipy.spatial.transform import Rotation
-
     asked, done = _resolve(False, not trajectory, trajectory)
     q = asked["trajectory"].quaternion[0, -1] if trajectory else asked["pose"].quaternion[0]
     expected = Rotation.from_quat(q, scalar_first=True).apply(grasp_frame(HAND).heading)
@@ -64,13 +64,13 @@ def test_a_lone_trajectorys_heading_is_at_the_centre_of_a_hand_that_is_closed_by
     path[:, -1], turns[:, -1] = (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)
     asked = asked.replace("trajectory", position=path, quaternion=turns)
     q = 0.6 * HAND.q_open + 0.4 * HAND.q_closed
-    tips = np.asarray(keypoints(HAND, link_transforms(HAND, q)))[len(HAND.links) :]
+    tips = np.asarray(points_of(q))[len(HAND.links) :]
     center = (tips[0] + (tips[1] + tips[2] + tips[3] + tips[4]) / 4) / 2
-    alone = resolve(HAND, surface, asked, _flags(trajectory=True)).goal
+    alone = resolved(surface, asked, _flags(trajectory=True)).goal
     np.testing.assert_allclose(alone["heading"].position, np.tile(np.add(center, (1, 2, 3)), (4, 1)), atol=1e-5)
     # The fingers of a reference pose are known, and taken as they are.
-    both = resolve(HAND, surface, asked, _flags(pose=True, trajectory=True)).goal
-    tips = np.asarray(keypoints(HAND, link_transforms(HAND, asked["pose"].q)))[:, len(HAND.links) :]
+    both = resolved(surface, asked, _flags(pose=True, trajectory=True)).goal
+    tips = np.asarray(points_of(asked["pose"].q))[:, len(HAND.links) :]
     expected = np.array([1, 2, 3]) + (tips[:, 0] + tips[:, 1:].mean(1)) / 2
     np.testing.assert_allclose(both["heading"].position, expected, atol=1e-5)
 
@@ -95,21 +95,23 @@ def test_affordance_turns_a_heading_that_comes_nearer_to_the_avoid_region(at_avo
     down = np.tile(np.array([0.0, 0.0, -1.0], np.float32), (4, 1))
     cross = np.tile(np.array([0.0, 1.0, 0.0], np.float32), (4, 1))
     asked = asked.replace("heading", position=where, direction=down, cross=cross)
-    done = resolve(HAND, surface, asked, _flags(affordance=True))
+    done = resolved(surface, asked, _flags(affordance=True))
     assert np.all(np.asarray(done.redirected) == at_avoided)
     np.testing.assert_allclose(done.goal["heading"].position[:, 0], 0.1, atol=1e-3)
-    assert not np.any(resolve(HAND, surface, asked, _flags()).redirected)
+    assert not np.any(resolved(surface, asked, _flags()).redirected)
 
 
 def _redirected(points: list[list[float]], avoid: list[list[float]], direction: list[float], cross: list[float]):
     """The heading of a hand that comes along a direction to (-0.1, 0, 0), and of an object with these points."""
     _, surface, asked = scene(1)
     rows = lambda v: np.tile(np.array(v, np.float32), (4, 1))  # noqa: E731
-    cloud = np.tile(np.float32([*points, *avoid]), (4, 1, 1))
+    # As many as in the other tests, so that one program does for all: the last of each region counts several times.
+    points = [*points, *[points[-1]] * (48 - len(points))]
+    cloud = np.tile(np.float32([*points, *avoid, *[avoid[-1]] * (16 - len(avoid))]), (4, 1, 1))
     surface = surface._replace(points=cloud, avoid=np.tile(np.arange(cloud.shape[1]) >= len(points), (4, 1)))
     asked = asked.replace("heading", position=rows([-0.1, 0, 0]), direction=rows(direction), cross=rows(cross))
-    done = resolve(HAND, surface, asked, _flags(affordance=True))
-    assert np.all(done.redirected) and not np.any(resolve(HAND, surface, done.goal, _flags(affordance=True)).redirected)
+    done = resolved(surface, asked, _flags(affordance=True))
+    assert np.all(done.redirected) and not np.any(resolved(surface, done.goal, _flags(affordance=True)).redirected)
     return jax.tree.map(lambda array: np.asarray(array)[0], done.goal["heading"])
 
 
@@ -166,9 +168,9 @@ def test_rounding_does_not_decide_on_the_roll_of_a_redirected_heading(wobble):
 def test_redirected_headings_lead_to_the_graspable_region(seed):
     """For any cloud: a point of the region is 2 cm before the position, and the rules have nothing more to change."""
     _, surface, asked = scene(seed)
-    done = _compiled(surface, asked)
+    done = resolved(surface, asked, _flags(affordance=True))
     moved, heading = np.asarray(done.redirected), jax.device_get(done.goal["heading"])
-    assert not np.any(_compiled(surface, done.goal).redirected)
+    assert not np.any(resolved(surface, done.goal, _flags(affordance=True)).redirected)
     before = heading.position - 0.02 * heading.direction
     away = np.where(surface.avoid, np.inf, np.linalg.norm(surface.points - before[:, None], axis=-1)).min(-1)
     assert (away[moved] < 1e-5).all()
@@ -182,7 +184,7 @@ def test_a_cross_finger_direction_along_the_heading_is_replaced_by_an_orthogonal
     _, surface, asked = scene(3)
     for wobble in (0.0, 1e-7):
         cross = asked["heading"].direction + np.float32([wobble, 0, 0])
-        heading = resolve(HAND, surface, asked.replace("heading", cross=cross), _flags()).goal["heading"]
+        heading = resolved(surface, asked.replace("heading", cross=cross), _flags()).goal["heading"]
         np.testing.assert_allclose(np.sum(heading.cross * heading.direction, -1), 0.0, atol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(heading.cross, axis=-1), 1.0, atol=1e-6)
 
@@ -194,8 +196,8 @@ def test_trajectory_and_affordance_must_agree(end_x, aligned):
     path[:, -1] = [end_x, 0.0, 0.05]
     asked = asked.replace("trajectory", position=path)
     both = _flags(affordance=True, trajectory=True)
-    assert np.all(np.asarray(resolve(HAND, surface, asked, both).aligned) == aligned)
-    assert np.all(resolve(HAND, surface, asked, _flags(trajectory=True)).aligned)
+    assert np.all(np.asarray(resolved(surface, asked, both).aligned) == aligned)
+    assert np.all(resolved(surface, asked, _flags(trajectory=True)).aligned)
 
 
 def test_explanations_name_what_is_overridden():

@@ -6,8 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from congrasp.common import rotations
+from congrasp.common import rotations as module
+from tests.compiled import Compiled
 
+rotations = Compiled(module)
 seeds = st.integers(0, 2**31)
 
 
@@ -19,7 +21,7 @@ def _wxyz(rotation: Rotation) -> np.ndarray:
     return rotation.as_quat(scalar_first=True).astype(np.float32)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seeds, seeds)
 def test_products_rotations_and_matrices_agree_with_scipy(a, b):
     first, second = _random(a), _random(b)
@@ -34,7 +36,7 @@ def test_products_rotations_and_matrices_agree_with_scipy(a, b):
     )
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seeds)
 def test_matrix_to_quaternion_and_back(seed):
     rotation = _random(seed)
@@ -44,7 +46,7 @@ def test_matrix_to_quaternion_and_back(seed):
         np.testing.assert_allclose(rotations.to_matrix(rotations.from_matrix(matrix)), matrix, atol=1e-5)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seeds)
 def test_euler_angles_are_intrinsic_xyz(seed):
     rng = np.random.default_rng(seed)

@@ -11,17 +11,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from congrasp.common import rotations
+from congrasp.common import rotations as module
 from congrasp.common.ranges import task_faults
 from congrasp.common.task import observation, sensing
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import Readings, Sensors
+from tests.compiled import Compiled
 from tests.scenes import HAND, F, L, N, scene
 
 TASK = TaskConfig(observation="tracked", surface_points=N, constraints=("heading", "affordance", "fingers"))
 FULL = dataclasses.replace(TASK, observation="full")
 STEPS = 40
+rotations = Compiled(module)
+
+
+_draw_sensors = jax.jit(sensing.draw_sensors, static_argnums=(0, 1, 3))
 
 
 def sensors(position_bias=(0.0, 0.0, 0.0), rotation_bias=(0.0, 0.0, 0.0), **given):
@@ -70,7 +75,7 @@ def test_a_perfect_tracker_shows_the_true_pose():
     np.testing.assert_array_equal(shown(sensors(), PATH, 1), PATH)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(delay=st.integers(0, 12))
 def test_a_delay_of_k_steps_shows_the_pose_of_k_steps_ago(delay):
     expected = [np.concatenate(truth(step - delay)) for step in range(STEPS)]
@@ -84,7 +89,7 @@ def test_samples_are_held_until_the_next_one_arrives():
     np.testing.assert_array_equal(found, [0, 0, 0, 0, 1, 1, 1, 4, 4, 6, 6, 6, 9, 9, 11])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(dropout=st.floats(0.0, 1.0), period=st.floats(1.0, 10.0))
 def test_what_is_lost_leaves_the_last_pose(dropout, period):
     """Every step shows what the step before it showed, or the present pose; all are lost at 1, none at 0."""
@@ -118,7 +123,7 @@ def test_an_offset_is_that_of_every_sample():
     down = rotations.rotate(jnp.asarray(found[0, 3:]), jnp.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(down, [0.0, 0.0, -1.0], atol=1e-5)
     config = SensingConfig(position_bias=(0.004, 0.004), rotation_bias=(0.03, 0.03))
-    drawn = jax.device_get(sensing.draw_sensors(config, 0.01, jax.random.key(0), 4000))
+    drawn = jax.device_get(_draw_sensors(config, 0.01, jax.random.key(0), 4000))
     np.testing.assert_allclose(drawn.position_bias.std(0), 0.004, rtol=0.05)
     np.testing.assert_allclose(drawn.rotation_bias.std(0), 0.03, rtol=0.05)
 
@@ -133,11 +138,13 @@ def test_where_an_object_rests_is_the_mean_of_its_readings_until_it_moves():
     )
     rows = rows.astype(np.float32)
 
+    track = jax.jit(sensing.track, static_argnums=5)
+
     def means(table, settle):
         tracker, found = sensing.begin(sensors(), 1, rows[:1, :3], rows[:1, 3:]), []
         for step, row in enumerate(rows[1:], 1):
             there = jnp.array([step < table])
-            tracker = sensing.track(tracker, jnp.array([step]), row[None, :3], row[None, 3:], there, settle)
+            tracker = track(tracker, jnp.array([step]), row[None, :3], row[None, 3:], there, settle)
             found.append(np.asarray(tracker.first[0]))
         return np.array(found)
 
@@ -152,18 +159,21 @@ def test_where_an_object_rests_is_the_mean_of_its_readings_until_it_moves():
 def test_trackers_are_drawn_from_their_ranges():
     """60 ms are 6 control steps of 10 ms; a tracker that is faster than control samples once a step."""
     config = SensingConfig((0.0, 0.1), (0.06, 0.1), (0.0, 0.01), (0.02, 0.1), (0.1, 0.3), latency=(0.0, 0.03))
-    drawn = jax.device_get(sensing.draw_sensors(config, 0.01, jax.random.key(0), 500))
+    drawn = jax.device_get(_draw_sensors(config, 0.01, jax.random.key(0), 500))
     assert set(np.unique(drawn.delay)) == {6, 7, 8, 9, 10} and sensing.longest(config, 0.01) == 11
     assert drawn.period.min() == 1.0 and 9.9 < drawn.period.max() <= 10.0
     assert 0.1 <= drawn.dropout.min() < 0.11 and 0.29 < drawn.dropout.max() <= 0.3
     assert drawn.position_noise.max() <= 0.01 and drawn.rotation_noise.min() >= 0.02
     assert set(np.unique(drawn.latency)) == {0, 1, 2, 3}
     assert len(np.unique(drawn.key, axis=0)) == 500
-    perfect = jax.device_get(sensing.draw_sensors(SensingConfig(), 0.01, jax.random.key(0), 3))
+    perfect = jax.device_get(_draw_sensors(SensingConfig(), 0.01, jax.random.key(0), 3))
     assert not any(np.any(field) for field in perfect[3:-1]) and (perfect.period == 1.0).all()
 
 
-@settings(max_examples=20, deadline=None)
+_push = jax.jit(sensing.push)
+
+
+@settings(max_examples=8, deadline=None)
 @given(pushed=npst.arrays(np.float32, (7, 2, 3), elements=st.floats(-1, 1, width=32)), steps=st.integers(1, 5))
 def test_readings_are_the_last_ones_newest_first(pushed, steps):
     def reading(row):
@@ -171,7 +181,7 @@ def test_readings_are_the_last_ones_newest_first(pushed, steps):
 
     readings = sensing.still(reading(pushed[0]), steps)
     for row in pushed[1:]:
-        readings = sensing.push(readings, reading(row))
+        readings = _push(readings, reading(row))
     for field in readings:
         np.testing.assert_array_equal(field, np.stack(pushed[::-1][:steps], 1))
 

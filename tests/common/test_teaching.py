@@ -1,6 +1,7 @@
 """The teacher's targets in the terms of a student, by numbers worked out here and through both controllers."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +14,13 @@ from congrasp.common.task.control import decode, guided
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.observation import observe
 from congrasp.common.task.teaching import extra, observe_for_teacher, student_action
-from tests.scenes import HAND, N, scene
+from tests.scenes import HAND, N, evaluated, scene
+from tests.scenes import scene_of as compiled_scene
 
 ALLEGRO = get_hand("allegro")
+
+
+_student_action = jax.jit(functools.partial(student_action, ALLEGRO, ControlConfig()))
 
 
 def label(teacher, ahead, limit, velocity, table, own):
@@ -28,7 +33,7 @@ def label(teacher, ahead, limit, velocity, table, own):
     rows = np.array([*along(ahead), limit, *along(velocity), table, *along(own), *lag], np.float32)
     assert len(rows) == extra(ALLEGRO)
     action = np.append(np.full(16, 0.3), along(teacher)).astype(np.float32)
-    found = np.asarray(student_action(ALLEGRO, ControlConfig(), jnp.asarray(rows), jnp.asarray(action)))
+    found = np.asarray(_student_action(rows, action))
     np.testing.assert_allclose(found[:16], action[:16] + lag / 0.1, atol=1e-6)  # alpha_f = 0.1 rad
     np.testing.assert_allclose(found[17:], 0.0, atol=1e-6)
     return found[16]
@@ -51,7 +56,7 @@ def test_with_its_label_a_student_gives_the_wrist_the_teacher_s_target():
     tracked = dataclasses.replace(task, sensing=dataclasses.replace(task.sensing, position_noise=(0.0, 0.01)))
     state, surface, goal = scene(5)
     state = state._replace(u_velocity=0.1 * state.u_velocity)  # as slow as its limits allow
-    ahead = guided(scene_of(HAND, task, state, surface, goal), task.control).ahead
+    ahead = evaluated(guided, compiled_scene(task, state, surface, goal), task.control).ahead
     state = state._replace(u=state.u + ahead - 0.004)  # and near its guidance
     off = np.array([[0.004, -0.003, 0.002]], np.float32)
     seen = state._replace(

@@ -110,6 +110,7 @@ class Cluster:
         return {name: process.wait(20) for name, process in self.processes.items()}
 
 
+@pytest.mark.slow
 def test_a_run_on_three_hosts(hosts, tmp_path):
     cluster = Cluster(hosts, tmp_path)
     (script,) = cluster.words("certs", SERVICES["certs"]["command"])

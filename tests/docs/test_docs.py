@@ -53,7 +53,9 @@ def commands_of_modules():
 
 @pytest.mark.parametrize("line", list(command_lines()))
 def test_every_command_line_parses(line):
-    """Names of commands and options are right, and values have the right form; nothing is run."""
+    """Names of commands and options are right, values have the right form, and examples exist; nothing is run."""
+    for name in re.findall(r"\bexamples/[\w.-]+", line):
+        assert (ROOT / name).is_file(), name
     words = shlex.split(PLACEHOLDERS.sub("x", line), comments=True)
     for stop in ("|", "&&", "&", ">"):
         words = words[: words.index(stop)] if stop in words else words
@@ -101,12 +103,6 @@ def test_help_pages_speak_to_people(capsys):
             assert f"\n  congrasp {' '.join(words)}" in page, words
             for noise in ("{None}", "None}", "options options", "[[", "(default: )", "(default: None)"):
                 assert noise not in page, (words, noise)
-
-
-@pytest.mark.parametrize("line", list(command_lines()))
-def test_the_files_of_the_examples_are_there(line):
-    for name in re.findall(r"\bexamples/[\w.-]+", line):
-        assert (ROOT / name).is_file(), name
 
 
 def test_the_mug_is_what_its_code_makes(tmp_path):

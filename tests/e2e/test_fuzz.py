@@ -1,6 +1,6 @@
 """Mutated messages at every key, and mutated files at every loader: no traceback, no growth, no hang.
 
-Each takes half of `CONGRASP_FUZZ_SECONDS`, 10 by default, from the seed `CONGRASP_FUZZ_SEED`, 0 by default:
+Each takes half of `CONGRASP_FUZZ_SECONDS`, 4 by default, from the seed `CONGRASP_FUZZ_SEED`, 0 by default:
 
     CONGRASP_FUZZ_SECONDS=600 pytest tests/e2e/test_fuzz.py -n 0
 """
@@ -54,7 +54,7 @@ from tests.rollouts import random_arrays
 from tests.services.serve.test_requests import arrays as query_arrays
 from tests.services.test_hostile_inputs import BVH
 
-SECONDS = float(os.environ.get("CONGRASP_FUZZ_SECONDS", "10")) / 2
+SECONDS = float(os.environ.get("CONGRASP_FUZZ_SECONDS", "4")) / 2
 SEED = int(os.environ.get("CONGRASP_FUZZ_SEED", "0"))
 KEYS = Keys("chaos")
 FORM = RolloutForm(3, 2, 32, 4, half=True)

@@ -1,6 +1,6 @@
 """One who does not read, asks without end, says nothing, sends too much or is slow holds nobody else up.
 
-The attackers are programs in processes of their own (`services.bench.attackers`).
+The attackers are programs in processes of their own (`tests.benchmarks.attackers`).
 """
 
 import contextlib
@@ -125,6 +125,7 @@ def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
     assert (weights.arrays["actor/w"] == weights.meta["version"]).all()
 
 
+@pytest.mark.slow
 def test_three_slow_links_leave_the_weights_to_others():
     """8 MB at 200 kB/s: forty seconds each, in which answers that wait for their readers would hold up all pulls."""
 

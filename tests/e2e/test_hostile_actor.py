@@ -7,17 +7,12 @@ import sys
 import pytest
 
 from tests.attackers import ATTACKS
-from tests.cluster import ROOT, Cluster
+from tests.cluster import ROOT
+
+SLOW = ("show_tokens", "publish_logs")  # the hub's own tests have tokens by the thousand
 
 
-@pytest.fixture
-def cluster(tmp_path):
-    made = Cluster(tmp_path)
-    yield made
-    made.close()
-
-
-@pytest.mark.parametrize("what", ATTACKS)
+@pytest.mark.parametrize("what", [pytest.param(what, marks=[pytest.mark.slow] * (what in SLOW)) for what in ATTACKS])
 def test_the_run_goes_on_beside_an_attacker(cluster, what):
     learner = cluster.start_learner()
     command = [sys.executable, str(ROOT / "tests" / "attackers.py"), what, cluster.endpoint, "chaos"]

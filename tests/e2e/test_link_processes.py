@@ -10,7 +10,7 @@ import pytest
 
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.wire.codec import Message, encode
-from tests.cluster import KEYS, A, B, D, T, rollout
+from tests.cluster import KEYS, A, B, D, T, assert_books_balance, rollout
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -19,18 +19,10 @@ def actors(status):
     return {role["incarnation"] for role in status["roles"] if role["role"] == "actor"}
 
 
-def assert_books_balance(final):
-    ledger = final["counters"]
-    assert ledger["accepted"] == ledger["consumed"] + ledger["dropped"] + ledger["queued"]
-    assert ledger["granted"] == ledger["running"] + ledger["redeemed"] + ledger["returned"] + ledger["expired"]
-    assert ledger["consumed"] == len(final["history"])
-    assert len({tuple(identity) for identity in final["history"]}) == len(final["history"])
-
-
 def test_actor_killed_while_it_uploads_leaves_nothing_behind(cluster):
     cluster.options["steps"] = 2000  # a rollout has about 2.8 MB, and one is always on its way
     learner = cluster.start_learner()
-    for _ in range(3):
+    for _ in range(2):
         actor = cluster.start_actor()
         before = cluster.wait(lambda status: len(actors(status)) == 1)["counters"]["accepted"]
         cluster.wait(lambda status, before=before: status["counters"]["accepted"] >= before + 4)
@@ -47,37 +39,7 @@ def test_actor_killed_while_it_uploads_leaves_nothing_behind(cluster):
     }
     # All that was acknowledged was learnt from, or waited at the end.
     assert len(acknowledged - history) <= final["counters"]["queued"] + final["counters"]["dropped"]
-    assert len({incarnation for incarnation, _ in history}) == 3
-
-
-def test_learner_killed_and_restarted_counts_every_rollout_once(cluster):
-    learner = cluster.start_learner()
-    actor = cluster.start_actor()
-    for _ in range(3):
-        version = cluster.wait(bool)["version"]
-        cluster.wait(lambda status, version=version: status["version"] >= version + 5)
-        time.sleep(random.uniform(0, 0.05))
-        learner.send_signal(signal.SIGKILL)
-        learner.wait(5)
-        time.sleep(0.3)
-        learner = cluster.start_learner()
-    version = cluster.wait(bool)["version"]
-    cluster.wait(lambda status: status["version"] >= version + 5)
-    assert actor.poll() is None
-    final, _ = cluster.stop(learner)
-    assert actor.wait(10) == 0, (cluster.folder / "actor.err").read_text()
-    assert_books_balance(final)
-    outcomes = cluster.outcomes()
-    assert sorted(entry["sequence"] for entry in outcomes) == list(range(len(outcomes)))
-    by_outcome = {name: set() for name in ("accepted", "duplicate", "stale", "unknown")}
-    for entry in outcomes:
-        by_outcome[entry["outcome"]].add(entry["sequence"])
-    acknowledged, unknown = by_outcome["accepted"] | by_outcome["duplicate"], by_outcome["unknown"]
-    assert len(unknown) <= 2  # on their way when the learner ended
-    assert {identity[2] for identity in final["history"]} <= acknowledged | unknown
-    ledger = final["counters"]
-    counted = sum(ledger[name] for name in ("consumed", "dropped", "queued", "stale", "missing"))
-    assert len(outcomes) - len(unknown) <= counted <= len(outcomes)
+    assert len({incarnation for incarnation, _ in history}) == 2
 
 
 def test_learner_started_from_scratch_makes_actors_start_over(cluster):

@@ -16,40 +16,13 @@ from congrasp.common.errors import CongraspError
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.checkpoint import Checkpoints
 from tests.benchmarks import toy
-from tests.learner.test_ppo import rollout
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-
-
-def run_stream(directory: pathlib.Path, first: int, last: int) -> None:
-    """Runs updates `first` to `last` - 1 of a fixed stream, from the checkpoint that is there, and leaves one."""
-    algorithm = PPO(toy.SPEC, toy.SETTINGS)
-    state = algorithm.init(3)
-    checkpoints = Checkpoints(directory)
-    if first:
-        state, meta = checkpoints.load(state)
-        assert meta == {"next": first}
-    for seed in range(first, last):
-        state, _ = algorithm.update(state, rollout(toy.bundle_of(state), seed))
-    checkpoints.save(state, {"next": last}, state.version)
 
 
 def in_a_fresh_process(script: str, directory: pathlib.Path) -> int:
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
     return subprocess.run([sys.executable, "-c", script, str(directory)], env=environment, timeout=120).returncode
-
-
-def test_half_save_load_half_equals_the_whole_bit_for_bit(tmp_path):
-    run_stream(tmp_path / "whole", 0, 6)
-    run_stream(tmp_path / "halves", 0, 3)
-    script = """
-import pathlib, sys
-from tests.learner.test_checkpoint import run_stream
-run_stream(pathlib.Path(sys.argv[1]), 3, 6)
-"""
-    assert in_a_fresh_process(script, tmp_path / "halves") == 0
-    whole, halves = ((tmp_path / name / "latest").read_bytes() for name in ("whole", "halves"))
-    assert whole == halves
 
 
 def tree(value: float) -> dict:

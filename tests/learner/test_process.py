@@ -2,11 +2,7 @@
 
 import contextlib
 import dataclasses
-import os
 import pathlib
-import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -20,8 +16,6 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
-from congrasp.common.transport.ports import free_port
-from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.learner.algorithms import ppo
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.process import run_learner
@@ -110,68 +104,6 @@ def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub):
     MadeUpActor(MemoryTransport(hub))
     assert learn(tmp_path, hub, audit=False).version == 3
     assert not (tmp_path / "accepted").exists() and not (tmp_path / "audit").exists()
-
-
-LEARNER = """
-import dataclasses, pathlib, sys, threading
-from congrasp.common.transport.zenoh_transport import ZenohTransport
-from congrasp.learner.process import run_learner
-from congrasp.learner.run_directory import open_run
-
-run_dir, endpoint, goal, resume = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), sys.argv[4] == "resume"
-with ZenohTransport(listen=[endpoint]) as transport:
-    run_learner(
-        run_dir, dataclasses.replace(open_run(run_dir), updates=goal), transport,
-        stop_event=threading.Event(), resume=resume,
-        on_update=lambda values: print(int(values["update"]), int(values["version"]), flush=True),
-    )
-"""
-
-
-@pytest.mark.timeout(150)
-def test_a_learner_killed_for_real_resumes_and_the_actor_goes_on(tmp_path):
-    """Killed between two checkpoints; its second session redoes the lost updates under versions of their own."""
-    create_run(tmp_path, dataclasses.replace(CONFIG, checkpoint_every=4))
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-
-    def start(goal: int, mode: str) -> subprocess.Popen:
-        command = [sys.executable, "-c", LEARNER, str(tmp_path), endpoint, str(goal), mode]
-        cache = str(tmp_path / "compiled")  # as on a machine where the learner has run before
-        environment = {
-            **os.environ,
-            "JAX_PLATFORMS": "cpu",
-            "JAX_COMPILATION_CACHE_DIR": cache,
-            "PYTHONPATH": str(ROOT),
-        }
-        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-
-    def figures(lines: list[str]) -> list[tuple[int, ...]]:
-        return [tuple(map(int, line.split())) for line in lines]
-
-    sessions = [start(10**6, "fresh")]
-    try:
-        with ZenohTransport(connect=[endpoint], wait=60.0) as transport:
-            actor = MadeUpActor(transport)
-            lines = [sessions[0].stdout.readline() for _ in range(5)]
-            sessions[0].send_signal(signal.SIGKILL)
-            first = figures([*lines, *sessions[0].stdout.readlines()])
-            kept = int((tmp_path / "checkpoints" / "latest").resolve().stem.removeprefix("checkpoint_"))
-            sessions.append(start(kept + 4, "resume"))
-            text, _ = sessions[1].communicate(timeout=90.0)
-            actor.join(10.0)
-            assert actor.ended == "The run is finished."
-    finally:
-        for session in sessions:
-            session.kill()
-            session.wait(10.0)
-            session.stdout.close()
-    assert sessions[1].returncode == 0
-    second = figures(text.splitlines())
-    assert kept >= 4 and kept % 4 == 0
-    assert [update for update, _ in second] == [kept + 1, kept + 2, kept + 3, kept + 4]
-    versions = [version for _, version in first + second]
-    assert versions == sorted(set(versions))
-    assert actor.versions == sorted(actor.versions) and actor.versions[-1] > first[-1][1]
 
 
 def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(tmp_path, hub):

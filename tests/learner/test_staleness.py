@@ -102,34 +102,6 @@ def test_a_rollout_of_an_earlier_session_comes_in_under_a_present_ticket_of_its_
     assert staleness.arrive(A, "new", 0) == "full"  # until the next version
 
 
-def test_rollout_without_a_ticket_comes_in_only_where_there_is_room():
-    staleness = manager(batch=1)  # room for 2
-    assert staleness.arrive(A, "lost", 0) == "accepted"
-    assert staleness.grant(B, "x")
-    assert staleness.arrive(A, "lost too", 0) == "full"
-    assert staleness.arrive(B, "x", 0) == "accepted"
-    assert staleness.arrive(A, "lost too", 0) == "full"
-    assert staleness.take(0)
-    staleness.publish(1)
-    assert staleness.arrive(A, "lost too", 0) == "accepted"
-
-
-def test_old_rollouts_are_refused_or_dropped_and_counted():
-    staleness = manager()
-    staleness.grant(A, "x")
-    staleness.grant(A, "y")
-    assert staleness.arrive(A, "x", 0) == "accepted"
-    staleness.publish(2)
-    assert staleness.arrive(A, "y", 0) == "stale"
-    assert staleness.arrive(A, "z", 1) == "accepted"
-    assert staleness.arrive(A, "z", 3) == "stale"  # made by a version that this learner never had
-    assert not staleness.take(0)
-    assert staleness.take(1)
-    counters = staleness.counters()
-    assert (counters["accepted"], counters["dropped"], counters["consumed"], counters["stale"]) == (2, 1, 1, 2)
-    assert counters["running"] == 0
-
-
 def test_checkpoint_keeps_what_is_settled():
     staleness = manager()
     staleness.grant(A, "x")

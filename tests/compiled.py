@@ -1,0 +1,24 @@
+"""Functions of a module as one program each: alone, every operation in them would be compiled for itself."""
+
+import functools
+import types
+from typing import Any
+
+import jax
+
+
+class Compiled:
+    """The functions of a module, compiled when they are first called.
+
+    Args:
+      module: the module.
+      given: first arguments of every function, which are constants of its program.
+    """
+
+    def __init__(self, module: types.ModuleType, *given: Any):
+        self._module, self._given = module, given
+
+    def __getattr__(self, name: str) -> Any:
+        found = jax.jit(functools.partial(getattr(self._module, name), *self._given))
+        setattr(self, name, found)
+        return found
