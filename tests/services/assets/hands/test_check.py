@@ -19,6 +19,7 @@ from congrasp.services.train.recipe import recipe
 
 CLAW = import_hand(pathlib.Path(__file__).parents[3] / "hands" / "claw.urdf").hand
 HANDS = {"claw": CLAW, **{name: get_hand(name) for name in ("human", "allegro", "sharpa")}}
+SLOW = ("allegro", "sharpa")
 
 
 def with_joints(hand, change, only=""):
@@ -44,7 +45,7 @@ def verdicts(hand):
     return lines, found
 
 
-@pytest.mark.parametrize("name", HANDS)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in HANDS])
 def test_good_hands_pass_every_check(name):
     lines, found = verdicts(HANDS[name])
     assert not found.failed and {finding.verdict for finding in lines.values()} == {"passed"}

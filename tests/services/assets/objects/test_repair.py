@@ -22,8 +22,8 @@ def ball(**options):
 
 
 @pytest.fixture
-def brought(tmp_path):
-    """Imports a mesh, or bytes, from a file of a name; returns the object and what was said of it."""
+def brought(tmp_path, quick_import):
+    """Imports a mesh, or bytes, from a file of a name; returns the object and its notes."""
 
     def bring(content, name="thing.stl", **options):
         path = tmp_path / name
