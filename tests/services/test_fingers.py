@@ -9,10 +9,8 @@ import onnxruntime
 import pytest
 import trimesh
 
-from congrasp.actors.attempts import PLAIN, Phases
-from congrasp.common.config import NetworkConfig, RunConfig
+from congrasp.actors.attempts import Phases
 from congrasp.common.errors import CongraspError, UnknownConstraintError
-from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.task import observation
@@ -26,18 +24,16 @@ from congrasp.services.grasp.files import RESULT
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.serve.inference import Inference, PolicyFunction
-from congrasp.services.serve.load import example_episode
+from congrasp.services.serve.load import Example
 from congrasp.services.serve.requests import Layout
 from congrasp.services.studio import description
-from congrasp.services.studio.grasping import PolicyGrasping
 from congrasp.services.studio.lanes import for_page, lanes
 from congrasp.services.studio.state import Studio
 from congrasp.services.train.command import untrained
 from tests.printed import errors
+from tests.task import CONFIG, HAND, TASK
+from tests.task import policy as make_policy
 
-HAND = get_hand("human")
-TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))
-CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
 MUG = procedural.generate(1, "mug")
 PINCH = np.array([True, True, False, False, False])
 REFUSED = (
@@ -48,15 +44,13 @@ REFUSED = (
 
 @pytest.fixture(scope="module")
 def policy() -> PolicyBundle:
-    """A policy that knows all constraints and has learnt nothing."""
-    return untrained(CONFIG)
+    return make_policy()
 
 
 @pytest.fixture(scope="module")
-def query() -> dict[str, np.ndarray]:
+def query(example: Example) -> dict[str, np.ndarray]:
     """The arrays of a query with the heading, from the start of an episode."""
-    episode = example_episode(1_000_000)
-    request, state = episode.request, episode.state
+    request, state = example.request, example.state
     given = {f"heading_{name}": value for name, value in request.constraints["heading"].items()}
     given |= {"q_target": request.q, "q_initial": request.q, "u_target": np.zeros(6), "time": np.float32(0)}
     given |= {"base_position": request.wrist[0], "base_quaternion": request.wrist[1], "table": np.bool_(True)}
@@ -191,20 +185,6 @@ def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
         studio.choose("pose", "q", [])
 
 
-@pytest.mark.slow
-def test_the_studio_grasps_with_it(policy: PolicyBundle) -> None:
-    task = dataclasses.replace(TASK, approach_steps=4, hold_steps=2, hold_steps_max=2)
-    grasping = PolicyGrasping(lambda version: dataclasses.replace(policy, task=task), "untrained", threads=1)
-    studio = Studio(grasping.hand, grasping.task, MUG)
-    studio.ask("fingers", True)
-    episode = grasping.grasp(studio.labelled, studio.request, PLAIN, lambda text, share: None)
-    assert episode.arrays["active/fingers"] and "fingers_ratio" in episode.meta["metrics"]
-    np.testing.assert_array_equal(episode.arrays["goal/fingers_allowed"], PINCH)
-    # An untrained policy holds nothing, with the constraint or without it.
-    assert episode.meta["note"].startswith("None of 8 attempts held. The one shown: ")
-    assert episode.meta["note"].endswith("Only the named fingers may touch the object. Try another heading.")
-
-
 def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
     assert export_policy(policy, "onnx", tmp_path / "policy.onnx") <= 1e-5
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
@@ -218,15 +198,3 @@ def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp
         == describe(policy)["masks"]
     )
     assert sum(size for _, size in meta["layout"]) == sum(size for _, size in observation.layout(HAND, TASK))
-
-
-@pytest.mark.slow
-def test_an_evaluation_has_its_row(policy: PolicyBundle) -> None:
-    evaluator = Evaluator(policy, procedural.generate_many(2, 1_000_000), physics="native", batch=8)
-    sample = evaluator.samples(["fingers"], 6)["fingers"]
-    ratio = sample.values["fingers_ratio"]
-    assert (sample.values["mask_fingers"] == 1).all() and ((ratio >= 0) & (ratio <= 1)).all()
-    row = evaluator.row("fingers", sample)
-    assert (row.constraint, row.episodes) == ("fingers", 6) and row.paper is None
-    assert "fingers_ratio" in row.errors and row.errors["heading_rad"] is None
-    assert (row.errors["fingers_ratio"] is None) == (row.success == 0)

@@ -8,16 +8,12 @@ import pytest
 import trimesh
 
 from congrasp.actors.attempts import Phases
-from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import OURS, PAPER
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.main import load
-from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.export.policy import describe
 from congrasp.services.grasp.grasper import Grasper
@@ -25,20 +21,18 @@ from congrasp.services.grasp.parse import read_request
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.studio import description
 from congrasp.services.studio.state import Studio
-from congrasp.services.train.command import untrained
 from tests.printed import errors
 from tests.services.test_fingers import query
+from tests.task import HAND, TASK
+from tests.task import policy as make_policy
 
 __all__ = ["query"]
-HAND = get_hand("human")
-TASK = TaskConfig(constraints=OURS)
 MUG = procedural.generate(1, "mug")
 
 
 @pytest.fixture(scope="module")
 def policy() -> PolicyBundle:
-    """A policy that knows all constraints and has learnt nothing."""
-    return untrained(RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4)))
+    return make_policy()
 
 
 @pytest.mark.parametrize("option", [["--force", "3"], ["--gentle"]])
@@ -92,15 +86,6 @@ def test_the_studio_has_a_box_for_it() -> None:
     assert studio.request.given("force", "limit") == 5.0 and studio.trouble == ""
     with pytest.raises(CongraspError, match="nothing to choose for 'force'"):
         studio.choose("force", "limit", [True])
-
-
-@pytest.mark.slow
-def test_an_evaluation_has_its_row(policy: PolicyBundle) -> None:
-    evaluator = Evaluator(policy, procedural.generate_many(2, 1_000_000), physics="native", batch=8)
-    sample = evaluator.samples(["force"], 6)["force"]
-    assert (sample.values["mask_force_limit"] == 1).all() and (sample.values["force_ratio"] <= 1).all()
-    row = evaluator.row("force", sample)
-    assert "force_ratio" in row.errors and {"force_peak_n", "force_mean_n"} <= set(row.to_json())
 
 
 def test_the_exported_policy_describes_it(policy: PolicyBundle) -> None:

@@ -17,14 +17,12 @@ from congrasp.services.client.episode import EpisodePolicy
 from congrasp.services.client.policy import Policy
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.inference import Inference, PolicyFunction
-from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.local import LocalPolicy, load_policy
 from congrasp.services.serve.server import PolicyServer, follow_file
 from congrasp.services.train.command import untrained
+from tests import task
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))
-CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
 COMBINATIONS = (
     "heading",
     "affordance heading",
@@ -37,16 +35,15 @@ COMBINATIONS = (
 
 
 @pytest.fixture(scope="module")
-def episode():
-    """The start of an episode whose request has a goal for every constraint."""
-    return example_episode(1_000_000)
+def episode(example):
+    return example
 
 
 @pytest.fixture(scope="module")
 def policies(tmp_path_factory) -> tuple[Policy, Policy]:
     """The same bundle in this process and behind a server."""
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
-    bundles.save(dataclasses.replace(untrained(CONFIG), version=7), path)
+    bundles.save(dataclasses.replace(task.policy(), version=7), path)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with urls.listen(endpoint, "server") as transport:
         server = PolicyServer(transport, "policy", follow_file(path))
@@ -59,8 +56,8 @@ def goals(request: GraspRequest) -> dict[str, dict[str, np.ndarray]]:
     """Goal arrays of every constraint around the heading of a request; the trajectory ends at the graspable region."""
     heading = request.constraints["heading"]
     graspable = request.surface[request.surface[:, 2].argmin()]
-    path = graspable + np.linspace(0.2, 0.0, TASK.trajectory_points)[:, None] * np.array([0.0, 0.0, 1.0])
-    turns = np.tile(IDENTITY, (TASK.trajectory_points, 1))
+    path = graspable + np.linspace(0.2, 0.0, task.TASK.trajectory_points)[:, None] * np.array([0.0, 0.0, 1.0])
+    turns = np.tile(IDENTITY, (task.TASK.trajectory_points, 1))
     return {
         "heading": dict(heading),
         "affordance": {},
@@ -150,7 +147,7 @@ def test_what_a_request_lacks_is_named_at_once(policies, episode):
 def test_both_refuse_a_contradiction(policies, episode):
     highest = episode.request.surface[episode.request.surface[:, 2].argmax()]
     request = asked(episode.request, "trajectory affordance")
-    path = {**goals(episode.request)["trajectory"], "position": np.tile(highest, (TASK.trajectory_points, 1))}
+    path = {**goals(episode.request)["trajectory"], "position": np.tile(highest, (task.TASK.trajectory_points, 1))}
     for policy in policies:
         policy.reset(dataclasses.replace(request, constraints={"affordance": {}, "trajectory": path}))
         with pytest.raises(ContradictionError):
@@ -216,8 +213,8 @@ def test_a_policy_that_looks_back_is_told_what_was_before(episode):
 
 def test_a_policy_with_a_camera_takes_clouds_and_no_pose(episode):
     """Its request and states hold clouds; a newer one changes the answer, and a pose is refused."""
-    task = dataclasses.replace(STUDENT.task, observation="camera")
-    policy = LocalPolicy(untrained(dataclasses.replace(STUDENT, task=task)))
+    camera = dataclasses.replace(STUDENT.task, observation="camera")
+    policy = LocalPolicy(untrained(dataclasses.replace(STUDENT, task=camera)))
     own, cloud = episode.request, np.asarray(episode.request.surface) + episode.request.object_pose[0]
     heading = own.constraints["heading"]
     heading = {**heading, "position": np.asarray(heading["position"]) + own.object_pose[0]}

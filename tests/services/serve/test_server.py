@@ -11,7 +11,6 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from congrasp.common.config import NetworkConfig
 from congrasp.common.errors import (
     CongraspError,
     ContradictionError,
@@ -31,19 +30,16 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.metrics import ServerMetrics, exposed
 from congrasp.services.serve.inference import Inference, PolicyFunction
-from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.requests import Query
 from congrasp.services.serve.server import DEPTH, SHARE, PolicyServer, follow_file, follow_run
 from congrasp.services.train.command import untrained
-from congrasp.services.train.presets import get_preset
+from tests import task
 from tests.services.ops.test_metrics import scrape
 from tests.waits import eventually
 
 pytestmark = pytest.mark.timeout(300)
-_QUICKSTART = get_preset("quickstart")
-CONFIG = dataclasses.replace(
-    _QUICKSTART, network=NetworkConfig(hidden=(32,)), task=dataclasses.replace(_QUICKSTART.task, constraints=PAPER)
-)
+CONFIG = dataclasses.replace(task.CONFIG, task=dataclasses.replace(task.TASK, constraints=PAPER))
+"""The suite's, without the constraint `fingers`, which is refused."""
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +49,7 @@ def metrics():
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory, metrics):
+def served(tmp_path_factory, metrics, example):
     """A server over Zenoh that follows a policy file, and the start of an episode."""
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
     bundles.save(untrained(CONFIG), path)
@@ -61,7 +57,7 @@ def served(tmp_path_factory, metrics):
     with ZenohTransport(listen=[endpoint], flows=("policy",)) as transport:
         server = PolicyServer(transport, "policy", follow_file(path), on_answer=metrics.answer, on_batch=metrics.batch)
         metrics.health = server.health
-        yield path, endpoint, example_episode(1_000_000)
+        yield path, endpoint, example
         server.close()
 
 

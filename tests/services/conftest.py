@@ -1,0 +1,31 @@
+"""Fixtures of the services' tests."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="session")
+def example() -> Any:
+    """The start of an episode of the human hand, whose request has a heading."""
+    from congrasp.services.serve.load import example_episode
+
+    return example_episode(1_000_000)
+
+
+@pytest.fixture
+def quick_import(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Imports a mesh as its hull and two plain halves; the pieces' errors count as zero.
+
+    Decomposition, errors and halves that a hand can hold take most of an import's time.
+    """
+    from congrasp.services.assets.objects import collision, decompose, meshes
+    from congrasp.services.assets.objects.fidelity import Fidelity
+
+    def hull(vertices: np.ndarray, faces: np.ndarray, **options: object) -> decompose.Decomposition:
+        return decompose.Decomposition([np.asarray(vertices)], "hull", [])
+
+    monkeypatch.setattr(decompose, "decompose", hull)
+    monkeypatch.setattr(collision, "fidelity", lambda *_: Fidelity(0.0, 0.0))
+    monkeypatch.setattr(meshes, "cut_to_hold", lambda obj: obj)
