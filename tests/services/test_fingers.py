@@ -19,6 +19,7 @@ from congrasp.common.task.constraints import PAPER
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.export.policy import describe, export_policy
 from congrasp.services.grasp.files import RESULT
 from congrasp.services.grasp.grasper import Grasper
@@ -120,18 +121,24 @@ def test_fingers_are_read_by_their_names() -> None:
         read_request(MUG, HAND, 15, fingers=("thumb",))
 
 
-def test_a_grasp_is_asked_for_with_two_fingers(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
+def test_a_grasp_with_two_fingers_and_a_force_limit(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
     grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
-    found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index")))
+    found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3"))
     grasper.close()
-    assert found.motion.constraints == ("heading", "fingers") and "fingers_ratio" in found.facts()
-    np.testing.assert_array_equal(found.motion.goal["fingers_allowed"], PINCH)
+    assert found.motion.constraints == ("heading", "fingers", "force") and "fingers_ratio" in found.facts()
+    assert 0.0 <= found.facts()["force_ratio"] <= 1.0
+    save_motion(tmp_path / "grasp.npz", found.motion)
+    goal = load_motion(tmp_path / "grasp.npz").goal
+    np.testing.assert_array_equal(goal["fingers_allowed"], PINCH)
+    assert goal["force_limit"] == 3.0
     assert "Only the named fingers may touch the object." in found.active
+    assert "No link may press harder than the force limit." in found.active
     arrays = found.episode.arrays
     steps = len(arrays["table"])
     other = np.isin(HAND.link_fingers, (2, 3, 4))
-    touching = np.linalg.norm(arrays["contact_force"], axis=-1) > 0
-    np.testing.assert_array_equal(arrays["error/fingers_ratio"] > 0, (touching & other).any(-1))
+    links = np.linalg.norm(arrays["contact_force"], axis=-1)
+    np.testing.assert_array_equal(arrays["error/fingers_ratio"] > 0, ((links > 0) & other).any(-1))
+    np.testing.assert_array_equal(arrays["error/force_ratio"] > 0, (links > 3.0).any(-1))
     assert arrays["active/fingers"] and not arrays["active/pose_finger"]
     assert lanes(found.episode)["fingers"].met.shape == (steps,)
     assert "lane/fingers/share" in for_page(found.episode).arrays
@@ -140,7 +147,7 @@ def test_a_grasp_is_asked_for_with_two_fingers(policy: PolicyBundle, tmp_path: p
 def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: dict[str, np.ndarray]) -> None:
     function = PolicyFunction(HAND, TASK)
     layout = function.layout
-    assert layout.shapes["fingers_allowed"] == (5,) and layout.shapes["asked"] == (5,)
+    assert layout.shapes["fingers_allowed"] == (5,) and layout.shapes["asked"] == (6,)
 
     def ask(constraints: list[str], **more: np.ndarray) -> Inference | Exception:
         (answer,) = function(
@@ -167,9 +174,8 @@ def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: di
 def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
     studio = Studio(HAND, TASK, MUG)
     flags = dict(zip(HAND.fingers, PINCH.tolist(), strict=True))
-    assert description.describe(studio)["others"] == [
-        {"name": "fingers", "title": "fingers", "flags": {"allowed": flags}}
-    ]
+    shown = {"name": "fingers", "title": "fingers", "flags": {"allowed": flags}}
+    assert description.describe(studio)["others"][0] == shown
     studio.ask("fingers", True)
     assert description.describe(studio)["active"]["masks"]["fingers"] and studio.trouble == ""
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), PINCH)
@@ -194,7 +200,7 @@ def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp
     assert dict(meta["layout"])["fingers"] == sum(size for _, size in block)
     assert (
         meta["masks"]
-        == ["affordance", "pose_finger", "pose_wrist", "trajectory", "fingers"]
+        == ["affordance", "pose_finger", "pose_wrist", "trajectory", "fingers", "force_limit"]
         == describe(policy)["masks"]
     )
     assert sum(size for _, size in meta["layout"]) == sum(size for _, size in observation.layout(HAND, TASK))

@@ -7,17 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.actors.attempts import Phases
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.task.constraints import OURS, PAPER
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.main import load
-from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.export.policy import describe
-from congrasp.services.grasp.grasper import Grasper
-from congrasp.services.grasp.parse import read_request
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.studio import description
 from congrasp.services.studio.state import Studio
@@ -43,20 +39,6 @@ def test_a_policy_that_does_not_know_it_says_so(paper_policy, tmp_path: pathlib.
     assert load("grasp")([str(tmp_path / "block.stl"), *options])() == 2
     (line,) = errors(capsys.readouterr().err)
     assert line.startswith("congrasp: error: The policy does not support the constraint 'force'. It supports heading, ")
-
-
-@pytest.mark.slow
-def test_a_grasp_is_made_with_a_limit(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
-    grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
-    found = grasper.grasp(MUG, read_request(MUG, HAND, 15, force="3"))
-    grasper.close()
-    assert found.motion.constraints == ("heading", "force") and 0.0 <= found.facts()["force_ratio"] <= 1.0
-    assert "No link may press harder than the force limit." in found.active
-    save_motion(tmp_path / "grasp.npz", found.motion)
-    assert load_motion(tmp_path / "grasp.npz").goal["force_limit"] == 3.0
-    arrays = found.episode.arrays
-    links = np.linalg.norm(arrays["contact_force"], axis=-1)
-    np.testing.assert_array_equal(arrays["error/force_ratio"] > 0, (links > 3.0).any(-1))
 
 
 def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: dict[str, np.ndarray]) -> None:

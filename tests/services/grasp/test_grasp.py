@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from congrasp.actors import attempts
 from congrasp.actors.attempts import Outcome, Phases
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
@@ -87,9 +88,8 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
 
 
 def test_a_left_hand_with_its_own_model_does_what_the_mirrored_right_one_did(block, grasper, monkeypatch):
-    begun = []
-    initial = grasper._attempts._initial
-    monkeypatch.setattr(grasper._attempts, "_initial", lambda *a, **k: begun.append(initial(*a, **k)) or begun[-1])
+    begun, given = [], attempts._given
+    monkeypatch.setattr(attempts, "_given", lambda *arguments: begun.append(given(*arguments)) or begun[-1])
     monkeypatch.setattr(grasper, "_left", True)
     monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
     found = grasper.grasp(block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}}))
@@ -158,7 +158,7 @@ def test_what_cannot_be_is_said_before_anything_is_simulated(block, grasper):
 
 
 @pytest.fixture
-def made_up(monkeypatch):
+def made_up(monkeypatch, quick_import):
     """The command with grasps that are made up; the list of objects that were grasped."""
     calls = []
 

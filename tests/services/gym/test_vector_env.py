@@ -10,6 +10,7 @@ import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.services.gym.vector_env import ACTION, GraspEnv, GraspVectorEnv
 
+# Episodes of five steps, which end within a test.
 SHORT = {"objects": 2, "physics": "native", "approach_steps": 3, "hold_steps": 2, "hold_steps_max": 2}
 COUNT = 4
 
@@ -58,7 +59,7 @@ def test_a_seed_decides_everything(vector):
 
 
 def test_gymnasium_makes_it_by_its_id():
-    made = gym.make_vec("congrasp.services.gym:congrasp/Grasp-v0", 2, "vector_entry_point", **SHORT)
+    made = gym.make_vec("congrasp.services.gym:congrasp/Grasp-v0", COUNT, "vector_entry_point", **SHORT)
     assert isinstance(made.unwrapped, GraspVectorEnv) and made.reset(seed=0)[0].shape == made.observation_space.shape
     made.close()
 
