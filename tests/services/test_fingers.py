@@ -1,4 +1,4 @@
-"""A constraint beyond the paper's, asked of policies that know it and of one that does not, at every door."""
+"""Constraints beyond the paper's, requested of a policy that knows them and of one that does not, at every door."""
 
 import dataclasses
 import json
@@ -9,7 +9,7 @@ import onnxruntime
 import pytest
 import trimesh
 
-from congrasp.actors.attempts import Phases
+from congrasp.actors.attempts import PLAIN, Phases
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import PolicyBundle
@@ -28,6 +28,7 @@ from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import Example
 from congrasp.services.serve.requests import Layout
 from congrasp.services.studio import description
+from congrasp.services.studio.grasping import PolicyGrasping
 from congrasp.services.studio.lanes import for_page, lanes
 from congrasp.services.studio.state import Studio
 from congrasp.services.train.command import untrained
@@ -62,19 +63,26 @@ def query(example: Example) -> dict[str, np.ndarray]:
 # A policy that does not know it.
 
 
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [("fingers", ["--fingers", "thumb", "index"]), ("force", ["--force", "3"]), ("force", ["--gentle"])],
+)
 def test_the_command_refuses_it_in_one_line(
     paper_policy: pathlib.Path,
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    quick_import: None,
+    name: str,
+    option: list[str],
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
     options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures"]
-    assert load("grasp")([str(tmp_path / "block.stl"), *options, "--fingers", "thumb", "index"])() == 2
+    assert load("grasp")([str(tmp_path / "block.stl"), *options, *option])() == 2
     (line,) = errors(capsys.readouterr().err)
     assert line.startswith(
-        "congrasp: error: The policy does not support the constraint 'fingers'. It supports heading, "
+        f"congrasp: error: The policy does not support the constraint '{name}'. It supports heading, "
     )
     assert not (tmp_path / "out" / "block" / RESULT).exists()
 
@@ -191,6 +199,20 @@ def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
         studio.choose("pose", "q", [])
 
 
+@pytest.mark.slow
+def test_the_studio_grasps_with_it(policy: PolicyBundle) -> None:
+    task = dataclasses.replace(TASK, approach_steps=4, hold_steps=2, hold_steps_max=2)
+    grasping = PolicyGrasping(lambda version: dataclasses.replace(policy, task=task), "untrained", threads=1)
+    studio = Studio(grasping.hand, grasping.task, MUG)
+    studio.ask("fingers", True)
+    episode = grasping.grasp(studio.labelled, studio.request, PLAIN, lambda text, share: None)
+    assert episode.arrays["active/fingers"] and "fingers_ratio" in episode.meta["metrics"]
+    np.testing.assert_array_equal(episode.arrays["goal/fingers_allowed"], PINCH)
+    # An untrained policy holds nothing, with the constraint or without it.
+    assert episode.meta["note"].startswith("None of 8 attempts held. The one shown: ")
+    assert episode.meta["note"].endswith("Only the named fingers may touch the object. Try another heading.")
+
+
 def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
     assert export_policy(policy, "onnx", tmp_path / "policy.onnx") <= 1e-5
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
@@ -204,3 +226,32 @@ def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp
         == describe(policy)["masks"]
     )
     assert sum(size for _, size in meta["layout"]) == sum(size for _, size in observation.layout(HAND, TASK))
+
+
+def test_queries_for_a_force_limit_are_answered_and_checked(policy: PolicyBundle, query: dict[str, np.ndarray]) -> None:
+    function = PolicyFunction(HAND, TASK)
+    layout = function.layout
+    assert layout.shapes["force_limit"] == ()
+
+    def ask(constraints: list[str], **more: np.ndarray) -> Inference | Exception:
+        queries = [layout.parse(Message({**query, **more}, {"constraints": constraints}))]
+        (answer,) = function(policy.inference_parameters, queries)
+        return answer
+
+    soft, firm = (ask(["heading", "force"], force_limit=np.float32(limit)) for limit in (2.0, 15.0))
+    assert isinstance(soft, Inference) and isinstance(firm, Inference)
+    assert np.abs(soft.vectors - firm.vectors).max() > 1e-6
+    assert "takes a limit between 0.5 and 50 N" in str(ask(["heading", "force"], force_limit=np.float32(0.0)))
+    with pytest.raises(CongraspError, match="lacks the field 'force_limit'"):
+        ask(["heading", "force"])
+
+
+def test_the_studio_has_a_box_for_a_force_limit() -> None:
+    studio = Studio(HAND, TASK, MUG)
+    studio.ask("force", True)
+    assert {"name": "force", "title": "force limit", "flags": {}} in json.loads(
+        json.dumps(description.describe(studio)["others"])
+    )
+    assert studio.request.given("force", "limit") == 5.0 and studio.trouble == ""
+    with pytest.raises(CongraspError, match="nothing to choose for 'force'"):
+        studio.choose("force", "limit", [True])

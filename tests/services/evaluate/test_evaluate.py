@@ -15,6 +15,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate import protocol, references
 from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.failures import failure_sheets
 from congrasp.services.evaluate.loads import Load
 from congrasp.services.evaluate.paper import CENTER_GROUP
 from tests import task
@@ -149,6 +150,15 @@ def test_an_episode_to_look_at_is_one_of_so_many_attempts(evaluator):
         episode = evaluator.episode("heading", attempts)
         assert episode.meta["object"] in {obj.name for obj in task.OBJECTS} and not episode.meta["success"]
         assert len(episode.arrays["table"]) == len(episode.arrays["q"]) > task.TASK.approach_steps
+
+
+@pytest.mark.slow
+def test_failures_of_an_untrained_policy_are_drawn(evaluator):
+    sample = evaluator.samples(["heading"], EPISODES, keep=True)["heading"]
+    assert not sample.values["held"].any()
+    ((name, sheet, causes),) = failure_sheets(evaluator, task.policy(), ["heading"], successes=2, failures=2)
+    assert name == "heading" and len(causes) == 2 and "held" not in causes
+    assert sheet.shape[0] > 2 * 225 and sheet.shape[1] > 5 * 300
 
 
 @pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--pool", "-1"], ["--friction", "nan"]])

@@ -166,7 +166,7 @@ def several_chunks(tmp_path_factory: pytest.TempPathFactory) -> tuple[pathlib.Pa
     return directory, writer.files[0].read_bytes()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(share=st.floats(0, 1))
 def test_a_file_cut_anywhere_gives_a_beginning(several_chunks: tuple[pathlib.Path, bytes], share: float) -> None:
     directory, whole = several_chunks
@@ -301,7 +301,7 @@ def test_what_was_dropped_is_warned_of_by_default(tmp_path: pathlib.Path, caplog
     assert len(caplog.messages) == 1 and "damaged in 1 place(s)" in caplog.messages[0]
 
 
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_one_flipped_bit_costs_one_chunk_at_most_and_never_without_a_word(
     tmp_path_factory: pytest.TempPathFactory, place: float, bit: int
@@ -320,7 +320,7 @@ def test_one_flipped_bit_costs_one_chunk_at_most_and_never_without_a_word(
     assert bool(missing) <= bool(said) and len(said) <= 1
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(wounds=st.lists(st.tuples(st.floats(0, 1), st.binary(max_size=60), st.integers(0, 60)), min_size=1, max_size=4))
 def test_overwritten_and_inserted_bytes_end_in_a_line_at_most(
     tmp_path_factory: pytest.TempPathFactory, wounds: list[tuple[float, bytes, int]]
