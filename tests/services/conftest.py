@@ -1,5 +1,7 @@
 """Fixtures of the services' tests."""
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,8 +16,8 @@ def example() -> Any:
     return example_episode(1_000_000)
 
 
-@pytest.fixture
-def quick_import(monkeypatch: pytest.MonkeyPatch) -> None:
+@contextlib.contextmanager
+def quick_imports() -> Iterator[None]:
     """Imports a mesh as its hull and two plain halves; the pieces' errors count as zero.
 
     Decomposition, errors and halves that a hand can hold take most of an import's time.
@@ -26,6 +28,15 @@ def quick_import(monkeypatch: pytest.MonkeyPatch) -> None:
     def hull(vertices: np.ndarray, faces: np.ndarray, **options: object) -> decompose.Decomposition:
         return decompose.Decomposition([np.asarray(vertices)], "hull", [])
 
-    monkeypatch.setattr(decompose, "decompose", hull)
-    monkeypatch.setattr(collision, "fidelity", lambda *_: Fidelity(0.0, 0.0))
-    monkeypatch.setattr(meshes, "cut_to_hold", lambda obj: obj)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(decompose, "decompose", hull)
+        patch.setattr(collision, "fidelity", lambda *_: Fidelity(0.0, 0.0))
+        patch.setattr(meshes, "cut_to_hold", lambda obj: obj)
+        yield
+
+
+@pytest.fixture
+def quick_import() -> Iterator[None]:
+    """Quick imports in one test."""
+    with quick_imports():
+        yield
