@@ -62,7 +62,7 @@ def columns(whole) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_a_killed_run_resumes_and_parts_make_the_same_shards(whole, tmp_path):
+def test_a_killed_run_and_parts_make_the_same_shards(whole, tmp_path):
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
@@ -83,7 +83,7 @@ def test_a_killed_run_resumes_and_parts_make_the_same_shards(whole, tmp_path):
     assert card["shards"] == {"finished": 2, "of": 2}
 
 
-def test_rows_say_what_was_requested_and_what_came_of_it(whole, columns):
+def test_rows_have_requests_and_outcomes(whole, columns):
     card = json.loads((whole / CARD).read_text())
     assert len(columns["object"]) == 12 and sorted(set(columns["object"])) == ["box_1", "box_2"]
     for asked in ("heading", "affordance"):
@@ -109,7 +109,7 @@ def test_poses_are_in_the_frame_of_the_object(columns):
     assert (np.asarray(turned + start[:, :3])[:, 2] > 0).all(), "the wrist starts above the table"
 
 
-def test_objects_are_beside_their_grasps(whole):
+def test_objects_are_stored(whole):
     table = pq.read_table(whole / "objects")
     box = generate(2, "box")
     row = table.column("object").to_pylist().index("box_2")
@@ -137,7 +137,7 @@ def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tm
         (("--shard", "100000"), "--shard"),
     ],
 )
-def test_what_cannot_be_made_is_refused_in_one_line(whole, more, words):
+def test_bad_options(whole, more, words):
     with pytest.raises(CongraspError, match=words) as error:
         cli.run(arguments(whole, *more))
     assert "\n" not in str(error.value)

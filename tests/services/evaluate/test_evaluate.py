@@ -66,7 +66,7 @@ def test_references_are_grasps_and_made_once(evaluator, cache, monkeypatch):
     kept.write_bytes(whole)
 
 
-def test_the_command_measures_rows_by_the_protocol(policy, tmp_path, capsys, monkeypatch):
+def test_the_command_evaluates_by_the_protocol(policy, tmp_path, capsys, monkeypatch):
     hold = task.TASK.hold_steps
     monkeypatch.setattr(protocol, "HOLD_SECONDS", hold * task.TASK.control_dt)  # the programs are the evaluator's
     folder, out, samples = tmp_path / "objects", tmp_path / "rows.json", {}
@@ -96,7 +96,7 @@ def test_the_command_measures_rows_by_the_protocol(policy, tmp_path, capsys, mon
         assert sample.torque.shape == (row["episodes"], hold, 20) and 0.0 < sample.torque.max() <= 1.0
 
 
-def test_the_exam_has_a_row_of_the_hands_centre_alone_and_rows_of_loads(evaluator):
+def test_rows_by_the_hand_centre_and_under_loads(evaluator):
     told = []
     row, rules = evaluator.row_by_center(EPISODES, told.append)
     assert row.group == CENTER_GROUP and row.episodes == EPISODES == told[-1] and row.paper.success == 0.96
@@ -107,7 +107,7 @@ def test_the_exam_has_a_row_of_the_hands_centre_alone_and_rows_of_loads(evaluato
     assert light.constraint == "heading" and light.paper is None and heavy.diverged == 0
 
 
-def test_a_row_is_the_same_alone_and_among_others(evaluator):
+def test_rows_are_independent(evaluator):
     """Equal to the last digit, whatever was simulated before it."""
     names = ["affordance", "heading"]
     among = evaluator.samples(names, EPISODES)
@@ -129,7 +129,7 @@ def test_rows_of_fingers_and_of_a_force_limit(evaluator):
         assert {"force_peak_n", "force_mean_n"} <= set(row.to_json())
 
 
-def test_a_pool_that_never_allows_a_constraint_is_an_error(evaluator, monkeypatch):
+def test_a_constraint_that_no_object_allows(evaluator, monkeypatch):
     bank = evaluator._bank
     none = bank._replace(has_affordance=np.zeros_like(bank.has_affordance))
     monkeypatch.setattr(evaluator, "_bank", none)
@@ -144,7 +144,7 @@ def test_a_pool_that_never_allows_a_constraint_is_an_error(evaluator, monkeypatc
 
 
 @pytest.mark.slow
-def test_an_episode_to_look_at_is_one_of_so_many_attempts(evaluator):
+def test_an_episode_of_several_attempts(evaluator):
     """The pool has four objects, so that a batch is larger than one attempt, and smaller than nine."""
     for attempts in (1, 9):
         episode = evaluator.episode("heading", attempts)
@@ -162,7 +162,7 @@ def test_failures_of_an_untrained_policy_are_drawn(evaluator):
 
 
 @pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--pool", "-1"], ["--friction", "nan"]])
-def test_numbers_out_of_range_are_refused(policy, arguments):
+def test_numbers_out_of_range(policy, arguments):
     with pytest.raises(CongraspError, match="must"):
         load("evaluate")(["--policy", str(policy), *arguments])()
 

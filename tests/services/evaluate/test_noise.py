@@ -49,7 +49,7 @@ def test_jitter_moves_every_waypoint(bank):
     np.testing.assert_array_equal(noisy.trajectory_quaternion, bank.trajectory_quaternion)
 
 
-def test_noise_is_added_to_the_same_references_in_every_row(bank, monkeypatch):
+def test_all_rows_have_the_same_references(bank, monkeypatch):
     evaluator, running = Evaluator(policy(), OBJECTS, bank=bank), mock.MagicMock()
     running.__enter__.return_value = running
     monkeypatch.setattr(evaluator, "_episodes", lambda episodes: running)

@@ -35,7 +35,7 @@ def _all(bank, plan, seed=0, size=task.BATCH):
 
 
 @pytest.mark.parametrize("name", MASKS)
-def test_every_object_has_as_many_episodes_with_just_the_rows_constraints(bank, name):
+def test_objects_have_equal_shares_and_the_rows_constraints(bank, name):
     plan = plan_row(TASK, bank, task.OBJECTS, name, 50)
     conditions = _all(bank, plan)
     index = conditions.reset_state.object_index
@@ -51,7 +51,7 @@ def test_every_object_has_as_many_episodes_with_just_the_rows_constraints(bank, 
         np.testing.assert_array_equal(conditions.goal.active[block], np.full(plan.total, bool(active)))
 
 
-def test_an_episode_does_not_depend_on_the_objects_beside_it(bank):
+def test_episodes_are_independent_of_other_objects(bank):
     """Nor on how many there are, or in which batches they are simulated (but for the rounding of another program)."""
     fewer = jax.tree.map(lambda x: x[1:], bank)
     for name in ("affordance", "pose+trajectory"):
@@ -76,7 +76,7 @@ def test_seeds_and_rows_draw_for_themselves(bank):
         assert (np.abs(drawn[0] - other).max(-1) > 0).mean() > 0.8
 
 
-def test_pairs_are_drawn_independently_but_where_they_are_aligned(bank):
+def test_pairs_are_independent_unless_aligned(bank):
     apart = {}
     for name in ("pose+trajectory", f"pose+trajectory{ALIGNED}"):
         plan = plan_row(TASK, bank, task.OBJECTS, name, 60)
@@ -99,7 +99,7 @@ def test_trajectories_end_nearer_to_the_graspable_region(bank):
     assert np.all(np.where(avoid, np.inf, distance).min(1) < np.where(avoid, distance, np.inf).min(1))
 
 
-def test_objects_that_allow_nothing_are_counted_not_replaced(bank):
+def test_objects_that_allow_nothing_are_counted(bank):
     valid = np.array(bank.pose_valid)
     valid[1] = False
     plan = plan_row(TASK, bank._replace(pose_valid=valid), task.OBJECTS, "pose", 10)

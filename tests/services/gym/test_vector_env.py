@@ -28,7 +28,7 @@ def test_gymnasium_accepts_the_environment():
     env.close()
 
 
-def test_ended_environments_begin_anew_in_the_same_step(vector):
+def test_environments_restart_in_the_same_step(vector):
     """Without the object up an end is a termination; the last observation comes beside the first one of the next."""
     first, infos = vector.reset(seed=3)
     assert first in vector.observation_space and infos == {}
@@ -72,6 +72,6 @@ def test_gymnasium_makes_it_by_its_id():
         ({"hand": "foot"}, "foot"),
     ],
 )
-def test_what_there_is_not_is_said_in_one_line(asked, says):
+def test_unknown_names(asked, says):
     with pytest.raises(CongraspError, match=says):
         congrasp.make_vec(**asked)

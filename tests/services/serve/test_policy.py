@@ -82,7 +82,7 @@ def same(one, other):
 
 
 @pytest.mark.parametrize("names", COMBINATIONS)
-def test_both_give_the_same_answers_to_the_last_digit(policies, episode, names):
+def test_both_answers_are_equal(policies, episode, names):
     states = [{**episode.state, "q": episode.state["q"] + 0.01 * i, "table": np.bool_(i < 3)} for i in range(5)]
     answers = []
     for policy in policies:
@@ -111,7 +111,7 @@ BAD_STATES = [{"u": np.zeros(5)}, {"weight": np.zeros(1)}, {"u": np.full(6, np.i
 
 
 @pytest.mark.parametrize(("change", "error"), BAD_REQUESTS)
-def test_both_refuse_a_bad_request_with_the_same_error(policies, episode, change, error):
+def test_bad_requests(policies, episode, change, error):
     messages = []
     for policy in policies:
         with pytest.raises(CongraspError) as caught:
@@ -124,7 +124,7 @@ def test_both_refuse_a_bad_request_with_the_same_error(policies, episode, change
 
 @pytest.mark.parametrize("change", BAD_STATES)
 @pytest.mark.parametrize("before", [0, 1])
-def test_both_refuse_a_bad_state_with_the_same_error_and_the_episode_stays(policies, episode, change, before):
+def test_bad_states_leave_the_episode(policies, episode, change, before):
     messages, answers = [], []
     for policy in policies:
         policy.reset(asked(episode.request, "heading"))
@@ -150,7 +150,7 @@ def test_both_refuse_a_contradiction(policies, episode):
     path = {**goals(episode.request)["trajectory"], "position": np.tile(highest, (task.TASK.trajectory_points, 1))}
     for policy in policies:
         policy.reset(dataclasses.replace(request, constraints={"affordance": {}, "trajectory": path}))
-        with pytest.raises(ContradictionError):
+        with pytest.raises(ContradictionError, match="trajectory ends nearer to the avoid region than to the grasp"):
             policy.act(episode.state)
 
 
@@ -177,7 +177,7 @@ STUDENT = RunConfig(
 )
 
 
-def test_a_policy_that_looks_back_is_told_what_was_before(episode):
+def test_history_of_a_student(episode):
     """The vector that is inferred from holds the control steps before this one, newest first, and at the begin its
     first reading; velocities and forces that a client sends change nothing."""
     policy = LocalPolicy(untrained(STUDENT))
@@ -250,7 +250,7 @@ class Recorder(EpisodePolicy):
 
 
 @pytest.mark.parametrize(("settle", "expected"), [(0.04, [0.0, 6.0, 4.0, 4.0, 4.0]), (0.0, [0.0] * 5)])
-def test_a_student_is_guided_by_the_mean_of_where_the_object_rests(episode, settle, expected):
+def test_a_student_averages_the_resting_object(episode, settle, expected):
     """Readings 0, 12, 0, 90 and 0 mm from the first one: the fourth has moved; one that is refused does not count."""
     policy = Recorder(dataclasses.replace(STUDENT.task, sensing=SensingConfig(settle=settle)))
     policy.reset(dataclasses.replace(episode.request, constraints={"heading": episode.request.constraints["heading"]}))

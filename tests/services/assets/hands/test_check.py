@@ -120,7 +120,7 @@ def test_objects_that_are_too_large_and_fingers_in_one_another_are_found():
     assert check._open_overlap(crossed).verdict == "failed" and "left_lower" in check._open_overlap(crossed).measured
 
 
-def test_the_command_says_by_its_exit_code_whether_a_hand_can_grasp(monkeypatch, tmp_path, capsys):
+def test_exit_codes_of_the_command(monkeypatch, tmp_path, capsys):
     _, made = verdicts(CLAW)
     monkeypatch.setattr(check, "check_hand", lambda hand, task, threads: made)
     file = tmp_path / "claw.json"

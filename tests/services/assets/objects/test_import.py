@@ -80,7 +80,7 @@ def test_units_scale_density_and_mass(tmp_path, options, quick_import):
     np.testing.assert_allclose(light.inertia / light.mass, heavy.inertia / 0.7, rtol=1e-6)
 
 
-def test_a_second_import_comes_from_the_cache_unless_something_changed(tmp_path, options, quick_import, monkeypatch):
+def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import, monkeypatch):
     path = tmp_path / "block.stl"
     block().export(path)
     (first,) = objects_of(path, options)
@@ -113,7 +113,7 @@ def test_part_files_become_the_parts(tmp_path, options, quick_import, names):
     assert [piece.part for piece in obj.pieces] == [0, 1]
 
 
-def test_a_stand_in_for_no_part_is_left_out(tmp_path, options, quick_import):
+def test_a_tiny_part_mesh_is_ignored(tmp_path, options, quick_import):
     folder = tmp_path / "ball"
     folder.mkdir()
     block().export(folder / "top.obj")
@@ -124,7 +124,7 @@ def test_a_stand_in_for_no_part_is_left_out(tmp_path, options, quick_import):
     np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), SIDES, rtol=1e-5)
 
 
-def test_objects_are_imported_side_by_side_and_one_that_fails_stops_no_other(tmp_path, options, quick_import):
+def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import):
     for name, factor in (("a", 1.0), ("b", 1000.0), ("c", 0.5)):
         block(factor * SIDES).export(tmp_path / f"{name}.stl")
     found = dict(meshes.import_sources(find_sources(tmp_path), options))
@@ -133,14 +133,14 @@ def test_objects_are_imported_side_by_side_and_one_that_fails_stops_no_other(tmp
     assert "b.stl is 80 m long" in str(found[1])
 
 
-def test_an_unforeseen_fault_of_one_import_reaches_the_caller(tmp_path, options, monkeypatch):
+def test_an_unexpected_error_reaches_the_caller(tmp_path, options, monkeypatch):
     block().export(tmp_path / "a.stl")
     monkeypatch.setattr(meshes, "_build", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         list(meshes.import_sources(find_sources(tmp_path), options))
 
 
-def test_contact_pieces_are_used_as_they_are(tmp_path, options, quick_import):
+def test_given_convex_pieces_are_used(tmp_path, options, quick_import):
     folder = tmp_path / "ell"
     folder.mkdir()
     first, second = block((0.08, 0.02, 0.02)), block((0.02, 0.02, 0.06), (0.03, 0, 0.04))
@@ -218,7 +218,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_meshes_get_one_line_that_names_them(tmp_path, options, name):
+def test_bad_meshes_are_one_line(tmp_path, options, name):
     make, expected = BAD[name]
     make(tmp_path / name)
     with pytest.raises(CongraspError, match=expected) as error:
@@ -258,7 +258,7 @@ def folder_of(path, mesh, *pieces):
     return path
 
 
-def test_pieces_that_are_far_off_their_mesh_give_way_to_pieces_cut_from_it(tmp_path, options):
+def test_coarse_pieces_are_replaced(tmp_path, options):
     mesh = ell()
     (obj,) = objects_of(folder_of(tmp_path / "ell", mesh, mesh.convex_hull), options)
     assert 2 <= len(obj.pieces) <= 3
@@ -274,7 +274,7 @@ def test_pieces_that_are_far_off_their_mesh_give_way_to_pieces_cut_from_it(tmp_p
     assert abs(float(said[2]) - 100 * (92 / 56 * 0.96 - 1)) < 2
 
 
-def test_given_pieces_within_the_budget_are_kept_without_a_cut(tmp_path, options, monkeypatch):
+def test_close_pieces_are_kept(tmp_path, options, monkeypatch):
     monkeypatch.setattr(meshes, "cut_to_hold", lambda obj: obj)
     monkeypatch.setattr(decompose, "decompose", lambda *_, **__: pytest.fail("cut"))
     (obj,) = objects_of(folder_of(tmp_path / "block", block(), block(SIDES - [0, 0, 0.0024])), options)
@@ -282,7 +282,7 @@ def test_given_pieces_within_the_budget_are_kept_without_a_cut(tmp_path, options
     assert obj.notes[-1].startswith("its own 1 convex piece stands for it: their surface is at most 1.2 mm off")
 
 
-def test_given_pieces_stay_where_a_cut_is_no_closer(tmp_path, options, hull_alone):
+def test_pieces_are_kept_if_a_cut_is_no_closer(tmp_path, options, hull_alone):
     mesh = ell()
     pieces = [block((0.08, 0.02, 0.02), (0.04, 0.01, 0.01)), block((0.02, 0.05, 0.02), (0.01, 0.045, 0.01))]
     (obj,) = objects_of(folder_of(tmp_path / "ell", mesh, *pieces), options)  # a leg is 1 cm too short
@@ -301,7 +301,7 @@ def test_coacd_cuts_an_ell_in_two():
     np.testing.assert_allclose(sum(shapes.hull_of(piece).volume for piece in result.pieces), mesh.volume, rtol=0.05)
 
 
-def test_vhacd_takes_over_when_coacd_runs_out_of_time_and_the_hull_when_both_do(monkeypatch):
+def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
     mesh = ell()
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert result.method == "vhacd"
@@ -314,7 +314,7 @@ def test_vhacd_takes_over_when_coacd_runs_out_of_time_and_the_hull_when_both_do(
     assert "hull" in result.notes[-1]
 
 
-def test_a_hull_that_stands_in_is_no_reliable_shape(tmp_path, options, hull_alone):
+def test_a_hull_of_an_ell_is_not_reliable(tmp_path, options, hull_alone):
     """An ell's hull has 64 % more volume; squeezed to its volume, it is far from its surface."""
     ell().export(tmp_path / "ell.stl")
     (obj,) = objects_of(tmp_path / "ell.stl", options)

@@ -31,7 +31,7 @@ def test_halves_that_can_be_held_stay(imported):
     assert regions.covered(obj).all() and regions.UNCOVERED not in obj.notes
 
 
-def test_a_half_that_cannot_be_held_is_cut_elsewhere(imported):
+def test_halves_that_cannot_be_held_are_cut_elsewhere(imported):
     """A can of 4 x 4 cm: of neither half fingers keep a centimetre off the other, as they are that thick."""
     obj = imported(trimesh.creation.cylinder(0.02, 0.04))
     assert regions.covered(obj).any()
@@ -43,7 +43,7 @@ def test_a_half_that_cannot_be_held_is_cut_elsewhere(imported):
     assert {piece.part for piece in obj.pieces} <= {0, 1}
 
 
-def test_what_cannot_be_held_by_any_half_says_so(monkeypatch):
+def test_an_object_without_a_graspable_half_has_a_note(monkeypatch):
     free = regions.covered
 
     def never(obj, *, use_affordance=True):
