@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -17,6 +18,7 @@ from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.sampling.build import clear_of_table
 from congrasp.common.task.sampling.headings import INWARD, above, max_width, sample_headings, within_reach
 
+_clear_of_table = jax.jit(clear_of_table, static_argnums=0)
 _ACROSS = 0.02  # m per unit of normal difference: the two sides of a thin wall may belong to different regions
 
 
@@ -124,7 +126,7 @@ def valid_rests(hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray
     Raises:
       CongraspError: there is none.
     """
-    valid = np.flatnonzero(clear_of_table(hand, turn[None], path[None], obj.rest_poses[None])[0])
+    valid = np.flatnonzero(_clear_of_table(hand, turn[None], path[None], obj.rest_poses[None])[0])
     if not len(valid):
         raise CongraspError(
             f"With this reference the hand would be in the table in every resting pose of '{obj.name}'.",

@@ -1,5 +1,6 @@
 """The policy as one compiled function from a batch of flat queries to joint targets."""
 
+import functools
 import itertools
 import time
 from collections.abc import Mapping, Sequence
@@ -44,9 +45,7 @@ class PolicyFunction:
 
     def __init__(self, hand: Hand, task: TaskConfig):
         self.layout = Layout(hand, task)
-        # Waking other threads costs more CPU time than they save here.
-        alone = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
-        self._compiled = jax.jit(self._infer, compiler_options=alone)
+        self._compiled = _compiled(hand, task)
 
     def warm_up(self, weights: InferenceParameters, sizes: Sequence[int] = BATCH_SIZES) -> dict[int, float]:
         """Compiles batches of these sizes; returns the seconds that one of each takes from then on."""
@@ -108,24 +107,6 @@ class PolicyFunction:
             "trajectory_points": task.trajectory_points,
         }
 
-    def _infer(self, weights: InferenceParameters, vectors: jax.Array) -> jax.Array:
-        """For states (B, S): answers (A + F + 6), flags redirected and aligned, and checks (C), concatenated to (B,
-        ...).
-        """
-        hand, task = self.layout.hand, self.layout.task
-        fields, checks = self.layout.complete(vectors)
-        asked = {c.name: fields["asked"][:, i] > 0.5 for i, c in enumerate(self.layout.known) if c.optional}
-        surface = self.layout.surface(fields)
-        resolution = resolve(hand, surface, self.layout.goal(fields), asked)
-        state = SceneState(**{name: fields[name] for name in SceneState._fields})
-        if (readings := self.layout.readings(fields)) is not None:
-            state = seen_by(task, state, readings)
-        scene = scene_of(hand, task, state, surface, resolution.goal, readings)._replace(cloud=surface)
-        mean = mean_action(observation.layout(hand, task), weights, observation.observe(scene))
-        action = control.decode(scene, task.control, mean)
-        notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
-        return jnp.concatenate([mean, action.q_target, action.u_target, notes, checks], -1)
-
     def _answer(self, query: Query, found: np.ndarray) -> Inference | Exception:
         """Returns the answer to one query, or its error."""
         size = len(self.layout.hand.motors) + len(self.layout.hand.joints) + 12
@@ -143,3 +124,28 @@ class PolicyFunction:
         flags = redirected.tolist()
         active = {flag: explain(query.asked, redirected=flag > 0) for flag in set(flags)}
         return Inference(vectors, [active[flag] for flag in flags])
+
+
+@functools.lru_cache(maxsize=8)
+def _compiled(hand: Hand, task: TaskConfig) -> Any:
+    """Returns the program of the policies of a hand and task, which they share in a process."""
+    # Waking other threads costs more CPU time than they save here.
+    alone = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
+    return jax.jit(functools.partial(_infer, Layout(hand, task)), compiler_options=alone)
+
+
+def _infer(layout: Layout, weights: InferenceParameters, vectors: jax.Array) -> jax.Array:
+    """For states (B, S): answers (A + F + 6), flags redirected and aligned, and checks (C), as one array (B, ...)."""
+    hand, task = layout.hand, layout.task
+    fields, checks = layout.complete(vectors)
+    asked = {c.name: fields["asked"][:, i] > 0.5 for i, c in enumerate(layout.known) if c.optional}
+    surface = layout.surface(fields)
+    resolution = resolve(hand, surface, layout.goal(fields), asked)
+    state = SceneState(**{name: fields[name] for name in SceneState._fields})
+    if (readings := layout.readings(fields)) is not None:
+        state = seen_by(task, state, readings)
+    scene = scene_of(hand, task, state, surface, resolution.goal, readings)._replace(cloud=surface)
+    mean = mean_action(observation.layout(hand, task), weights, observation.observe(scene))
+    action = control.decode(scene, task.control, mean)
+    notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
+    return jnp.concatenate([mean, action.q_target, action.u_target, notes, checks], -1)

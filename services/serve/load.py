@@ -82,7 +82,9 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     task = TaskConfig(hand=hand, constraints=("heading",))
     found = get_hand(hand)
     (obj,) = scale_objects(found, task, [procedural.generate(seed)])
-    initial_conditions = initial.sample(found, task, build_bank(found, task, [obj], seed), jax.random.key(seed), 1)
+    sample = jax.jit(initial.sample, static_argnames=("hand", "task", "batch"))
+    bank = build_bank(found, task, [obj], seed)
+    initial_conditions = jax.device_get(sample(found, task, bank, jax.random.key(seed), batch=1))
     world = {name: np.asarray(value)[0] for name, value in initial_conditions.reset_state._asdict().items()}
     pose = world["object_position"], world["object_quaternion"]
     request = GraspRequest(

@@ -52,7 +52,7 @@ def test_resting_poses_are_listed_and_drawn(tmp_path, capsys):
     assert Image.open(tmp_path / "rests.png").width == len(poses) * (240 + 10) + 10
 
 
-def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, capsys):
+def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, capsys, quick_import):
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "good.stl")
     trimesh.creation.box((40, 50, 60)).export(tmp_path / "big.stl")
     (tmp_path / "text.ply").write_text("no mesh")
@@ -71,7 +71,7 @@ def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, 
     assert Catalogue(tmp_path / "out").get("good").mass == 0.25
 
 
-def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch):
+def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, quick_import):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     obj = find_object("mug:7")
     path = Catalogue(tmp_path).add(obj)

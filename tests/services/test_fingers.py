@@ -1,4 +1,4 @@
-"""A constraint beyond the paper's, asked of policies that know it and of one that does not, at every door."""
+"""Constraints beyond the paper's, requested of a policy that knows them and of one that does not, at every door."""
 
 import dataclasses
 import json
@@ -10,9 +10,7 @@ import pytest
 import trimesh
 
 from congrasp.actors.attempts import PLAIN, Phases
-from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError, UnknownConstraintError
-from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.task import observation
@@ -21,12 +19,13 @@ from congrasp.common.task.constraints import PAPER
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.export.policy import describe, export_policy
 from congrasp.services.grasp.files import RESULT
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.serve.inference import Inference, PolicyFunction
-from congrasp.services.serve.load import example_episode
+from congrasp.services.serve.load import Example
 from congrasp.services.serve.requests import Layout
 from congrasp.services.studio import description
 from congrasp.services.studio.grasping import PolicyGrasping
@@ -34,10 +33,9 @@ from congrasp.services.studio.lanes import for_page, lanes
 from congrasp.services.studio.state import Studio
 from congrasp.services.train.command import untrained
 from tests.printed import errors
+from tests.task import CONFIG, HAND, TASK
+from tests.task import policy as make_policy
 
-HAND = get_hand("human")
-TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))
-CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
 MUG = procedural.generate(1, "mug")
 PINCH = np.array([True, True, False, False, False])
 REFUSED = (
@@ -48,15 +46,13 @@ REFUSED = (
 
 @pytest.fixture(scope="module")
 def policy() -> PolicyBundle:
-    """A policy that knows all constraints and has learnt nothing."""
-    return untrained(CONFIG)
+    return make_policy()
 
 
 @pytest.fixture(scope="module")
-def query() -> dict[str, np.ndarray]:
+def query(example: Example) -> dict[str, np.ndarray]:
     """The arrays of a query with the heading, from the start of an episode."""
-    episode = example_episode(1_000_000)
-    request, state = episode.request, episode.state
+    request, state = example.request, example.state
     given = {f"heading_{name}": value for name, value in request.constraints["heading"].items()}
     given |= {"q_target": request.q, "q_initial": request.q, "u_target": np.zeros(6), "time": np.float32(0)}
     given |= {"base_position": request.wrist[0], "base_quaternion": request.wrist[1], "table": np.bool_(True)}
@@ -67,19 +63,26 @@ def query() -> dict[str, np.ndarray]:
 # A policy that does not know it.
 
 
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [("fingers", ["--fingers", "thumb", "index"]), ("force", ["--force", "3"]), ("force", ["--gentle"])],
+)
 def test_the_command_refuses_it_in_one_line(
     paper_policy: pathlib.Path,
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    quick_import: None,
+    name: str,
+    option: list[str],
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
     options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures"]
-    assert load("grasp")([str(tmp_path / "block.stl"), *options, "--fingers", "thumb", "index"])() == 2
+    assert load("grasp")([str(tmp_path / "block.stl"), *options, *option])() == 2
     (line,) = errors(capsys.readouterr().err)
     assert line.startswith(
-        "congrasp: error: The policy does not support the constraint 'fingers'. It supports heading, "
+        f"congrasp: error: The policy does not support the constraint '{name}'. It supports heading, "
     )
     assert not (tmp_path / "out" / "block" / RESULT).exists()
 
@@ -126,18 +129,24 @@ def test_fingers_are_read_by_their_names() -> None:
         read_request(MUG, HAND, 15, fingers=("thumb",))
 
 
-def test_a_grasp_is_asked_for_with_two_fingers(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
+def test_a_grasp_with_two_fingers_and_a_force_limit(policy: PolicyBundle, tmp_path: pathlib.Path) -> None:
     grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
-    found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index")))
+    found = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3"))
     grasper.close()
-    assert found.motion.constraints == ("heading", "fingers") and "fingers_ratio" in found.facts()
-    np.testing.assert_array_equal(found.motion.goal["fingers_allowed"], PINCH)
+    assert found.motion.constraints == ("heading", "fingers", "force") and "fingers_ratio" in found.facts()
+    assert 0.0 <= found.facts()["force_ratio"] <= 1.0
+    save_motion(tmp_path / "grasp.npz", found.motion)
+    goal = load_motion(tmp_path / "grasp.npz").goal
+    np.testing.assert_array_equal(goal["fingers_allowed"], PINCH)
+    assert goal["force_limit"] == 3.0
     assert "Only the named fingers may touch the object." in found.active
+    assert "No link may press harder than the force limit." in found.active
     arrays = found.episode.arrays
     steps = len(arrays["table"])
     other = np.isin(HAND.link_fingers, (2, 3, 4))
-    touching = np.linalg.norm(arrays["contact_force"], axis=-1) > 0
-    np.testing.assert_array_equal(arrays["error/fingers_ratio"] > 0, (touching & other).any(-1))
+    links = np.linalg.norm(arrays["contact_force"], axis=-1)
+    np.testing.assert_array_equal(arrays["error/fingers_ratio"] > 0, ((links > 0) & other).any(-1))
+    np.testing.assert_array_equal(arrays["error/force_ratio"] > 0, (links > 3.0).any(-1))
     assert arrays["active/fingers"] and not arrays["active/pose_finger"]
     assert lanes(found.episode)["fingers"].met.shape == (steps,)
     assert "lane/fingers/share" in for_page(found.episode).arrays
@@ -146,7 +155,7 @@ def test_a_grasp_is_asked_for_with_two_fingers(policy: PolicyBundle, tmp_path: p
 def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: dict[str, np.ndarray]) -> None:
     function = PolicyFunction(HAND, TASK)
     layout = function.layout
-    assert layout.shapes["fingers_allowed"] == (5,) and layout.shapes["asked"] == (5,)
+    assert layout.shapes["fingers_allowed"] == (5,) and layout.shapes["asked"] == (6,)
 
     def ask(constraints: list[str], **more: np.ndarray) -> Inference | Exception:
         (answer,) = function(
@@ -173,9 +182,8 @@ def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: di
 def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
     studio = Studio(HAND, TASK, MUG)
     flags = dict(zip(HAND.fingers, PINCH.tolist(), strict=True))
-    assert description.describe(studio)["others"] == [
-        {"name": "fingers", "title": "fingers", "flags": {"allowed": flags}}
-    ]
+    shown = {"name": "fingers", "title": "fingers", "flags": {"allowed": flags}}
+    assert description.describe(studio)["others"][0] == shown
     studio.ask("fingers", True)
     assert description.describe(studio)["active"]["masks"]["fingers"] and studio.trouble == ""
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), PINCH)
@@ -214,19 +222,36 @@ def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp
     assert dict(meta["layout"])["fingers"] == sum(size for _, size in block)
     assert (
         meta["masks"]
-        == ["affordance", "pose_finger", "pose_wrist", "trajectory", "fingers"]
+        == ["affordance", "pose_finger", "pose_wrist", "trajectory", "fingers", "force_limit"]
         == describe(policy)["masks"]
     )
     assert sum(size for _, size in meta["layout"]) == sum(size for _, size in observation.layout(HAND, TASK))
 
 
-@pytest.mark.slow
-def test_an_evaluation_has_its_row(policy: PolicyBundle) -> None:
-    evaluator = Evaluator(policy, procedural.generate_many(2, 1_000_000), physics="native", batch=8)
-    sample = evaluator.samples(["fingers"], 6)["fingers"]
-    ratio = sample.values["fingers_ratio"]
-    assert (sample.values["mask_fingers"] == 1).all() and ((ratio >= 0) & (ratio <= 1)).all()
-    row = evaluator.row("fingers", sample)
-    assert (row.constraint, row.episodes) == ("fingers", 6) and row.paper is None
-    assert "fingers_ratio" in row.errors and row.errors["heading_rad"] is None
-    assert (row.errors["fingers_ratio"] is None) == (row.success == 0)
+def test_queries_for_a_force_limit_are_answered_and_checked(policy: PolicyBundle, query: dict[str, np.ndarray]) -> None:
+    function = PolicyFunction(HAND, TASK)
+    layout = function.layout
+    assert layout.shapes["force_limit"] == ()
+
+    def ask(constraints: list[str], **more: np.ndarray) -> Inference | Exception:
+        queries = [layout.parse(Message({**query, **more}, {"constraints": constraints}))]
+        (answer,) = function(policy.inference_parameters, queries)
+        return answer
+
+    soft, firm = (ask(["heading", "force"], force_limit=np.float32(limit)) for limit in (2.0, 15.0))
+    assert isinstance(soft, Inference) and isinstance(firm, Inference)
+    assert np.abs(soft.vectors - firm.vectors).max() > 1e-6
+    assert "takes a limit between 0.5 and 50 N" in str(ask(["heading", "force"], force_limit=np.float32(0.0)))
+    with pytest.raises(CongraspError, match="lacks the field 'force_limit'"):
+        ask(["heading", "force"])
+
+
+def test_the_studio_has_a_box_for_a_force_limit() -> None:
+    studio = Studio(HAND, TASK, MUG)
+    studio.ask("force", True)
+    assert {"name": "force", "title": "force limit", "flags": {}} in json.loads(
+        json.dumps(description.describe(studio)["others"])
+    )
+    assert studio.request.given("force", "limit") == 5.0 and studio.trouble == ""
+    with pytest.raises(CongraspError, match="nothing to choose for 'force'"):
+        studio.choose("force", "limit", [True])

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from collections.abc import Sequence as Items
 from typing import Any, Literal
 
+import jax
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -46,6 +47,9 @@ _TOUCHED = 0.03
 """Radius around touched points that counts as touched, m."""
 IN_TABLE = 0.005
 """Tolerated depth of a captured hand in the table if no resting pose avoids it, m."""
+_above_table = jax.jit(above_table)
+_clear_of_table = jax.jit(clear_of_table, static_argnums=0)
+_height_over_table = jax.jit(height_over_table, static_argnums=0)
 _VERTICES = 3
 """Least number of contact points that makes a part of an object graspable."""
 
@@ -275,8 +279,8 @@ def _resting_poses(
       rest: (R, 7) resting poses.
     """
     rests = np.stack([rest] * len(position))
-    clear = np.asarray(clear_of_table(hand, quaternion[:, -1], position, rests))
-    height = np.where(clear, height_over_table(hand, q, position, quaternion, rests), -np.inf)
+    clear = np.asarray(_clear_of_table(hand, quaternion[:, -1], position, rests))
+    height = np.where(clear, _height_over_table(hand, q, position, quaternion, rests), -np.inf)
     return clear & (height >= np.clip(height.max(1, keepdims=True), -IN_TABLE, -SOFT))
 
 
@@ -343,8 +347,8 @@ def _from_below(hand: Hand, made: Message) -> np.ndarray:
     names = "trajectory/position", "pose/quaternion", "rest"
     path, turn, rest = (made.arrays[name] for name in names)
     rests = np.stack([rest] * path.shape[1])
-    clear = np.asarray(clear_of_table(hand, turn[0], path[0], rests))
-    return np.asarray(np.asarray(above_table(path[0], rests)).any(-1) & ~clear.any(-1))
+    clear = np.asarray(_clear_of_table(hand, turn[0], path[0], rests))
+    return np.asarray(np.asarray(_above_table(path[0], rests)).any(-1) & ~clear.any(-1))
 
 
 def _twice(values: np.ndarray) -> np.ndarray:

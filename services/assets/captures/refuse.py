@@ -1,6 +1,8 @@
 """Refuses captured references that a hand cannot take: too deep in their object, or wider than the hand opens."""
 
-import jax.numpy as jnp
+import functools
+
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -10,6 +12,7 @@ from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transfo
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.shapes import hull_of, tessellate
 from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.common.task.types import Array
 from congrasp.services.assets.captures.extract import Demonstration
 from congrasp.services.assets.captures.sequence import Dropped
 
@@ -50,12 +53,18 @@ def depth(demonstration: Demonstration, obj: GraspObject) -> float:
 
     It is exact if a finger's axis is in the piece, and an upper bound beyond its edges.
     """
-    ends = np.asarray(capsules(HUMAN, link_transforms(HUMAN, jnp.asarray(demonstration.q, jnp.float32))), float)
+    ends = np.asarray(_capsules(HUMAN, demonstration.q.astype(np.float32)), float)
     axes = (1 - _ALONG) * ends[:, :1] + _ALONG * ends[:, 1:]
     turn = Rotation.from_quat(demonstration.quaternion[-1], scalar_first=True)
     points = turn.apply(axes.reshape(-1, 3)) + demonstration.position[-1]
     outside = np.min([_above_faces(piece, points) for piece in obj.pieces], axis=0)
     return float((np.repeat(HUMAN.capsule_radii, len(_ALONG)) - outside).max())
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _capsules(hand: Hand, q: Array) -> Array:
+    """Ends (C, 2, 3) of a hand's capsules at finger angles (F,), compiled as one program."""
+    return capsules(hand, link_transforms(hand, q))
 
 
 def _above_faces(piece: Piece, points: np.ndarray) -> np.ndarray:

@@ -286,18 +286,13 @@ def _response(one: Response) -> str:
 def _open_overlap(hand: Hand) -> Finding:
     """Checks that different fingers of the open hand do not overlap; housings of one finger may nest at knuckles."""
     names = [link.name for link in hand.links]
-    transforms = kinematics.link_transforms(hand, jnp.asarray(hand.q_open))
-    ends = np.asarray(kinematics.capsules(hand, transforms))
+    depths = np.asarray(_depths(hand, np.array(hand.q_open, np.float32)))
     deepest, pair = 0.0, ""
     for pair_of in overlapping(hand):
         if any(one in ("", names[0], *chain_of(hand, other)) for one, other in (pair_of, pair_of[::-1])):
             continue
-        a, b = (np.flatnonzero(hand.capsule_links == names.index(name)) for name in pair_of)
-        first, second = (grid.ravel() for grid in np.meshgrid(a, b))
-        apart = np.asarray(
-            plausibility.segment_distance(*(jnp.asarray(ends[i, side]) for i in (first, second) for side in (0, 1)))
-        )
-        depth = float((hand.capsule_radii[first] + hand.capsule_radii[second] - apart).max())
+        first, second = (np.flatnonzero(hand.capsule_links == names.index(name)) for name in pair_of)
+        depth = float(depths[np.ix_(first, second)].max())
         if depth > deepest:
             deepest, pair = depth, f" ({pair_of[0]} and {pair_of[1]}, which then do not collide)"
     return _finding(
@@ -306,6 +301,14 @@ def _open_overlap(hand: Hand) -> Finding:
         f"fingers overlap by at most {1e3 * deepest:.1f} mm{pair}",
         "widen the open_pose, or make the capsules of the two smaller",
     )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _depths(hand: Hand, q: jax.Array) -> jax.Array:
+    """Overlaps (C, C) in m of all pairs of capsules at finger angles (F,), compiled as one program."""
+    start, end = jnp.moveaxis(kinematics.capsules(hand, kinematics.link_transforms(hand, q)), -2, 0)
+    apart = plausibility.segment_distance(start[:, None], end[:, None], start, end)
+    return hand.capsule_radii[:, None] + hand.capsule_radii - apart
 
 
 def _closed_overlap(depth: float) -> Finding:

@@ -7,6 +7,7 @@ the pushes are those of `actors.stress`.
 """
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,6 +27,7 @@ from congrasp.common.objects.families import draft
 from congrasp.common.objects.plain import plain_object
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.types import Array
 
 OBJECTS = ("ball", "cylinder", "box")
 SIZES = (0.4, 0.3)
@@ -157,12 +159,9 @@ def _shake(
 ) -> PhysicsState:
     """Simulates half a second without support, the lift, and the pushes; the states have a leading axis T."""
     task = dataclasses.replace(task, approach_steps=0)
-    protocol, time = protocols.stress(task, objects, _HOLD), jnp.arange(_HOLD + protocols.stress_steps(task))
-    base = jnp.tile(jnp.asarray(start.base_quaternion)[:1], (len(time), 1))
-    frame = protocols.frame(protocol, task, time + 0.5)
-    wrist = np.asarray(protocols.carried_targets(jnp.zeros((len(time), 6)), hand, base, frame))
-    which = [jnp.full(len(time), n) for n in range(len(objects))]
-    pushes = np.stack([protocols.push(protocol, task, time, n, jnp.ones(len(time))) for n in which], 1)
+    protocol, time = protocols.stress(task, objects, _HOLD), np.arange(_HOLD + protocols.stress_steps(task))
+    base = np.tile(np.asarray(start.base_quaternion, np.float32)[:1], (len(time), 1))
+    wrist, pushes = map(np.asarray, _disturbances(hand, task, len(objects), protocol, time, base))
     states, away = [], np.zeros(len(target), bool)
     for u, force in zip(wrist, pushes[:, start.object_index], strict=True):
         _, state = physics.step(physics, np.concatenate([np.tile(u, (len(target), 1)), target], -1), away, force)
@@ -170,15 +169,40 @@ def _shake(
     return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _disturbances(
+    hand: Hand, task: TaskConfig, count: int, protocol: protocols.Protocol, time: Array, base: Array
+) -> tuple[Array, Array]:
+    """Targets (T, 6) of a carried wrist and pushes (T, N, 3) of N objects, in N, at control steps `time` (T,).
+
+    Args:
+      hand: the hand.
+      task: the task.
+      count: number N of objects.
+      protocol: times of lift and pushes.
+      time: (T,) control steps.
+      base: (T, 4) orientations of the wrist's base.
+    """
+    frame = protocols.frame(protocol, task, time + 0.5)
+    wrist = protocols.carried_targets(jnp.zeros((len(time), 6)), hand, base, frame)
+    which = [jnp.full(len(time), n) for n in range(count)]
+    return wrist, jnp.stack([protocols.push(protocol, task, time, n, jnp.ones(len(time))) for n in which], 1)
+
+
+@jax.jit
+def _in_wrist_frame(start: ResetState, states: PhysicsState) -> tuple[Array, Array]:
+    """Positions (T, B, 3) and orientations (T, B, 4) of the objects in the wrist frame."""
+    wrist = rotations.compose_pose(
+        start.base_position, start.base_quaternion, states.u[..., :3], rotations.euler_to_quaternion(states.u[..., 3:])
+    )
+    return rotations.relative_pose(*wrist, states.object_position, states.object_quaternion)
+
+
 def _judged(
     task: TaskConfig, start: ResetState, states: PhysicsState, objects: Sequence[GraspObject], width: float
 ) -> list[Grip]:
     """Results of the attempts."""
-    wrist = rotations.compose_pose(
-        start.base_position, start.base_quaternion, states.u[..., :3], rotations.euler_to_quaternion(states.u[..., 3:])
-    )
-    seen = rotations.relative_pose(*wrist, states.object_position, states.object_quaternion)
-    position, quaternion = (np.asarray(leaf) for leaf in seen)
+    position, quaternion = map(np.asarray, _in_wrist_frame(start, states))
     last = _HOLD - 1
     moved = np.linalg.norm(states.object_position[last], axis=-1)  # it was released at the origin
     held = (moved < protocols.FARTHEST) & ~states.diverged.any(0)

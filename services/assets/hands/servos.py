@@ -1,6 +1,7 @@
 """Tracking of a hand's motors in free air: the response to a step, and closing without an object."""
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ from congrasp.common.hands.motors import motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.types import Array
 from congrasp.services.assets.hands.grips import grip_objects
 
 STEP = 0.1
@@ -65,7 +67,13 @@ def closed_overlap(hand: Hand, task: TaskConfig, threads: int) -> float:
     share = np.minimum(np.arange(1, 2 * _STEPS + 1) / _STEPS, 1.0)[:, None, None]
     opened, closed = (motor_positions(hand, q) for q in (hand.q_open, hand.q_closed))
     states = _states(hand, task, opened + share * (closed - opened), threads)
-    return float(plausibility.hand_hand(hand, link_transforms(hand, np.asarray(states.q[-1], np.float32)))[0])
+    return float(_overlap(hand, states.q[-1].astype(np.float32))[0])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _overlap(hand: Hand, q: Array) -> Array:
+    """Greatest overlap (B,) in m of two links at finger angles (B, F), compiled as one program."""
+    return plausibility.hand_hand(hand, link_transforms(hand, q))
 
 
 def _states(hand: Hand, task: TaskConfig, targets: np.ndarray, threads: int) -> PhysicsState:

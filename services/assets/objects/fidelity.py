@@ -84,12 +84,15 @@ def _random() -> np.random.Generator:
 
 def _farthest(surface: _Surface, other: _Surface) -> float:
     """The largest distance of a point of a surface that the ball can touch from the other surface, m."""
-    some = _random().permutation(np.flatnonzero(surface.outer))[:POINTS]
+    # Sorted: neighbouring points are then neighbours in the tree and in memory.
+    some = np.sort(_random().permutation(np.flatnonzero(surface.outer))[:POINTS])
     points, normals = surface.points[some], surface.normals[some]
     tree = cKDTree(surface.points)
-    distance, near = tree.query(points, k=8)
-    in_crack = (distance < _SEAM) & (np.einsum("nkj,nj->nk", surface.normals[near], normals) < -_FACING)
-    touched = ~in_crack.any(-1) & (tree.query(points + REACH * normals)[0] > _TOUCHES * REACH)
+    distance, near = tree.query(points, k=8, distance_upper_bound=_SEAM)
+    facing = np.einsum("nkj,nj->nk", surface.normals[np.minimum(near, len(surface.points) - 1)], normals)
+    in_crack = (distance < _SEAM) & (facing < -_FACING)
+    apart = np.isinf(tree.query(points + REACH * normals, distance_upper_bound=_TOUCHES * REACH)[0])
+    touched = ~in_crack.any(-1) & apart
     return float(cKDTree(other.points[other.outer]).query(points[touched])[0].max(initial=0.0))
 
 

@@ -26,6 +26,7 @@ from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
 from congrasp.services.export.motion_file import load_motion, robot_joints
 from congrasp.services.export.motion_formats import pick_motion
+from tests.services.conftest import quick_imports
 
 LINKS = [("0 0 1", 0.3, 170), ("0 1 0", 0.0, 120), ("0 0 1", 0.4, 170), ("0 1 0", 0.0, 140), ("0 0 1", 0.4, 170),
          ("0 1 0", 0.0, 120), ("0 0 1", 0.1, 170)]  # fmt: skip
@@ -60,7 +61,8 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def block(folder):
-    return one_object(folder / "block.stl", ImportOptions(cache_dir=str(folder)))
+    with quick_imports():
+        return one_object(folder / "block.stl", ImportOptions(cache_dir=str(folder / "quick")))
 
 
 @pytest.fixture(scope="module")

@@ -25,15 +25,14 @@ ROOT = pathlib.Path(__file__).resolve().parents[3]
 
 
 def arguments(out: pathlib.Path, *more: str) -> list[str]:
-    """Six episodes of each of three objects, a shard each."""
-    own = ["dataset", "box:1-3", "--out", str(out), "--per-object", "6", "--shard", "1"]
+    """Six episodes of each of two objects, a shard each."""
+    own = ["dataset", "box:1-2", "--out", str(out), "--per-object", "6", "--shard", "1"]
     return [*own, "--constraints", "heading", "affordance", "--keep", "all", "--physics", "native", *more]
 
 
 def made(out: pathlib.Path, *more: str) -> dict:
-    """Makes a dataset in a process of its own, whose programs the next ones find compiled; returns its card."""
-    command = [sys.executable, "-m", "congrasp", *arguments(out, *more)]
-    subprocess.run(command, check=True, timeout=500, stdout=subprocess.DEVNULL)
+    """Makes a dataset in this process, which compiles once for all of them; returns its card."""
+    assert not cli.run(arguments(out, *more))
     return json.loads((out / CARD).read_text())
 
 
@@ -63,7 +62,7 @@ def columns(whole) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_a_killed_run_resumes_and_parts_make_the_same_shards(whole, tmp_path):
+def test_a_killed_run_and_parts_make_the_same_shards(whole, tmp_path):
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
@@ -72,25 +71,25 @@ def test_a_killed_run_resumes_and_parts_make_the_same_shards(whole, tmp_path):
     os.kill(process.pid, signal.SIGKILL)
     process.wait(30)
     killed = contents(tmp_path)
-    assert 2 <= len(killed) < 6, "it was killed between its first shard and its last"
-    (tmp_path / "grasps" / f".00002-of-00003.parquet.{process.pid}.tmp").write_bytes(b"half a shard")
+    assert 2 <= len(killed) < 4, "it was killed between its first shard and its last"
+    (tmp_path / "grasps" / f".00001-of-00002.parquet.{process.pid}.tmp").write_bytes(b"half a shard")
     first = sorted(tmp_path.rglob("*.parquet"))[0]
     changed = first.stat().st_mtime_ns
-    made(tmp_path, "--part", "3/3")
+    made(tmp_path, "--part", "2/2")
     card = made(tmp_path)
     assert first.stat().st_mtime_ns == changed, "what was finished is not made again"
     assert contents(tmp_path) == contents(whole)
     assert card["counts"] == json.loads((whole / CARD).read_text())["counts"]
-    assert card["shards"] == {"finished": 3, "of": 3}
+    assert card["shards"] == {"finished": 2, "of": 2}
 
 
-def test_rows_say_what_was_requested_and_what_came_of_it(whole, columns):
+def test_rows_have_requests_and_outcomes(whole, columns):
     card = json.loads((whole / CARD).read_text())
-    assert len(columns["object"]) == 18 and sorted(set(columns["object"])) == ["box_1", "box_2", "box_3"]
+    assert len(columns["object"]) == 12 and sorted(set(columns["object"])) == ["box_1", "box_2"]
     for asked in ("heading", "affordance"):
         rows = columns["constraints"] == asked
-        assert sorted(columns["episode"][rows]) == sorted([0, 1, 2] * 3)
-        assert card["counts"][asked]["episodes"] == 9
+        assert sorted(columns["episode"][rows]) == sorted([0, 1, 2] * 2)
+        assert card["counts"][asked]["episodes"] == 6
         assert card["counts"][asked]["held"] == columns["held"][rows].sum()
         assert np.isnan(columns["goal_heading_direction"][rows]).all() == (asked != "heading")
         assert np.isfinite(columns["affordance_ratio"][rows]).all() == (asked == "affordance")
@@ -110,7 +109,7 @@ def test_poses_are_in_the_frame_of_the_object(columns):
     assert (np.asarray(turned + start[:, :3])[:, 2] > 0).all(), "the wrist starts above the table"
 
 
-def test_objects_are_beside_their_grasps(whole):
+def test_objects_are_stored(whole):
     table = pq.read_table(whole / "objects")
     box = generate(2, "box")
     row = table.column("object").to_pylist().index("box_2")
@@ -119,7 +118,7 @@ def test_objects_are_beside_their_grasps(whole):
 
 
 def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tmp_path):
-    card = made(tmp_path, "--keep", "held", "clean", "--part", "1/3")
+    card = made(tmp_path, "--keep", "held", "clean", "--part", "1/2")
     of_first = columns["object"] == "box_1"
     wanted = of_first & columns["held"] & columns["clean"]
     assert pq.read_table(tmp_path / "grasps").num_rows == wanted.sum()
@@ -138,7 +137,7 @@ def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tm
         (("--shard", "100000"), "--shard"),
     ],
 )
-def test_what_cannot_be_made_is_refused_in_one_line(whole, more, words):
+def test_bad_options(whole, more, words):
     with pytest.raises(CongraspError, match=words) as error:
         cli.run(arguments(whole, *more))
     assert "\n" not in str(error.value)

@@ -1,16 +1,10 @@
-"""Failures are drawn with their causes, from what was simulated."""
-
-import dataclasses
+"""Causes of failures."""
 
 import numpy as np
 import pytest
 
-from congrasp.common.objects.procedural import generate_many
 from congrasp.common.wire.codec import Message
-from congrasp.services.evaluate.evaluator import Evaluator
-from congrasp.services.evaluate.failures import cause, failure_sheets
-from congrasp.services.train.command import untrained
-from congrasp.services.train.presets import get_preset
+from congrasp.services.evaluate.failures import cause
 
 
 def episode(heights, **metrics) -> Message:
@@ -42,15 +36,3 @@ def test_what_slips_in_a_lift_is_measured_from_the_wrist():
     arrays = {**made.arrays, "link_position": wrist, "table": np.ones(8, bool)}
     lifted = Message(arrays, {**made.meta, "phases": {"grasp": 0.0, "lift": 0.02}})
     assert cause(lifted, 0.05) == "slipped 0.03 s after the lift began"
-
-
-@pytest.mark.slow
-def test_failures_of_an_untrained_policy_are_drawn():
-    config = get_preset("quickstart")
-    policy = untrained(dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,))))
-    evaluator = Evaluator(policy, generate_many(2, 0, ("box",)), batch=4)
-    sample = evaluator.samples(["heading"], 3, keep=True)["heading"]
-    assert not sample.values["held"].any()
-    ((name, sheet, causes),) = failure_sheets(evaluator, policy, ["heading"], successes=2, failures=2)
-    assert name == "heading" and len(causes) == 2 and "held" not in causes
-    assert sheet.shape[0] > 2 * 225 and sheet.shape[1] > 5 * 300

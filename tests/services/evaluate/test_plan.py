@@ -1,24 +1,17 @@
 """Rows of an evaluation: their episodes, and what they do not depend on."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
 
-from congrasp.common.hands import get_hand
-from congrasp.common.objects import procedural
-from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import OURS, PAPER, blocks
-from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.task.constraints import blocks
 from congrasp.services.evaluate.plan import ALIGNED, batches, plan_row
-from congrasp.services.evaluate.protocol import protocol
+from congrasp.services.evaluate.protocol import protocol, two_seconds
 from congrasp.services.evaluate.scores import TABLES
+from tests import task
 
-HAND = get_hand("human")
-TASK = protocol(TaskConfig(constraints=PAPER), 200)
-OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box"), procedural.generate(3, "hammer")]
-MASKS = {  # affordance, fingers of the pose, wrist of the pose, trajectory
+TASK = protocol(task.TASK, two_seconds(task.TASK))
+MASKS = {  # affordance, fingers of the pose, wrist of the pose, trajectory; neither fingers nor a force limit
     "heading": (0, 0, 0, 0),
     "pose": (0, 1, 1, 0),
     "trajectory": (0, 0, 0, 1),
@@ -30,38 +23,40 @@ MASKS = {  # affordance, fingers of the pose, wrist of the pose, trajectory
 
 @pytest.fixture(scope="module")
 def bank():
-    return build_bank(HAND, TASK, OBJECTS, 3)
+    return task.bank()
 
 
-def _all(bank, plan, seed=0, size=32):
+def _all(bank, plan, seed=0, size=task.BATCH):
     """The conditions of all episodes of a plan."""
-    parts = [jax.tree.map(lambda x, n=n: np.asarray(x)[:n], c) for c, n in batches(HAND, TASK, bank, plan, seed, size)]
+    parts = [
+        jax.tree.map(lambda x, n=n: np.asarray(x)[:n], c) for c, n in batches(task.HAND, TASK, bank, plan, seed, size)
+    ]
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
 @pytest.mark.parametrize("name", MASKS)
-def test_every_object_has_as_many_episodes_with_just_the_rows_constraints(bank, name):
-    plan = plan_row(TASK, bank, OBJECTS, name, 50)
+def test_objects_have_equal_shares_and_the_rows_constraints(bank, name):
+    plan = plan_row(TASK, bank, task.OBJECTS, name, 50)
     conditions = _all(bank, plan)
     index = conditions.reset_state.object_index
     np.testing.assert_array_equal(index, plan.episodes.objects)
-    counts = np.bincount(index, minlength=len(OBJECTS))
+    counts = np.bincount(index, minlength=len(task.OBJECTS))
     each = -(-50 // plan.covered.sum())
     np.testing.assert_array_equal(counts, np.where(plan.covered, each, 0))
     for obj in np.flatnonzero(plan.covered):
         rests = plan.episodes.rests[index == obj]
         of_each = np.unique(rests, return_counts=True)[1]
-        assert of_each.max() - of_each.min() <= 1 and len(of_each) <= len(OBJECTS[obj].rest_poses)
-    for block, active in zip(blocks(TASK), MASKS[name], strict=True):
+        assert of_each.max() - of_each.min() <= 1 and len(of_each) <= len(task.OBJECTS[obj].rest_poses)
+    for block, active in zip(blocks(TASK), (*MASKS[name], 0, 0), strict=True):
         np.testing.assert_array_equal(conditions.goal.active[block], np.full(plan.total, bool(active)))
 
 
-def test_an_episode_does_not_depend_on_the_objects_beside_it(bank):
+def test_episodes_are_independent_of_other_objects(bank):
     """Nor on how many there are, or in which batches they are simulated (but for the rounding of another program)."""
     fewer = jax.tree.map(lambda x: x[1:], bank)
     for name in ("affordance", "pose+trajectory"):
-        among = plan_row(TASK, bank, OBJECTS, name, 30)
-        alone = plan_row(TASK, fewer, OBJECTS[1:], name, 8)
+        among = plan_row(TASK, bank, task.OBJECTS, name, 30)
+        alone = plan_row(TASK, fewer, task.OBJECTS[1:], name, 8)
         whole, part = _all(bank, among), _all(fewer, alone, size=4)
         for i, (obj, number) in enumerate(zip(alone.episodes.objects, alone.episodes.numbers, strict=True)):
             (at,) = np.flatnonzero((among.episodes.objects == obj + 1) & (among.episodes.numbers == number))
@@ -74,17 +69,17 @@ def test_an_episode_does_not_depend_on_the_objects_beside_it(bank):
 
 
 def test_seeds_and_rows_draw_for_themselves(bank):
-    heading = plan_row(TASK, bank, OBJECTS, "heading", 30)
+    heading = plan_row(TASK, bank, task.OBJECTS, "heading", 30)
     drawn = [_all(bank, heading, seed).goal["heading"].position for seed in (0, 1)]
     drawn.append(_all(bank, heading._replace(constraint="affordance")).goal["heading"].position)
     for other in drawn[1:]:  # of the dozens of headings that an object has, two draws may well be the same
         assert (np.abs(drawn[0] - other).max(-1) > 0).mean() > 0.8
 
 
-def test_pairs_are_drawn_independently_but_where_they_are_aligned(bank):
+def test_pairs_are_independent_unless_aligned(bank):
     apart = {}
     for name in ("pose+trajectory", f"pose+trajectory{ALIGNED}"):
-        plan = plan_row(TASK, bank, OBJECTS, name, 60)
+        plan = plan_row(TASK, bank, task.OBJECTS, name, 60)
         goal = _all(bank, plan).goal
         q, wrist = (np.asarray(field)[plan.episodes.objects, 0] for field in (bank.pose_q, bank.pose_position))
         # Hands that close around nothing are alike: any pose with these fingers may be meant.
@@ -97,22 +92,21 @@ def test_pairs_are_drawn_independently_but_where_they_are_aligned(bank):
 
 
 def test_trajectories_end_nearer_to_the_graspable_region(bank):
-    conditions = _all(bank, plan_row(TASK, bank, OBJECTS, "trajectory+affordance", 60))
+    conditions = _all(bank, plan_row(TASK, bank, task.OBJECTS, "trajectory+affordance", 60))
     end = conditions.goal["trajectory"].position[:, -1]
     distance = np.linalg.norm(conditions.surface.points - end[:, None], axis=-1)
     avoid = conditions.surface.avoid
     assert np.all(np.where(avoid, np.inf, distance).min(1) < np.where(avoid, distance, np.inf).min(1))
 
 
-def test_objects_that_allow_nothing_are_counted_not_replaced(bank):
+def test_objects_that_allow_nothing_are_counted(bank):
     valid = np.array(bank.pose_valid)
     valid[1] = False
-    plan = plan_row(TASK, bank._replace(pose_valid=valid), OBJECTS, "pose", 10)
-    assert plan.covered.tolist() == [True, False, True] and 1 not in plan.episodes.objects
-    assert plan.total == 10
+    plan = plan_row(TASK, bank._replace(pose_valid=valid), task.OBJECTS, "pose", 10)
+    assert plan.covered.tolist() == [True, False, True, True] and 1 not in plan.episodes.objects
+    assert plan.total == 12
 
 
 def test_the_tables_name_rows_that_can_be_planned(bank):
-    task = dataclasses.replace(TASK, constraints=OURS)
     for name in dict.fromkeys(row for rows in TABLES.values() for row in rows):
-        assert plan_row(task, bank, OBJECTS, name, 3).total >= 3
+        assert plan_row(TASK, bank, task.OBJECTS, name, 3).total >= 3

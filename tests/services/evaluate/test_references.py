@@ -1,28 +1,22 @@
-"""References of a reference policy: where they come from, how they are split, and that they are made once."""
+"""References of a reference policy: where they come from, and how they are split."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.hands import get_hand
-from congrasp.common.objects import procedural
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands, reference_file
-from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling.build import POSES, build_bank
+from congrasp.common.task.sampling.build import POSES
 from congrasp.common.task.sampling.closed_poses import Poses
 from congrasp.services.evaluate import references
-from congrasp.services.evaluate.references import HELD_OUT, References, held_out
-
-HAND = get_hand("human")
-TASK = TaskConfig()
-OBJECTS = [procedural.generate(0, "bottle"), procedural.generate(1, "cylinder")]
+from congrasp.services.evaluate.references import HELD_OUT, held_out
+from tests import task
 
 
 @pytest.fixture(scope="module")
 def bank():
-    return build_bank(HAND, TASK, OBJECTS, 3)
+    return task.bank()
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +50,8 @@ def test_objects_that_the_policy_cannot_grasp_keep_geometric_references(bank, po
     low = Poses(*(np.asarray(field)[0, 0, good] for field in (bank.pose_q, bank.pose_position, bank.pose_quaternion)))
     down = [Rotation.from_quat(rest[3:], scalar_first=True).inv().apply([0, 0, -1.0]) for rest in bank.rest[:, 0]]
     own, *below = (low._replace(position=low.position + way.astype(np.float32)) for way in (-down[0], *down))
-    made = references._filled(policy, TASK, bank, [[[own, below[0], own], []], [[below[1]], []]])
-    np.testing.assert_array_equal(made.grasps, [[2, 0], [0, 0]])
+    made = references._filled(policy, task.TASK, bank, [[[own, below[0], own], []], [[below[1]], []], *[[[], []]] * 2])
+    np.testing.assert_array_equal(made.grasps, [[2, 0], [0, 0], [0, 0], [0, 0]])
     np.testing.assert_array_equal(made.bank.pose_q[0, 0], np.tile(own.q, (POSES, 1)))
     closed = np.asarray(bank.pose_q)[1, 0]
     assert all(any(np.array_equal(q, other) for other in closed) for q in np.asarray(made.bank.pose_q)[1, 0])
@@ -70,22 +64,3 @@ def test_only_the_last_fifth_is_for_tables(bank):
     everything = bank._replace(pose_valid=jnp.ones_like(bank.pose_valid))
     allowed = np.asarray(held_out(everything).pose_valid)
     assert allowed[..., -HELD_OUT:].all() and not allowed[..., :-HELD_OUT].any()
-
-
-def test_they_are_grasps_and_made_once(bank, policy, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(references, "_ATTEMPTS", 8)
-    told = []
-    arguments = (policy, TASK, OBJECTS, bank)
-    made = references.make(*arguments, physics="native", threads=1, progress=lambda *counts: told.append(counts))
-    assert made.grasps[:, 0].min() >= 3  # most episodes on such objects succeed
-    assert told[-1][0] >= made.grasps.sum() and [count for count, _ in told] == sorted(count for count, _ in told)
-    monkeypatch.setattr(references, "Episodes", None)  # nothing is simulated again
-    again = references.make(*arguments, physics="native", threads=1)
-    assert isinstance(again, References)
-    np.testing.assert_array_equal(again.bank.pose_q, made.bank.pose_q)
-    np.testing.assert_array_equal(again.grasps, made.grasps)
-    (kept,) = (tmp_path / "congrasp" / "references").iterdir()
-    kept.write_bytes(kept.read_bytes()[:1000])
-    with pytest.raises(TypeError):  # what is damaged is made anew
-        references.make(*arguments, physics="native", threads=1)

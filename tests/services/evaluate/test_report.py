@@ -11,7 +11,6 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
@@ -26,9 +25,9 @@ from congrasp.services.evaluate.turntable import turntable
 from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.train.command import untrained
-from congrasp.services.train.presets import get_preset
 from congrasp.services.viz.shapes import skin_shape
 from congrasp.services.viz.sheets import save_png
+from tests import task
 from tests.episodes import episode
 from tests.pages import Reader
 from tests.rows import row as made_row
@@ -43,8 +42,7 @@ def row(constraint, success, low, high):
 
 @pytest.fixture
 def policy():
-    config = get_preset("quickstart")
-    return untrained(dataclasses.replace(config, network=dataclasses.replace(config.network, hidden=(8,))))
+    return task.policy()
 
 
 def test_a_report_holds_its_tables_and_pictures(tmp_path, policy):
@@ -104,7 +102,7 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
 
 @pytest.mark.slow
 def test_the_command_evaluates_draws_and_writes(tmp_path):
-    config = RunConfig(task=TaskConfig(constraints=("heading",)), network=NetworkConfig(hidden=(8,), encoder=4))
+    config = dataclasses.replace(task.CONFIG, task=TaskConfig(constraints=("heading",)))  # a table of one row
     bundles.save(untrained(config), tmp_path / "mine.safetensors")
     command = ["report", str(tmp_path / "mine.safetensors"), "--out", str(tmp_path / "report.html")]
     assert main.run([*command, "--episodes", "1", "--pool", "2", "--physics", "native"]) == 0
@@ -146,13 +144,13 @@ def test_limits_name_what_is_bad_by_the_figures():
 
 
 def test_a_card_says_what_the_policy_sees_and_what_it_learnt_with(policy):
-    task = dataclasses.replace(policy.task, friction_range=(0.5, 1.2), mass_range=(1.0, 1.0))
-    card = model_card(dataclasses.replace(policy, task=task), [])
+    ranged = dataclasses.replace(policy.task, friction_range=(0.5, 1.2), mass_range=(1.0, 1.0))
+    card = model_card(dataclasses.replace(policy, task=ranged), [])
     assert "It observes exact poses, velocities and contact forces." in card["limits"]
     assert card["data"][1].endswith("; mass x 1, sliding friction 0.5 to 1.2.")
     trackers = SensingConfig(delay=(0.0, 0.1), dropout=(0.0, 0.3))
-    task = dataclasses.replace(task, observation="tracked", history=8, gain_range=(0.8, 1.2), sensing=trackers)
-    card = model_card(dataclasses.replace(policy, task=task), [])
+    tracked = dataclasses.replace(ranged, observation="tracked", history=8, gain_range=(0.8, 1.2), sensing=trackers)
+    card = model_card(dataclasses.replace(policy, task=tracked), [])
     (observed,) = [text for text in card["limits"] if text.startswith("It observes")]
     assert "last 8 control steps" in observed and "no velocities and no contact forces" in observed
     said = "servo gains x 0.8 to 1.2, tracker's delay 0 to 0.1 s, tracker's dropout 0 to 0.3."

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from congrasp.actors import attempts
 from congrasp.actors.attempts import Outcome, Phases
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
@@ -58,7 +59,7 @@ def test_a_shape_that_is_another_one_is_not_held():
     assert not Result("mug", held | {"success": False}).held
 
 
-def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
+def test_the_pretrained_policy_grasps_a_block(block, grasper):
     reports = []
     minus = block.points[:, 2] < 0
     heading = {"direction": np.array([0.0, 0.0, -1.0])}
@@ -86,10 +87,9 @@ def test_the_pretrained_policy_grasps_a_block_as_it_is_asked_to(block, grasper):
     np.testing.assert_array_equal(again.joint_position, motion.joint_position)
 
 
-def test_a_left_hand_with_its_own_model_does_what_the_mirrored_right_one_did(block, grasper, monkeypatch):
-    begun = []
-    initial = grasper._attempts._initial
-    monkeypatch.setattr(grasper._attempts, "_initial", lambda *a, **k: begun.append(initial(*a, **k)) or begun[-1])
+def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch):
+    begun, given = [], attempts._given
+    monkeypatch.setattr(attempts, "_given", lambda *arguments: begun.append(given(*arguments)) or begun[-1])
     monkeypatch.setattr(grasper, "_left", True)
     monkeypatch.setattr(grasper, "hand", get_hand("human:left"))
     found = grasper.grasp(block, GraspRequest({"heading": {"direction": np.array([0.0, 0.6, -0.8])}}))
@@ -108,7 +108,7 @@ def test_a_left_hand_with_its_own_model_does_what_the_mirrored_right_one_did(blo
     np.testing.assert_allclose(state.q[0], arrays["q"][-1], atol=0.1)
 
 
-def test_what_holds_comes_first_then_what_is_firm_clean_and_as_asked():
+def test_costs_of_attempts():
     """Costs that are added up by hand, of five attempts."""
     zeros = np.zeros(5)
     metrics = {name: zeros.copy() for name in ("moved_at_removal", *ASSESSED)}
@@ -146,7 +146,7 @@ def test_a_grasp_lifts_the_block_off_a_table_that_stays(block):
     assert np.linalg.norm(np.diff(motion.wrist_position[lifted:held], axis=0), axis=-1).max() < 0.6 * motion.control_dt
 
 
-def test_what_cannot_be_is_said_before_anything_is_simulated(block, grasper):
+def test_impossible_requests(block, grasper):
     lying = dataclasses.replace(block, rest_poses=block.rest_poses[:1])
     down = -np.asarray(rotate(block.rest_poses[0][3:] * [1, -1, -1, -1], np.array([0.0, 0.0, 1.0])))
     words = " ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)
@@ -158,7 +158,7 @@ def test_what_cannot_be_is_said_before_anything_is_simulated(block, grasper):
 
 
 @pytest.fixture
-def made_up(monkeypatch):
+def made_up(monkeypatch, quick_import):
     """The command with grasps that are made up; the list of objects that were grasped."""
     calls = []
 
@@ -189,7 +189,7 @@ def meshes(folder: pathlib.Path, *names: str) -> pathlib.Path:
     return folder
 
 
-def test_a_folder_is_grasped_once_and_bad_meshes_do_not_stop_it(tmp_path, capsys, monkeypatch, made_up):
+def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch, made_up):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder, out = meshes(tmp_path / "things", "a", "b"), tmp_path / "out"
     (folder / "bad.obj").write_text("no mesh")
@@ -224,7 +224,7 @@ def test_a_folder_is_grasped_once_and_bad_meshes_do_not_stop_it(tmp_path, capsys
     assert made_up[8:] == ["a", "b", "c"]
 
 
-def test_what_is_not_held_is_told_by_the_exit_code(tmp_path, capsys, monkeypatch, made_up):
+def test_exit_codes(tmp_path, capsys, monkeypatch, made_up):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder = meshes(tmp_path / "things", "loose")
     assert command(folder / "loose.stl", "--out", tmp_path / "out") == 1
@@ -235,7 +235,7 @@ def test_what_is_not_held_is_told_by_the_exit_code(tmp_path, capsys, monkeypatch
     assert "--heading is 'up there', not 3 numbers" in capsys.readouterr().err
 
 
-def test_pictures_show_the_import_beside_a_hand_and_the_grasp(tmp_path, monkeypatch, made_up):
+def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, made_up):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     path = meshes(tmp_path / "things", "a") / "a.stl"
     assert load("grasp")([str(path), "--out", str(tmp_path / "out")])() == 0

@@ -16,6 +16,7 @@ from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.export.motion_file import motion_of_episode, save_motion
 from congrasp.services.grasp.parse import read_request
 from tests.episodes import HEIGHT, episode
+from tests.services.conftest import quick_imports
 
 HAND = get_hand("human")
 CENTER = np.array([0.1, -0.2, 0.3])
@@ -29,7 +30,8 @@ def block(tmp_path_factory):
     mesh.apply_translation(CENTER)
     mesh.apply_scale(1000)
     mesh.export(folder / "block.stl")
-    return objects_of(folder / "block.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache")))[0]
+    with quick_imports():
+        return objects_of(folder / "block.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache")))[0]
 
 
 def asked(obj, **constraints):

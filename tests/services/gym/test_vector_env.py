@@ -10,6 +10,7 @@ import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.services.gym.vector_env import ACTION, GraspEnv, GraspVectorEnv
 
+# Episodes of five steps, which end within a test.
 SHORT = {"objects": 2, "physics": "native", "approach_steps": 3, "hold_steps": 2, "hold_steps_max": 2}
 COUNT = 4
 
@@ -27,7 +28,7 @@ def test_gymnasium_accepts_the_environment():
     env.close()
 
 
-def test_ended_environments_begin_anew_in_the_same_step(vector):
+def test_environments_restart_in_the_same_step(vector):
     """Without the object up an end is a termination; the last observation comes beside the first one of the next."""
     first, infos = vector.reset(seed=3)
     assert first in vector.observation_space and infos == {}
@@ -58,7 +59,7 @@ def test_a_seed_decides_everything(vector):
 
 
 def test_gymnasium_makes_it_by_its_id():
-    made = gym.make_vec("congrasp.services.gym:congrasp/Grasp-v0", 2, "vector_entry_point", **SHORT)
+    made = gym.make_vec("congrasp.services.gym:congrasp/Grasp-v0", COUNT, "vector_entry_point", **SHORT)
     assert isinstance(made.unwrapped, GraspVectorEnv) and made.reset(seed=0)[0].shape == made.observation_space.shape
     made.close()
 
@@ -71,6 +72,6 @@ def test_gymnasium_makes_it_by_its_id():
         ({"hand": "foot"}, "foot"),
     ],
 )
-def test_what_there_is_not_is_said_in_one_line(asked, says):
+def test_unknown_names(asked, says):
     with pytest.raises(CongraspError, match=says):
         congrasp.make_vec(**asked)

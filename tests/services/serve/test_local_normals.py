@@ -8,11 +8,10 @@ import pytest
 from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.objects import procedural
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.local import LocalPolicy
 from congrasp.services.train.command import untrained
 
-TASK = TaskConfig(constraints=("heading",), surface_normals=True)
+TASK = TaskConfig(constraints=("heading",), surface_normals=True)  # the suite's policy observes no normals
 
 
 @pytest.fixture(scope="module")
@@ -25,10 +24,9 @@ def _actions(policy, request, states):
     return [np.asarray(policy.act(state).action) for state in states]
 
 
-def test_normals_of_an_episode_are_those_of_its_points(policy):
+def test_normals_of_an_episode_are_those_of_its_points(policy, example):
     """Named and packed queries alike, and new points of a state are not given the first ones' normals."""
-    episode = example_episode(0)
-    obj = procedural.generate(0)
+    episode, obj = example, procedural.generate(1_000_000)
     place = np.linalg.norm(obj.points[:, None] - episode.request.surface, axis=-1).argmin(0)
     exact = dataclasses.replace(episode.request, normals=obj.normals[place].astype(np.float32))
     states = [episode.state, episode.state]

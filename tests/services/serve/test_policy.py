@@ -17,14 +17,12 @@ from congrasp.services.client.episode import EpisodePolicy
 from congrasp.services.client.policy import Policy
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.inference import Inference, PolicyFunction
-from congrasp.services.serve.load import example_episode
 from congrasp.services.serve.local import LocalPolicy, load_policy
 from congrasp.services.serve.server import PolicyServer, follow_file
 from congrasp.services.train.command import untrained
+from tests import task
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-TASK = TaskConfig(constraints=("heading", "affordance", "pose", "trajectory", "fingers"))
-CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
 COMBINATIONS = (
     "heading",
     "affordance heading",
@@ -37,16 +35,15 @@ COMBINATIONS = (
 
 
 @pytest.fixture(scope="module")
-def episode():
-    """The start of an episode whose request has a goal for every constraint."""
-    return example_episode(1_000_000)
+def episode(example):
+    return example
 
 
 @pytest.fixture(scope="module")
 def policies(tmp_path_factory) -> tuple[Policy, Policy]:
     """The same bundle in this process and behind a server."""
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
-    bundles.save(dataclasses.replace(untrained(CONFIG), version=7), path)
+    bundles.save(dataclasses.replace(task.policy(), version=7), path)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with urls.listen(endpoint, "server") as transport:
         server = PolicyServer(transport, "policy", follow_file(path))
@@ -59,8 +56,8 @@ def goals(request: GraspRequest) -> dict[str, dict[str, np.ndarray]]:
     """Goal arrays of every constraint around the heading of a request; the trajectory ends at the graspable region."""
     heading = request.constraints["heading"]
     graspable = request.surface[request.surface[:, 2].argmin()]
-    path = graspable + np.linspace(0.2, 0.0, TASK.trajectory_points)[:, None] * np.array([0.0, 0.0, 1.0])
-    turns = np.tile(IDENTITY, (TASK.trajectory_points, 1))
+    path = graspable + np.linspace(0.2, 0.0, task.TASK.trajectory_points)[:, None] * np.array([0.0, 0.0, 1.0])
+    turns = np.tile(IDENTITY, (task.TASK.trajectory_points, 1))
     return {
         "heading": dict(heading),
         "affordance": {},
@@ -85,7 +82,7 @@ def same(one, other):
 
 
 @pytest.mark.parametrize("names", COMBINATIONS)
-def test_both_give_the_same_answers_to_the_last_digit(policies, episode, names):
+def test_both_answers_are_equal(policies, episode, names):
     states = [{**episode.state, "q": episode.state["q"] + 0.01 * i, "table": np.bool_(i < 3)} for i in range(5)]
     answers = []
     for policy in policies:
@@ -114,7 +111,7 @@ BAD_STATES = [{"u": np.zeros(5)}, {"weight": np.zeros(1)}, {"u": np.full(6, np.i
 
 
 @pytest.mark.parametrize(("change", "error"), BAD_REQUESTS)
-def test_both_refuse_a_bad_request_with_the_same_error(policies, episode, change, error):
+def test_bad_requests(policies, episode, change, error):
     messages = []
     for policy in policies:
         with pytest.raises(CongraspError) as caught:
@@ -127,7 +124,7 @@ def test_both_refuse_a_bad_request_with_the_same_error(policies, episode, change
 
 @pytest.mark.parametrize("change", BAD_STATES)
 @pytest.mark.parametrize("before", [0, 1])
-def test_both_refuse_a_bad_state_with_the_same_error_and_the_episode_stays(policies, episode, change, before):
+def test_bad_states_leave_the_episode(policies, episode, change, before):
     messages, answers = [], []
     for policy in policies:
         policy.reset(asked(episode.request, "heading"))
@@ -150,10 +147,10 @@ def test_what_a_request_lacks_is_named_at_once(policies, episode):
 def test_both_refuse_a_contradiction(policies, episode):
     highest = episode.request.surface[episode.request.surface[:, 2].argmax()]
     request = asked(episode.request, "trajectory affordance")
-    path = {**goals(episode.request)["trajectory"], "position": np.tile(highest, (TASK.trajectory_points, 1))}
+    path = {**goals(episode.request)["trajectory"], "position": np.tile(highest, (task.TASK.trajectory_points, 1))}
     for policy in policies:
         policy.reset(dataclasses.replace(request, constraints={"affordance": {}, "trajectory": path}))
-        with pytest.raises(ContradictionError):
+        with pytest.raises(ContradictionError, match="trajectory ends nearer to the avoid region than to the grasp"):
             policy.act(episode.state)
 
 
@@ -180,7 +177,7 @@ STUDENT = RunConfig(
 )
 
 
-def test_a_policy_that_looks_back_is_told_what_was_before(episode):
+def test_history_of_a_student(episode):
     """The vector that is inferred from holds the control steps before this one, newest first, and at the begin its
     first reading; velocities and forces that a client sends change nothing."""
     policy = LocalPolicy(untrained(STUDENT))
@@ -216,8 +213,8 @@ def test_a_policy_that_looks_back_is_told_what_was_before(episode):
 
 def test_a_policy_with_a_camera_takes_clouds_and_no_pose(episode):
     """Its request and states hold clouds; a newer one changes the answer, and a pose is refused."""
-    task = dataclasses.replace(STUDENT.task, observation="camera")
-    policy = LocalPolicy(untrained(dataclasses.replace(STUDENT, task=task)))
+    camera = dataclasses.replace(STUDENT.task, observation="camera")
+    policy = LocalPolicy(untrained(dataclasses.replace(STUDENT, task=camera)))
     own, cloud = episode.request, np.asarray(episode.request.surface) + episode.request.object_pose[0]
     heading = own.constraints["heading"]
     heading = {**heading, "position": np.asarray(heading["position"]) + own.object_pose[0]}
@@ -253,7 +250,7 @@ class Recorder(EpisodePolicy):
 
 
 @pytest.mark.parametrize(("settle", "expected"), [(0.04, [0.0, 6.0, 4.0, 4.0, 4.0]), (0.0, [0.0] * 5)])
-def test_a_student_is_guided_by_the_mean_of_where_the_object_rests(episode, settle, expected):
+def test_a_student_averages_the_resting_object(episode, settle, expected):
     """Readings 0, 12, 0, 90 and 0 mm from the first one: the fourth has moved; one that is refused does not count."""
     policy = Recorder(dataclasses.replace(STUDENT.task, sensing=SensingConfig(settle=settle)))
     policy.reset(dataclasses.replace(episode.request, constraints={"heading": episode.request.constraints["heading"]}))

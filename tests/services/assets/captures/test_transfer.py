@@ -21,7 +21,7 @@ def axes(hand):
     return np.stack([frame.heading, frame.cross])
 
 
-@pytest.mark.parametrize("name", ["allegro", "sharpa"])
+@pytest.mark.parametrize("name", ["allegro", pytest.param("sharpa", marks=pytest.mark.slow)])
 def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_path, capsys, name):
     cases = [known.make(f"MyoHand_box_lift{seed}", "box", seed, tail=0.04) for seed in range(2)]
     for case in cases:

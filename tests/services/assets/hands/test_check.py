@@ -19,6 +19,7 @@ from congrasp.services.train.recipe import recipe
 
 CLAW = import_hand(pathlib.Path(__file__).parents[3] / "hands" / "claw.urdf").hand
 HANDS = {"claw": CLAW, **{name: get_hand(name) for name in ("human", "allegro", "sharpa")}}
+SLOW = ("allegro", "sharpa")
 
 
 def with_joints(hand, change, only=""):
@@ -44,7 +45,7 @@ def verdicts(hand):
     return lines, found
 
 
-@pytest.mark.parametrize("name", HANDS)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in HANDS])
 def test_good_hands_pass_every_check(name):
     lines, found = verdicts(HANDS[name])
     assert not found.failed and {finding.verdict for finding in lines.values()} == {"passed"}
@@ -119,7 +120,7 @@ def test_objects_that_are_too_large_and_fingers_in_one_another_are_found():
     assert check._open_overlap(crossed).verdict == "failed" and "left_lower" in check._open_overlap(crossed).measured
 
 
-def test_the_command_says_by_its_exit_code_whether_a_hand_can_grasp(monkeypatch, tmp_path, capsys):
+def test_exit_codes_of_the_command(monkeypatch, tmp_path, capsys):
     _, made = verdicts(CLAW)
     monkeypatch.setattr(check, "check_hand", lambda hand, task, threads: made)
     file = tmp_path / "claw.json"

@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -251,27 +252,29 @@ def test_a_motion_is_drawn_by_its_own_arrays_where_its_hands_files_are_damaged(o
     np.testing.assert_array_equal(skin_of_motion(motion).points, expected.points)
 
 
-def test_meshes_are_measured_against_the_object_beside_the_capsules(own):
+def test_depth_of_meshes_and_capsules(own):
     """A ball of 3 cm whose centre is 4.5 cm from the cube's middle, along an edge's normal and a face's normal."""
+    measures = (link_transforms, plausibility.hand_mesh, plausibility.hand_object)
+    transforms_of, hand_mesh, hand_object = (jax.jit(measure, static_argnums=0) for measure in measures)
     ball = plain_object("ball", (Piece("ellipsoid", (0.03, 0.03, 0.03)),), 500.0)
-    transforms = link_transforms(own, np.asarray(own.q_open, np.float32)[None])
+    transforms = transforms_of(own, np.asarray(own.q_open, np.float32)[None])
     field, upright = distance_field([ball]), np.array([[1.0, 0.0, 0.0, 0.0]], np.float32)
 
     def depth(*center):
         seen = np.array([center], np.float32), upright, np.zeros(1, int), field
-        return float(plausibility.hand_mesh(own, transforms, *seen)[0])
+        return float(hand_mesh(own, transforms, *seen)[0])
 
     assert depth(-0.045, 0.0, 0.0) == pytest.approx(0.005, abs=5e-4)
     side = 0.045 / np.sqrt(2)  # an edge is sqrt(8) cm from the middle
     assert depth(-side, 0.0, -side) == pytest.approx(0.03 - (0.045 - 0.02 * np.sqrt(2)), abs=5e-4)
     assert depth(-0.06, 0.0, 0.0) == 0.0
     seen = np.zeros((1, 3), np.float32), upright, np.zeros(1, int), field
-    assert np.isnan(plausibility.hand_mesh(get_hand("allegro"), transforms, *seen)).all()
+    assert np.isnan(hand_mesh(get_hand("allegro"), transforms, *seen)).all()
     # Allegro's palm is a box whose front is at x = 11.1 mm: the ball's middle is 25 mm before it.
     allegro = get_hand("allegro")
-    flat = link_transforms(allegro, np.zeros((1, len(allegro.joints)), np.float32))
+    flat = transforms_of(allegro, np.zeros((1, len(allegro.joints)), np.float32))
     seen = np.array([[0.0111 + 0.025, -0.025, 0.0475]], np.float32), upright, np.zeros(1, int), field
-    assert float(plausibility.hand_object(allegro, flat, *seen)[0]) == pytest.approx(0.005, abs=5e-4)
+    assert float(hand_object(allegro, flat, *seen)[0]) == pytest.approx(0.005, abs=5e-4)
 
 
 def test_points_on_a_large_mesh_are_bounded_before_they_are_sampled(own, tmp_path, monkeypatch):

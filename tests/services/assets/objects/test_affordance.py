@@ -10,6 +10,7 @@ from congrasp.services.assets.objects.affordance import in_half_space, on_part_m
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
+from tests.services.conftest import quick_imports
 
 EDGES, SHIFT = np.array([0.05, 0.05, 0.12]), np.array([0.01, 0.02, 0.06])
 
@@ -31,8 +32,8 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def box(folder):
-    (obj,) = objects_of(folder / "box.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache")))
-    return obj
+    with quick_imports():
+        return objects_of(folder / "box.stl", ImportOptions(unit="mm", cache_dir=str(folder / "cache")))[0]
 
 
 def test_each_source_finds_the_lower_half(box, folder):

@@ -82,7 +82,7 @@ def test_files_without_colours_have_none(tmp_path):
         assert sample_colours([tmp_path / f"cube.{suffix}"], seed=0) is None
 
 
-def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(tmp_path):
+def test_an_imported_object_has_them_in_its_own_frame_on_disk_and_in_pictures(tmp_path, quick_import):
     (source,) = find_sources(textured(tmp_path / "cube.glb"))
     obj = import_source(source, ImportOptions(scale=0.5, cache_dir=str(tmp_path / "cache")))
     assert obj.colours is not None
@@ -113,7 +113,7 @@ def test_an_image_that_cannot_be_read_costs_the_colours_alone(tmp_path):
     assert sample_colours([tmp_path / "cube.glb"], seed=0) is None
 
 
-def test_texture_coordinates_without_sense_are_named_and_cost_the_colours_alone(tmp_path):
+def test_texture_coordinates_without_sense_are_named_and_cost_the_colours_alone(tmp_path, quick_import):
     box = cube()
     box.visual = trimesh.visual.TextureVisuals(uv=np.full((36, 2), np.nan), image=Image.new("RGB", (4, 4), RED))
     box.export(tmp_path / "cube.obj")
@@ -122,7 +122,7 @@ def test_texture_coordinates_without_sense_are_named_and_cost_the_colours_alone(
     assert obj.colours is None and any("its colours are left out" in note for note in obj.notes), obj.notes
 
 
-def test_an_object_file_with_half_of_its_colours_is_refused(tmp_path):
+def test_an_object_file_with_half_of_its_colours_is_refused(tmp_path, quick_import):
     (source,) = find_sources(textured(tmp_path / "cube.glb"))
     obj = import_source(source, ImportOptions(scale=1.0, cache_dir=str(tmp_path / "cache")))
     store.save(

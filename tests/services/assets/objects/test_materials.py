@@ -68,7 +68,7 @@ def imported(folder: pathlib.Path, **options):
     return obj
 
 
-def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer):
+def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer, quick_import):
     obj = imported(hammer, material="head=steel,handle=wood")
     head, handle = 7850 * 0.025**2 * 0.09, 640 * 0.025**2 * 0.25
     assert obj.mass == pytest.approx(head + handle, rel=1e-4) and 0.4 < obj.mass < 0.6
@@ -89,7 +89,7 @@ def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer):
         ("head=steel", "leaves out the part 'handle'. Add handle=NAME."),
     ],
 )
-def test_what_is_wrong_with_a_material_is_said_in_one_line(hammer, material, words):
+def test_what_is_wrong_with_a_material_is_said_in_one_line(hammer, quick_import, material, words):
     with pytest.raises(CongraspError) as error:
         imported(hammer, material=material)
     assert words in str(error.value) and "\n" not in str(error.value)

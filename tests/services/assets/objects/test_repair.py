@@ -1,4 +1,4 @@
-"""Ten broken meshes: each is mended with a line that says so, or refused with a line that says what to do."""
+"""Broken meshes: each is repaired with a note, or rejected with the remedy."""
 
 import struct
 import zipfile
@@ -22,8 +22,8 @@ def ball(**options):
 
 
 @pytest.fixture
-def brought(tmp_path):
-    """Imports a mesh, or bytes, from a file of a name; returns the object and what was said of it."""
+def brought(tmp_path, quick_import):
+    """Imports a mesh, or bytes, from a file of a name; returns the object and its notes."""
 
     def bring(content, name="thing.stl", **options):
         path = tmp_path / name
@@ -38,7 +38,7 @@ def brought(tmp_path):
     return bring
 
 
-def test_a_whole_mesh_is_left_alone(brought):
+def test_a_sound_mesh_has_no_notes(brought):
     _, notes = brought(ball())
     assert [note for note in notes if "convex piece stands for it" not in note] == []
 
@@ -127,7 +127,7 @@ def test_millions_of_triangles(brought, monkeypatch):
     assert trimesh.Trimesh(vertices, faces).is_watertight
 
 
-def test_points_that_are_no_numbers(brought):
+def test_points_that_are_not_finite(brought):
     mesh = ball()
     mesh.vertices[3] = np.nan
     obj, notes = brought(mesh, "thing.ply")
@@ -166,7 +166,7 @@ def test_a_zip(brought, tmp_path):
             brought(data, name)
 
 
-def test_what_was_mended_is_said_again_from_the_cache(brought):
+def test_notes_come_back_from_the_cache(brought):
     mesh = ball()
     mesh.invert()
     assert brought(mesh)[1] == brought(mesh)[1] != []
@@ -180,7 +180,7 @@ def test_a_binary_stl_may_begin_with_solid(brought):
     assert obj.name == "thing" and not [note for note in notes if "content" in note]
 
 
-def test_a_body_that_cannot_be_turned_outwards_stays_as_it_is():
+def test_a_surface_without_an_outside_is_unchanged():
     strip = trimesh.Trimesh(*_moebius())
     said: list[str] = []
     assert closed(strip, said).faces.shape == strip.faces.shape
