@@ -12,7 +12,7 @@ def doctor(
     """Check this machine and installation: versions, GPU, ports, disk, clock, certificates.
 
     Prints one line per check, with a remedy if it failed; the exit code is 1 if any failed. `congrasp train --preset
-    check` then runs physics, messages, log, server and pictures in half a minute.
+    check` then runs physics, messages, log, server and pictures.
 
     Args:
       connect: Endpoint of a learner to test; its clock is compared with this machine's.
@@ -31,7 +31,7 @@ def doctor(
         print(f"{'ok  ' if finding.fine else 'BAD '} {finding.what:13s} {finding.text}")
     fine = all(finding.fine for finding in findings)
     if fine:
-        print("Next: congrasp train --preset check (physics, messages, log, server and pictures, in half a minute)")
+        print("Next: congrasp train --preset check (physics, messages, log, server and pictures; it learns nothing)")
     return 0 if fine else 1
 
 

@@ -46,7 +46,7 @@ def train(
     Args:
       config: The run.
       preset: Named configuration to start from: quickstart, full, human, allegro or sharpa; or check, which trains
-        nothing and shows in half a minute that physics, messages, log, server and pictures work here.
+        nothing and shows that physics, messages, log, server and pictures work here.
       method: Method whose settings are used: ours, a baseline or ablation of the paper (graspxl, dgrasp,
         no-dynamic-center, no-feedforward, two-phase, single-stage), or a policy for robots (student, with a tracker;
         camera, with a depth camera). By default that of the preset, ours.

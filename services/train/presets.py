@@ -41,7 +41,7 @@ CHECK = dataclasses.replace(
     objects=ObjectsConfig(count=2),
     network=NetworkConfig(hidden=(16,)),
 )
-"""Learns nothing: physics, messages, log, server and picture of an installation, in half a minute."""
+"""Learns nothing: it shows that physics, messages, log, server and pictures of an installation work."""
 _SHORT = {run.name: run for run in (QUICKSTART, CHECK)}
 PRESETS = (*_SHORT, FULL, *FULL_FOR)
 """Names of the presets."""
