@@ -141,10 +141,15 @@ class GraspEnv:
         self.hand, self.task, self._engine = hand, task, engine
         self.settings = Settings(task.reward, task.control)
 
+    @property
+    def _traced(self) -> Physics:
+        """The engine, for the methods that call it."""
+        assert self._engine is not None, "the engine is stepped outside"
+        return self._engine
+
     def reset(self, initial: InitialConditions) -> EnvState:
         """Starts episodes from initial conditions, in every environment."""
-        assert self._engine is not None, "the engine is stepped outside"
-        return self.state_of(initial, self._engine.start(initial.reset_state))
+        return self.state_of(initial, self._traced.start(initial.reset_state))
 
     def state_of(self, initial: InitialConditions, physics: Any) -> EnvState:
         """Returns the state of episodes whose engine was just started from their `reset_state`."""
@@ -178,8 +183,7 @@ class GraspEnv:
 
     def restart(self, state: EnvState, mask: Array, initial: InitialConditions) -> EnvState:
         """Starts new episodes in the masked environments (B,); the others continue, with their contacts."""
-        assert self._engine is not None, "the engine is stepped outside"
-        physics = self._engine.reset(state.physics, mask, initial.reset_state)
+        physics = self._traced.reset(state.physics, mask, initial.reset_state)
         return self.merge(state, mask, self.state_of(initial, physics))
 
     def merge(self, state: EnvState, mask: Array, fresh: EnvState) -> EnvState:
@@ -200,8 +204,7 @@ class GraspEnv:
         """
         settings = settings or self.settings
         target, command = self.targets(state, action, settings)
-        assert self._engine is not None, "the engine is stepped outside"
-        physics, physics_state = self._engine.step(state.physics, *command)
+        physics, physics_state = self._traced.step(state.physics, *command)
         return self.advance(state._replace(physics=physics), target, physics_state, settings)
 
     def targets(self, state: EnvState, action: Array, settings: Settings) -> tuple[Action, tuple[Array, ...]]:

@@ -20,7 +20,7 @@ _LEAST = 2.0**-24
 def uniforms(key: Array, numbers: Mapping[str, int], batch: int) -> dict[str, Array]:
     """Random numbers (B, U) in [0, 1) by name, where U is given for each.
 
-    Those of a name depend on the key, the name and U's row alone, not on the other names.
+    Those of a name do not depend on the other names, nor on how many numbers these have.
 
     Args:
       key: random key.
@@ -33,8 +33,7 @@ def uniforms(key: Array, numbers: Mapping[str, int], batch: int) -> dict[str, Ar
     def drawn(seed: Array) -> Array:
         return jax.random.uniform(jax.random.fold_in(key, seed), (widest, batch))
 
-    # Without the barrier, XLA would compute a number again wherever it is used, thirty times in the longest loops.
-    blocks = jax.lax.optimization_barrier(jax.vmap(drawn)(seeds))
+    blocks = jax.vmap(drawn)(seeds)
     return {name: blocks[i, :count].T for i, (name, count) in enumerate(numbers.items())}
 
 
