@@ -3,12 +3,8 @@
 import dataclasses
 import functools
 import itertools
-import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
-
-import jax
-import numpy as np
 
 from congrasp.actors.initial import InitialConditions
 from congrasp.common.errors import CongraspError
@@ -299,26 +295,6 @@ class Evaluator:
             self.samples([name], most, keep=True)
         kept = self._kept[name]
         return [*kept[False][:failures], *kept[True][:successes]]
-
-    def episode(self, name: str, attempts: int = 1) -> Message:
-        """Returns an episode under a set of constraints: the first of `attempts` that succeeds, or the last.
-
-        Raises:
-          CongraspError: the pool does not allow these constraints.
-        """
-        plan = self.plan(name, max(attempts, len(self.objects)))
-        first = zlib.crc32(name.encode()) % plan.total  # a different object for each row
-        plan = plan._replace(episodes=jax.tree.map(lambda x: np.roll(x, -first), plan.episodes))
-        bank = self.bank_for(name)
-        with self._episodes(attempts, traced=True) as running:
-            for begun, count in batches(self._hand, self.task, bank, plan, self._seed, running.batch):
-                batch = running.run(begun)
-                tried = min(count, attempts)
-                succeeded = np.flatnonzero(batch.sample.values["success"][:tried] > 0)
-                attempts -= tried
-                if len(succeeded) or not attempts:
-                    break
-            return batch.message(int(succeeded[0]) if len(succeeded) else tried - 1)
 
     def _episodes(self, episodes: int, traced: bool = False, task: TaskConfig | None = None) -> Episodes:
         """Returns the simulator of rows with `episodes` episodes; its batch depends only on this number."""
