@@ -52,7 +52,7 @@ def evaluate(
     whose clusters are objects (captured sequences); 'of all objects' counts uncovered objects as failures. Errors and
     forces are those of successful episodes in the paper's window of 25 steps. The policy acts with its mean. Every
     object has the same number of episodes in a row, independent of other requested rows. Reference poses and
-    trajectories are grasps of a reference policy trained without any; the last fifth of each object's 20 is evaluated.
+    trajectories are grasps of a reference policy trained without any, at most 20 of each object.
 
     Args:
       policy: Policy files (policy.safetensors of a run), as FILE or METHOD=FILE, or folders of runs; by default a

@@ -97,7 +97,7 @@ class Evaluator:
         self._kept: dict[str, dict[bool, list[Message]]] = {}
 
     def references(self, progress: Callable[[int, int], None] = lambda done, of: None) -> References | None:
-        """Returns references of the reference policy, of which rows draw the held-out ones; None if some were given."""
+        """Returns the references of which rows draw, those of the reference policy; None if some were given."""
         if self._references is None and not self._given:
             policy, _ = references.reference_policy(self.bundle)
             self._references = self.references_of(policy, progress)
@@ -120,7 +120,7 @@ class Evaluator:
     def bank_for(self, name: str) -> ConstraintBank:
         """Returns the constraint bank of a row's episodes."""
         if from_references(name) and (made := self.references()):
-            return references.held_out(made.bank)
+            return made.bank
         return self._bank
 
     def plan(self, name: str, episodes: int) -> RowPlan:

@@ -2,7 +2,7 @@
 
 A policy trained without poses and trajectories grasps every object under headings, on the whole surface and on the
 graspable region. Final states of its successful episodes are the references, and approach paths to them the
-trajectories. The last fifth of each object's references is held out.
+trajectories. Tables draw from all of them: no policy was trained with the objects of an exam.
 """
 
 import hashlib
@@ -36,7 +36,7 @@ from congrasp.services.evaluate.plan import RowPlan, batches
 from congrasp.services.evaluate.protocol import protocol
 
 HELD_OUT = POSES // 5
-"""References of an object and region used in tables; the others are for training."""
+"""References of an object and region that its constraint set holds out (`write_sets`), the last ones."""
 _ATTEMPTS = 3 * POSES
 """Most episodes of an object and region; the grasps found by then are used."""
 _SPARE = 1.25
@@ -98,12 +98,6 @@ def make(
     return made
 
 
-def held_out(bank: ConstraintBank) -> ConstraintBank:
-    """Returns the bank with only the references of tables."""
-    table = np.arange(bank.pose_valid.shape[-1]) >= bank.pose_valid.shape[-1] - HELD_OUT
-    return bank._replace(pose_valid=jnp.asarray(bank.pose_valid) & table)
-
-
 _ARRAYS = ("pose_q", "pose_position", "pose_quaternion", "trajectory_position", "trajectory_quaternion", "pose_valid")
 
 
@@ -153,10 +147,10 @@ def _grasp(
 def _filled(
     policy: PolicyBundle, task: TaskConfig, bank: ConstraintBank, grasps: list[list[list[Poses]]]
 ) -> References:
-    """Returns the bank with these grasps and trajectories to them, without overlap between tables and training.
+    """Returns the bank with these grasps and trajectories to them, none of them both held out and for training.
 
     A grasp counts if it clears the table in some resting pose. If there are too few, a fifth of them (at least one) is
-    repeated for tables, and the others for training.
+    repeated among those held out, and the others among those for training.
     """
     hand = get_hand(policy.spec.hand)
     arrays = {name: np.array(getattr(bank, name)) for name in _ARRAYS}
@@ -187,11 +181,11 @@ def _filled(
 
 
 def _arranged(count: int) -> np.ndarray:
-    """Indices (POSES,) into `count` references; those of tables come last."""
-    tables = max(1, round(count * HELD_OUT / POSES))
-    training = np.arange(max(count - tables, 1))
+    """Indices (POSES,) into `count` references; those held out come last."""
+    held_out = max(1, round(count * HELD_OUT / POSES))
+    training = np.arange(max(count - held_out, 1))
     return np.concatenate(
-        [np.resize(training, POSES - HELD_OUT), np.resize(np.arange(count - tables, count), HELD_OUT)]
+        [np.resize(training, POSES - HELD_OUT), np.resize(np.arange(count - held_out, count), HELD_OUT)]
     )
 
 

@@ -174,7 +174,7 @@ def _references(evaluator: Evaluator, track: Track) -> str:
     _, who = reference_policy(evaluator.bundle)
     whole = made.grasps[:, 0]
     closed = [obj.name for obj, count in zip(evaluator.objects, whole, strict=True) if not count]
-    text = f"References: grasps of {who}, {np.median(whole):.0f} per object (median), the last fifth held out."
+    text = f"References: grasps of {who}, {np.median(whole):.0f} per object (median)."
     return text + (
         f" Without a grasp, the hand closed around the object is used: {', '.join(closed)}." if closed else ""
     )

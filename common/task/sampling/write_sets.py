@@ -69,7 +69,7 @@ def set_of(
       obj: the object.
       seed: seed of the constraints.
       about: additional metadata of the file.
-      pose_training: (M,) bool, references for training; by default the first 80 %, as in evaluations
+      pose_training: (M,) bool, references for training; by default the first 80 %, as references are arranged
         (`services.evaluate.references`).
       heading_training: (H,) bool, headings for training; by default 80 % drawn with the seed.
     """

@@ -1,6 +1,5 @@
 """References of a reference policy: where they come from, and how they are split."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,7 +9,7 @@ from congrasp.common.policy.pretrained import policy_file, pretrained_hands, ref
 from congrasp.common.task.sampling.build import POSES
 from congrasp.common.task.sampling.closed_poses import Poses
 from congrasp.services.evaluate import references
-from congrasp.services.evaluate.references import HELD_OUT, held_out
+from congrasp.services.evaluate.references import HELD_OUT
 from tests import task
 
 
@@ -33,12 +32,12 @@ def test_reference_policies_never_had_poses_or_trajectories():
 
 
 @pytest.mark.parametrize("count", range(1, POSES + 1))
-def test_tables_and_training_share_no_reference(count):
+def test_held_out_references_are_not_for_training(count):
     order = references._arranged(count)
-    training, tables = order[:-HELD_OUT], order[-HELD_OUT:]
+    training, held_out = order[:-HELD_OUT], order[-HELD_OUT:]
     assert len(order) == POSES and set(order) <= set(range(count))
     if count > 1:
-        assert set(order) == set(range(count)) and not set(training) & set(tables)
+        assert set(order) == set(range(count)) and not set(training) & set(held_out)
     if count == POSES:
         np.testing.assert_array_equal(order, np.arange(POSES))
 
@@ -58,9 +57,3 @@ def test_objects_that_the_policy_cannot_grasp_keep_geometric_references(bank, po
     assert np.asarray(made.bank.pose_valid)[:, 0].any(1).all()  # of those that the table leaves room for
     for field in ("points", "heading_position", "rest"):
         np.testing.assert_array_equal(getattr(made.bank, field), getattr(bank, field))
-
-
-def test_only_the_last_fifth_is_for_tables(bank):
-    everything = bank._replace(pose_valid=jnp.ones_like(bank.pose_valid))
-    allowed = np.asarray(held_out(everything).pose_valid)
-    assert allowed[..., -HELD_OUT:].all() and not allowed[..., :-HELD_OUT].any()
