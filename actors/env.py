@@ -240,11 +240,11 @@ class GraspEnv:
         )
         if settings.protocol is not None:
             state = state._replace(frame=protocols.frame(settings.protocol, task, state.time))
-        seen = protocols.carried(physics_state, state.reset_state.base_quaternion, state.frame)
+        moved = protocols.carried(physics_state, state.reset_state.base_quaternion, state.frame)
         followed = self._followed(state, Action(state.q_target, state.u_target))
-        momentum = track_load(self.hand, task, state.momentum, seen.u, seen.u_velocity, followed.u_target)
+        momentum = track_load(self.hand, task, state.momentum, moved.u, moved.u_velocity, followed.u_target)
         state = state._replace(momentum=jnp.where(physics_state.diverged[:, None], 0.0, momentum))
-        state = self.with_scene(self._sense(state, physics_state), physics_state)
+        state = self._viewed(self._sense(state, physics_state, moved), moved, followed)
         scene = self.scene_of(state)
         tracked, up = success.track(task, state.success, scene, physics_state.diverged)
         found = reward_terms(scene, settings.weights)
@@ -285,30 +285,33 @@ class GraspEnv:
         return state, transition
 
     def with_scene(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
-        """Returns the environments with the engine's scene, expressed in the carried frame."""
+        """Returns the environments with the scene of an engine that has simulated no step since the last `advance`."""
+        moved = protocols.carried(physics_state, state.reset_state.base_quaternion, state.frame)
+        return self._viewed(state, moved, self._followed(state))
+
+    def _viewed(self, state: EnvState, moved: PhysicsState, followed: Action) -> EnvState:
+        """Returns the environments with their views of a scene in the carried frame, and these followed targets."""
         reset_state = state.reset_state
-        physics_state = protocols.carried(physics_state, reset_state.base_quaternion, state.frame)
-        followed = self._followed(state)
         scene = SceneState(
-            q=physics_state.q,
-            u=physics_state.u,
-            q_velocity=physics_state.q_velocity,
-            u_velocity=physics_state.u_velocity,
+            q=moved.q,
+            u=moved.u,
+            q_velocity=moved.q_velocity,
+            u_velocity=moved.u_velocity,
             q_target=followed.q_target,
             u_target=followed.u_target,
-            object_position=physics_state.object_position,
-            object_quaternion=physics_state.object_quaternion,
-            object_velocity=physics_state.object_velocity,
-            object_angular_velocity=physics_state.object_angular_velocity,
-            contact_force=physics_state.contact_force,
-            contact_position=physics_state.contact_position,
-            contact_found=physics_state.contact_found,
+            object_position=moved.object_position,
+            object_quaternion=moved.object_quaternion,
+            object_velocity=moved.object_velocity,
+            object_angular_velocity=moved.object_angular_velocity,
+            contact_force=moved.contact_force,
+            contact_position=moved.contact_position,
+            contact_found=moved.contact_found,
             base_position=reset_state.base_position,
             base_quaternion=reset_state.base_quaternion,
             q_initial=reset_state.q,
             object_position_initial=reset_state.object_position,
             object_quaternion_initial=reset_state.object_quaternion,
-            wrist_load=wrist_load(self.hand, self.task, state.momentum, physics_state.u, physics_state.u_velocity),
+            wrist_load=wrist_load(self.hand, self.task, state.momentum, moved.u, moved.u_velocity),
             time=state.time.astype(jnp.float32),
             table=self.table_present(state),
         )
@@ -372,22 +375,24 @@ class GraspEnv:
         first = Readings(start.q, wrist, start.q, wrist, shown[:, :3], shown[:, 3:])
         return {**found, "readings": sensing.still(first, task.history)}
 
-    def _sense(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
-        """Returns the environments with the sensors' readings after a control step, in the carried frame."""
+    def _sense(self, state: EnvState, physics_state: PhysicsState, moved: PhysicsState) -> EnvState:
+        """Returns the environments with the sensors' readings after a control step, in the carried frame.
+
+        Args:
+          state: the environments.
+          physics_state: state of the engine after the step.
+          moved: the same in the carried frame.
+        """
         if state.readings is None:
             return state
-        start, tracker, camera, shown = state.reset_state, state.tracker, state.camera, physics_state
+        tracker, camera, pose = state.tracker, state.camera, cameras.world(len(moved.q))
         if tracker is not None:
-            true = shown.object_position, shown.object_quaternion
+            true = physics_state.object_position, physics_state.object_quaternion
             tracker = sensing.track(tracker, state.time, *true, self.table_present(state), self.task.sensing.settle)
-            shown = shown._replace(object_position=tracker.shown[:, :3], object_quaternion=tracker.shown[:, 3:])
-        shown = protocols.carried(shown, start.base_quaternion, state.frame)
+            pose = tracker.shown - jnp.pad(protocols.up(state.frame.height), ((0, 0), (0, 4)))
         if camera is not None:
-            camera = cameras.look(self.hand, camera, state.time, shown, start, state.surface)
-            world = cameras.world(len(shown.q))
-            shown = shown._replace(object_position=world[:, :3], object_quaternion=world[:, 3:])
-        pose = shown.object_position, shown.object_quaternion
-        newest = Readings(shown.q, shown.u, state.q_target, state.u_target, *pose)
+            camera = cameras.look(self.hand, camera, state.time, moved, state.reset_state, state.surface)
+        newest = Readings(moved.q, moved.u, state.q_target, state.u_target, pose[:, :3], pose[:, 3:])
         return state._replace(tracker=tracker, camera=camera, readings=sensing.push(state.readings, newest))
 
     def _followed(self, state: EnvState, newest: Action | None = None) -> Action:

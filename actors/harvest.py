@@ -40,13 +40,6 @@ class Grasps(NamedTuple):
     """(B, 4)."""
 
 
-RENEWED = (
-    *("pose_q", "pose_position", "pose_quaternion", "trajectory_position", "trajectory_quaternion"),
-    *("pose_valid", "grasps"),
-)
-"""Fields of the constraint bank written by `renew`."""
-
-
 def collect(
     scene: Scene,
     grasps: Grasps,

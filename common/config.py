@@ -103,7 +103,7 @@ class PPOConfig:
     bootstrap_truncated: bool = True
     """Bootstraps from the critic if the time limit ends an episode with a held object; otherwise from zero."""
     learning_rate: float = 5e-4
-    """Initial learning rate of Adam."""
+    """Initial learning rate of Adam; a tenth of it with an initial policy."""
     learning_rate_range: tuple[float, float] = (1e-5, 3e-3)
     """Bounds of the adaptive learning rate."""
     kl_target: float = 0.012

@@ -121,7 +121,7 @@ class _Actor:
         self._saved = time.monotonic()
         self._objects, bank = training_set(self._hand, config, self._number)
         if self._references:
-            bank = with_kept_references(self._references, bank)
+            bank = with_kept_references(self._references, self._hand, config.task, bank)
         with stage("engine"):
             self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
         with stage("first episodes"):

@@ -50,6 +50,7 @@ _NORMALISED = ("observation", "privileged")
 _FINE = -1  # no term was non-finite; otherwise an index into _CHECKED
 _UNREASONABLE_KL = 10.0  # nats between the policies before and after an update; the target is about a hundredth of one
 _RATE_FACTOR = 1.5
+_TRAINED_RATE = 0.1  # at the whole initial rate, a trained policy moved by 120 KL targets in its first update
 _TRUSTED_KL = 4.0  # KL targets; a minibatch with a larger divergence does not update the policy
 
 Learnt = tuple[Params, Any, Array]
@@ -80,7 +81,11 @@ class PPO:
         self.batch_schema: Schema = {**RECORDED, **PRIVILEGED} if spec.privileged else RECORDED
 
     def init(self, seed: int, initial: LearnedPolicy | None = None) -> TrainState:
-        """Returns the state before the first update."""
+        """Returns the state before the first update.
+
+        With an `initial` policy, the learning rate begins at `_TRAINED_RATE` of the configured one.
+        """
+        rate = self._config.learning_rate * (1.0 if initial is None else _TRAINED_RATE)
         initial = initial or random_policy(seed, self._spec)
         params = jax.tree.map(jnp.asarray, initial.params)
         privileged = initial.privileged
@@ -88,7 +93,7 @@ class PPO:
             privileged = normalizer.empty((self._spec.privileged_size,))
         return TrainState(
             params=params,
-            optimizer=jax.jit(_optimizer(self._config.learning_rate, self._config.max_grad_norm).init)(params),
+            optimizer=jax.jit(_optimizer(rate, self._config.max_grad_norm).init)(params),
             key=jax.random.PRNGKey(seed),
             observation=initial.observation,
             value=initial.value,

@@ -109,10 +109,15 @@ def _references(
     waypoints: int,
 ) -> dict[str, Array]:
     """Poses and trajectories of the bank: the hand closed around N objects (N, P, 3) at headings (N, V, M, 3)."""
-    poses = _closed(hand, points, normals, position, direction, cross)
-    shape = position.shape[:-1]
+    return reference_columns(hand, _closed(hand, points, normals, position, direction, cross), rest, key, waypoints)
+
+
+@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
+def reference_columns(hand: Hand, poses: Poses, rest: Array, key: Array, waypoints: int) -> dict[str, Array]:
+    """Columns of the bank of poses (N, V, M, ...) and of trajectories to them, for resting poses (N, R, 7)."""
+    shape = poses.q.shape[:-1]
     flat = Poses(*(field.reshape(-1, field.shape[-1]) for field in poses))
-    rest = jnp.repeat(rest, 2 * POSES, axis=0)
+    rest = jnp.repeat(rest, shape[1] * shape[2], axis=0)
     path, turns, valid = make_references(hand, flat, rest, key, waypoints)
     return {
         "pose_q": poses.q,
