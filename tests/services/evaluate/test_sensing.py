@@ -56,10 +56,7 @@ def test_a_level_is_what_it_says(bank):
             name
             for part in ("sensors", "reset_state")
             for name, a, b in zip(
-                getattr(nominal, part)._fields,
-                getattr(nominal, part),
-                getattr(found[level.label], part),
-                strict=True,
+                getattr(nominal, part)._fields, getattr(nominal, part), getattr(found[level.label], part), strict=True
             )
             if not np.array_equal(a, b)
         ]

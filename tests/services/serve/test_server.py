@@ -11,13 +11,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from congrasp.common.errors import (
-    CongraspError,
-    OverloadedError,
-    RefusedError,
-    TransportError,
-    UnknownConstraintError,
-)
+from congrasp.common.errors import CongraspError, OverloadedError, RefusedError, TransportError, UnknownConstraintError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.transport.keys import Keys, below
