@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import congrasp.services.cli.main as cli
+from congrasp.actors import stress
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
@@ -43,15 +44,16 @@ def contents(folder: pathlib.Path) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def short_hold():
-    """A quarter of a second, where the protocol has two."""
+def short_protocol():
+    """Holds and pushes that last an eighth and a fifth of their time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocol, "HOLD_SECONDS", 0.25)
+        patch.setattr(stress, "PUSH_SECONDS", 0.05)
         yield
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, short_hold) -> pathlib.Path:
+def whole(tmp_path_factory, short_protocol) -> pathlib.Path:
     """A dataset that was made at once."""
     out = tmp_path_factory.mktemp("dataset")
     made(out)
@@ -72,7 +74,8 @@ def columns(whole) -> dict[str, np.ndarray]:
 
 @pytest.mark.slow
 def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path, monkeypatch):
-    monkeypatch.setattr(protocol, "HOLD_SECONDS", 2.0)  # that of the process
+    monkeypatch.setattr(protocol, "HOLD_SECONDS", 2.0)  # as in the process
+    monkeypatch.setattr(stress, "PUSH_SECONDS", 0.25)
     made(whole := tmp_path_factory.mktemp("whole"))
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
