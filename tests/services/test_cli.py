@@ -184,15 +184,16 @@ main()
     assert done.stdout.endswith("shut down\n") is not late
 
 
-def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path):
+def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(logging.getLogger(), "handlers", [*logging.getLogger().handlers])
     port = free_port()
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", port))
         busy.listen()
-        run_dir = tmp_path / "run"
-        done = congrasp("learner", "--run-dir", str(run_dir), "--listen", f"tcp/127.0.0.1:{port}")
-    assert done.returncode == 2 and f"127.0.0.1:{port} is in use" in done.stderr
-    assert not run_dir.exists()
+        with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
+            cli.main(["learner", "--run-dir", str(tmp_path / "run"), "--listen", f"tcp/127.0.0.1:{port}"])
+    is_one_line(end.value.code, capfd.readouterr().err, f"127.0.0.1:{port} is in use")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_misspelt_file_is_named_before_anything_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +21,7 @@ from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects.named import objects_at
 from congrasp.services.dataset.card import CARD
 from congrasp.services.evaluate import protocol
+from tests.waits import eventually
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 
@@ -79,9 +79,7 @@ def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path,
     made(whole := tmp_path_factory.mktemp("whole"))
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 300
-    while len(contents(tmp_path)) < 2 and time.monotonic() < deadline and process.poll() is None:
-        time.sleep(0.01)
+    eventually(lambda: len(contents(tmp_path)) >= 2 or process.poll() is not None, 0.01)
     os.kill(process.pid, signal.SIGKILL)
     process.wait(30)
     killed = contents(tmp_path)

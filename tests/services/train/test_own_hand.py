@@ -7,7 +7,6 @@ import pathlib
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -24,6 +23,7 @@ from congrasp.services.train.command import untrained
 from congrasp.services.train.own_hand import CHECK, HAND, REPORT, Request, train_hand
 from congrasp.services.train.presets import get_preset
 from tests.services.train.conftest import CLAW
+from tests.waits import eventually
 
 TINY = (
     "--actors 0 --environments 4 --rollout-steps 8 --updates {} --checkpoint-every 1 --ppo.minibatches 2 "
@@ -162,17 +162,16 @@ def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(claw,
         [*command, f"--training={TINY.format(10_000)}"], stdout=subprocess.PIPE, start_new_session=True, env=os.environ
     )
     try:
-        deadline = time.monotonic() + 200
-        while len(list((run_dir / CHECKPOINTS).glob("*.safetensors"))) < 2:
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.1)
+        written = lambda: [*(run_dir / CHECKPOINTS).glob("*.safetensors")]  # noqa: E731
+        eventually(lambda: len(written()) >= 2 or process.poll() is not None)
+        assert process.poll() is None
         process.send_signal(signal.SIGTERM)
         assert process.wait(20) == 128 + signal.SIGTERM
     finally:
         process.kill()
         process.communicate()
     (run_dir / "mark").touch()
-    first = max(int(file.stem.rpartition("_")[2]) for file in (run_dir / CHECKPOINTS).glob("*.safetensors"))
+    first = max(int(file.stem.rpartition("_")[2]) for file in written())
 
     monkeypatch.setattr(own_hand, "_report", lambda *arguments: None)
     last = first + 2
