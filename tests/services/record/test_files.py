@@ -176,10 +176,11 @@ def flushed_file(directory: pathlib.Path, chunks: int = 5) -> tuple[pathlib.Path
 
 
 @pytest.mark.parametrize("damaged", [0, 2, 4])
-def test_after_a_damaged_chunk_reading_goes_on_and_says_what_was_dropped(tmp_path: pathlib.Path, damaged: int) -> None:
+@pytest.mark.parametrize("at", [-5, 32], ids=["contents", "uncompressed size"])
+def test_after_a_damaged_chunk_reading_goes_on_and_says_what_was_dropped(tmp_path, damaged, at):
     path, chunks = flushed_file(tmp_path)
     data, (start, length) = bytearray(path.read_bytes()), chunks[damaged]
-    data[start + length - 5] ^= 4
+    data[start + at % length] ^= 4
     path.write_bytes(data)
     said: list[str] = []
     records = list(read_records(path, warn=said.append))
