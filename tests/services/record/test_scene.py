@@ -15,11 +15,10 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import link_origin
-from congrasp.common.wire.codec import Message, decode
+from congrasp.common.wire.codec import decode
 from congrasp.services.record.channels import Entry
 from congrasp.services.record.entries import Converter
 from congrasp.services.record.goals import active_blocks, active_constraints
@@ -234,9 +233,3 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
     ]
     places = [next(t for t in tf.transforms if t.parent_frame_id == "world").translation.x for tf in transforms]
     assert places == [0.0, pytest.approx(SPACING)]
-
-
-def test_an_unknown_hand_is_named_in_the_error() -> None:
-    strange = Message(episode().arrays, {**episode().meta, "hand": "tentacle"})
-    with pytest.raises(CongraspError, match="tentacle"):
-        Converter()(KEY, strange, START)

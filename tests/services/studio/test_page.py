@@ -137,20 +137,6 @@ def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
 
 
 @pytest.mark.slow
-def test_the_rules_act_and_are_explained_when_constraints_are_ticked(opened: Any, site: Site) -> None:
-    opened.check("[data-ask=affordance]")
-    opened.wait_for_selector("[data-mask=affordance][data-on=true]")
-    assert red(picture(opened)).mean() > 0.002
-    opened.check("[data-ask=pose]")
-    opened.wait_for_selector("[data-mask=pose_wrist][data-on=true]")
-    assert opened.get_attribute("[data-mask=affordance]", "data-on") == "false"
-    assert "affordance is overridden" in opened.inner_text("#explanation")
-    opened.uncheck("[data-ask=pose]")
-    opened.wait_for_selector("[data-mask=affordance][data-on=true]")
-    assert site.studio["asked"] == ["affordance"]
-
-
-@pytest.mark.slow
 def test_the_brush_paints_what_it_goes_over(opened: Any, site: Site) -> None:
     x, y = on_object(opened)
     before = red(picture(opened)).sum()

@@ -84,14 +84,6 @@ def test_the_nearer_shape_hides_the_other() -> None:
     assert seen[50, 50] == 1 and seen[35, 50] == 0 and seen[0, 0] == -1
 
 
-def test_colours_and_background() -> None:
-    image = render_scene([ball()], FRONT, (60, 60))
-    assert image.shape == (60, 60, 3) and image.dtype == np.uint8
-    red, green, blue = image[25, 30].astype(int)
-    assert red > 2 * green and red > 2 * blue
-    assert image[0].min() > 180
-
-
 def test_what_is_seen_through_takes_its_share_of_the_colour() -> None:
     pane = box((0.02, 0.4, 0.4), BLUE, (0.3, 0, 0), alpha=0.5)
     plain, through = render_scene([ball()], FRONT, (61, 61)), render_scene([ball(), pane], FRONT, (61, 61))
