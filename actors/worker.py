@@ -191,12 +191,12 @@ class RolloutWorker:
 
     def _collect_stepwise(self, parameters: Any, key: Array, steps: int, progress: Callable[[int], None]) -> Rollout:
         """Collects a rollout with an engine that JAX cannot trace; see `collect`."""
-        # One more key than steps: the decision after the last step only yields `last_observation`.
-        keys = jax.random.split(key, steps + 1)
-        key_data = np.asarray(jax.random.key_data(keys))
+        # One more key than steps: the decision after the last step only yields `last_observation`. A split does not
+        # depend on how many follow it, so that one program serves many lengths.
+        key_data = np.asarray(jax.random.key_data(jax.random.split(key, 1 << steps.bit_length())))
         parameters, settings = _on_device((parameters, self._settings))
         assert self.state is not None
-        decision = self.programs.decide(parameters, settings, self.state, keys[0])
+        decision = self.programs.decide(parameters, settings, self.state, jax.random.wrap_key_data(key_data[0]))
         state = self.state._replace(views=None)
         rows: list[dict[str, Any]] = []
         extras = []
@@ -215,9 +215,9 @@ class RolloutWorker:
                 self.physics.reset(None, transition.terminal, fresh.reset_state)
                 state = self.programs.merge(state, transition.terminal, fresh)
                 physics_state = self.physics.read(None)
-                decision = self.programs.decide(
-                    parameters, settings, self.programs.with_scene(state, physics_state), keys[step]
-                )
+                state_key = jax.random.wrap_key_data(key_data[step])
+                scene = self.programs.with_scene(state, physics_state)
+                decision = self.programs.decide(parameters, settings, scene, state_key)
             progress(step)
         self.state = self.programs.with_scene(state, physics_state)
         columns, (trace, probed) = jax.tree.map(lambda *x: np.stack(x), *zip(rows, extras, strict=True))

@@ -88,7 +88,7 @@ def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
         for obj, lattice in zip(objects, lattices, strict=True)
     ]
     origin, cell, shape = (np.array(column) for column in zip(*lattices, strict=True))
-    return DistanceField(jnp.stack(values), jnp.asarray(origin), jnp.asarray(cell, jnp.float32), jnp.asarray(shape))
+    return jax.device_put(DistanceField(np.stack(values), origin, cell.astype(np.float32), shape))
 
 
 def primitive_distance(pieces: Sequence[Piece], points: Array) -> Array:

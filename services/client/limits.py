@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _EQUAL = 1e-12
 """Tolerance of equal targets, m or rad: norms are subject to rounding."""
+_SHORTEST = 1e-9
+"""Resolution of a clock, s; quotients of less overflow."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -275,11 +277,11 @@ class Limiter:
 
     def _elapsed(self, now: float) -> float:
         """Seconds since the last target, at most a period, so that targets do not catch up after a pause."""
-        if not math.isfinite(now):
-            return 0.0
         spent = now - self._latest
-        self._latest = max(self._latest, now)
-        return min(max(spent, 0.0), self._period)
+        if not (math.isfinite(now) and spent >= _SHORTEST):
+            return 0.0
+        self._latest = now
+        return min(spent, self._period)
 
 
 def _bounded(values: np.ndarray, most: np.ndarray) -> np.ndarray:

@@ -16,6 +16,15 @@ def example() -> Any:
     return example_episode(1_000_000)
 
 
+@pytest.fixture(scope="session")
+def constraint_sets() -> Any:
+    """Constraint sets of the suite's objects."""
+    from congrasp.common.task.sampling.write_sets import make_sets
+    from tests.task import HAND, OBJECTS, TASK
+
+    return make_sets(HAND, TASK, OBJECTS, 0)
+
+
 @contextlib.contextmanager
 def quick_imports() -> Iterator[None]:
     """Imports a mesh as its hull and two plain halves; the pieces' errors count as zero.

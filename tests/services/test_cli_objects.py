@@ -84,13 +84,7 @@ def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, qui
         find_object("cat:1")
 
 
-def test_bad_arguments_are_named(tmp_path):
-    with pytest.raises(CongraspError, match="--count is 0"):
-        parse(["generate", "--out", str(tmp_path), "--count", "0"])()
-    with pytest.raises(CongraspError, match="nothing to import"):
-        parse(["import"])()
-    with pytest.raises(CongraspError, match="no folder"):
-        parse(["list", str(tmp_path / "none")])()
+def test_a_picture_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(CongraspError, match=r"x\.png could not be written"):
         parse(["show", "box:1", "--png", str(tmp_path / "file" / "x.png")])()

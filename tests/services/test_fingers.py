@@ -67,15 +67,7 @@ def query(example: Example) -> dict[str, np.ndarray]:
     ("name", "option"),
     [("fingers", ["--fingers", "thumb", "index"]), ("force", ["--force", "3"]), ("force", ["--gentle"])],
 )
-def test_the_command_refuses_it_in_one_line(
-    paper_policy: pathlib.Path,
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    quick_import: None,
-    name: str,
-    option: list[str],
-) -> None:
+def test_the_command_refuses_it_in_one_line(paper_policy, tmp_path, monkeypatch, capsys, quick_import, name, option):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")
     options = ["--policy", str(paper_policy), "--out", str(tmp_path / "out"), "--no-pictures"]
@@ -152,22 +144,25 @@ def test_a_grasp_with_two_fingers_and_a_force_limit(policy: PolicyBundle, tmp_pa
     assert "lane/fingers/share" in for_page(found.episode).arrays
 
 
-def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: dict[str, np.ndarray]) -> None:
+@pytest.fixture
+def ask(policy, query):
+    """Asks the policy under constraints; its inference or its error."""
     function = PolicyFunction(HAND, TASK)
-    layout = function.layout
-    assert layout.shapes["fingers_allowed"] == (5,) and layout.shapes["asked"] == (6,)
 
     def ask(constraints: list[str], **more: np.ndarray) -> Inference | Exception:
-        (answer,) = function(
-            policy.inference_parameters, [layout.parse(Message({**query, **more}, {"constraints": constraints}))]
-        )
+        queries = [function.layout.parse(Message({**query, **more}, {"constraints": constraints}))]
+        (answer,) = function(policy.inference_parameters, queries)
         return answer
 
+    return ask
+
+
+def test_queries_for_it_are_answered_and_checked(ask) -> None:
+    shapes = Layout(HAND, TASK).shapes
+    assert (shapes["fingers_allowed"], shapes["force_limit"], shapes["asked"]) == ((5,), (), (6,))
     pinch = ask(["heading", "fingers"], fingers_allowed=PINCH)
-    assert isinstance(pinch, Inference)
     assert pinch.active == [["Only the named fingers may touch the object.", "The heading guides the wrist."]]
     free, ignored = ask(["heading"]), ask(["heading"], fingers_allowed=PINCH)
-    assert isinstance(free, Inference) and isinstance(ignored, Inference)
     np.testing.assert_array_equal(free.vectors, ignored.vectors)
     assert np.abs(pinch.vectors - free.vectors).max() > 1e-6
     assert "needs the thumb and another finger. Allow both" in str(
@@ -177,6 +172,14 @@ def test_queries_for_it_are_answered_and_checked(policy: PolicyBundle, query: di
         ask(["heading", "fingers"])
     with pytest.raises(CongraspError, match="no constraint that guides the wrist"):
         ask(["fingers"], fingers_allowed=PINCH)
+
+
+def test_queries_for_a_force_limit_are_answered_and_checked(ask) -> None:
+    soft, firm = (ask(["heading", "force"], force_limit=np.float32(limit)) for limit in (2.0, 15.0))
+    assert np.abs(soft.vectors - firm.vectors).max() > 1e-6
+    assert "takes a limit between 0.5 and 50 N" in str(ask(["heading", "force"], force_limit=np.float32(0.0)))
+    with pytest.raises(CongraspError, match="lacks the field 'force_limit'"):
+        ask(["heading", "force"])
 
 
 def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
@@ -226,24 +229,6 @@ def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp
         == describe(policy)["masks"]
     )
     assert sum(size for _, size in meta["layout"]) == sum(size for _, size in observation.layout(HAND, TASK))
-
-
-def test_queries_for_a_force_limit_are_answered_and_checked(policy: PolicyBundle, query: dict[str, np.ndarray]) -> None:
-    function = PolicyFunction(HAND, TASK)
-    layout = function.layout
-    assert layout.shapes["force_limit"] == ()
-
-    def ask(constraints: list[str], **more: np.ndarray) -> Inference | Exception:
-        queries = [layout.parse(Message({**query, **more}, {"constraints": constraints}))]
-        (answer,) = function(policy.inference_parameters, queries)
-        return answer
-
-    soft, firm = (ask(["heading", "force"], force_limit=np.float32(limit)) for limit in (2.0, 15.0))
-    assert isinstance(soft, Inference) and isinstance(firm, Inference)
-    assert np.abs(soft.vectors - firm.vectors).max() > 1e-6
-    assert "takes a limit between 0.5 and 50 N" in str(ask(["heading", "force"], force_limit=np.float32(0.0)))
-    with pytest.raises(CongraspError, match="lacks the field 'force_limit'"):
-        ask(["heading", "force"])
 
 
 def test_the_studio_has_a_box_for_a_force_limit() -> None:

@@ -27,6 +27,7 @@ from congrasp.common.task.sampling import sets as stored_sets
 from congrasp.common.task.sampling import write_sets as constraint_sets
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
+from congrasp.services.record.reader import read_records
 from tests.episodes import episode
 from tests.limits import limited
 
@@ -60,7 +61,7 @@ def test_an_object_that_names_another_folder_is_not_read(tmp_path):
 
 def test_pipes_and_folders_are_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "a.safetensors")
-    for read in (store.load, bundles.load, stored_sets.load, load_motion, read_hand):
+    for read in (*LOADERS.values(), lambda path: [*read_records(path)]):
         assert "not a regular file" in limited(read, tmp_path / "a.safetensors", seconds=5)
     with pytest.raises(CongraspError, match="has 4 bytes; the limit is 3"):
         (tmp_path / "b").write_bytes(b"1234")
@@ -173,6 +174,10 @@ def test_json_that_is_no_hand_is_refused(tmp_path, text):
         (lambda m: {"link_parent": m.link_parent + 100}, "link_parent names links"),
         (lambda m: {"capsule_radius": -m.capsule_radius}, "capsule_radius"),
         (lambda m: {"table": m.table.astype(float)}, "table has the type"),
+        (lambda m: {"time": m.time[:3]}, r"table has shape \(12,\), but \(T,\) requires \(3,\)"),
+        (lambda m: {"object_vertices": m.object_vertices[:0]}, "object_vertices is empty"),
+        (lambda m: {"object_faces": m.object_faces + 1000}, "names vertices that do not exist"),
+        (lambda m: {"wrist_quaternion": m.wrist_quaternion[:, :3]}, r"has shape \(12, 3\), but \(T, 4\) requires"),
     ],
 )
 def test_motions_with_values_that_none_has_are_named(tmp_path, change, why):
@@ -253,7 +258,7 @@ def test_a_file_with_noise_in_it_is_read_or_refused(tmp_path, kind):
     data = path.read_bytes()
     sealed = kind in ("object", "set", "policy")
 
-    @settings(max_examples=150, deadline=3000, database=None)
+    @settings(max_examples=40, deadline=3000, database=None)
     @given(
         st.integers(0, len(data)) | st.integers(0, min(2000, len(data))),
         st.binary(max_size=6) | st.sampled_from([b"9" * 5, b"-1", b"1e9", b"null", b"[]", b'"', b"NaN"]),
@@ -321,7 +326,7 @@ def test_a_file_with_an_odd_fact_in_it_is_read_or_refused(tmp_path, kind):
         message = decode(path.read_bytes())
         facts = json.loads(json.dumps(message.meta))
 
-    @settings(max_examples=100, deadline=3000, database=None)
+    @settings(max_examples=40, deadline=3000, database=None)
     @given(st.sampled_from(list(_leaves(facts))[1:]), st.sampled_from(ODD))
     def mutated(at, value):
         changed = _replaced(facts, at, value)

@@ -132,8 +132,8 @@ def contradictions(
     """
     names = set(asked)
     flags = {name: np.ones(1, bool) for name in names}
-    batch = jax.tree.map(lambda array: jnp.asarray(array)[None], goal)
-    surface = Surface(jnp.asarray(points, jnp.float32)[None], jnp.asarray(avoid)[None])
+    batch = jax.tree.map(lambda array: np.asarray(array)[None], goal)
+    surface = Surface(np.asarray(points, np.float32)[None], np.asarray(avoid)[None])
     result = []
     for stronger, relation in _relations(names):
         if not {stronger.name, relation.weaker} <= names or _moot(relation, stronger, flags).any():

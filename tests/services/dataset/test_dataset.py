@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,18 +14,21 @@ import pyarrow.parquet as pq
 import pytest
 
 import congrasp.services.cli.main as cli
+from congrasp.actors import stress
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects.named import objects_at
 from congrasp.services.dataset.card import CARD
+from congrasp.services.evaluate import protocol
+from tests.waits import eventually
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 
 
 def arguments(out: pathlib.Path, *more: str) -> list[str]:
-    """Six episodes of each of two objects, a shard each."""
-    own = ["dataset", "box:1-2", "--out", str(out), "--per-object", "6", "--shard", "1"]
+    """Four episodes of each of two objects, a shard each."""
+    own = ["dataset", "box:2-3", "--out", str(out), "--per-object", "4", "--shard", "1"]
     return [*own, "--constraints", "heading", "affordance", "--keep", "all", "--physics", "native", *more]
 
 
@@ -42,7 +44,16 @@ def contents(folder: pathlib.Path) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> pathlib.Path:
+def short_protocol():
+    """Holds and pushes that last an eighth and a fifth of their time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(protocol, "HOLD_SECONDS", 0.25)
+        patch.setattr(stress, "PUSH_SECONDS", 0.05)
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, short_protocol) -> pathlib.Path:
     """A dataset that was made at once."""
     out = tmp_path_factory.mktemp("dataset")
     made(out)
@@ -56,18 +67,19 @@ def columns(whole) -> dict[str, np.ndarray]:
     code = re.search(r"```python\n(.*?)```", page, re.S)
     namespace: dict = {}
     exec(code[1], namespace)
-    batches = [dict(batch) for batch in namespace["batches"](whole, size=4)]
-    assert max(len(batch["q"]) for batch in batches) <= 4
+    batches = [dict(batch) for batch in namespace["batches"](whole, size=3)]
+    assert max(len(batch["q"]) for batch in batches) <= 3
     return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
 
 
 @pytest.mark.slow
-def test_a_killed_run_and_parts_make_the_same_shards(whole, tmp_path):
+def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path, monkeypatch):
+    monkeypatch.setattr(protocol, "HOLD_SECONDS", 2.0)  # as in the process
+    monkeypatch.setattr(stress, "PUSH_SECONDS", 0.25)
+    made(whole := tmp_path_factory.mktemp("whole"))
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 300
-    while len(contents(tmp_path)) < 2 and time.monotonic() < deadline and process.poll() is None:
-        time.sleep(0.01)
+    eventually(lambda: len(contents(tmp_path)) >= 2 or process.poll() is not None, 0.01)
     os.kill(process.pid, signal.SIGKILL)
     process.wait(30)
     killed = contents(tmp_path)
@@ -85,11 +97,11 @@ def test_a_killed_run_and_parts_make_the_same_shards(whole, tmp_path):
 
 def test_rows_have_requests_and_outcomes(whole, columns):
     card = json.loads((whole / CARD).read_text())
-    assert len(columns["object"]) == 12 and sorted(set(columns["object"])) == ["box_1", "box_2"]
+    assert len(columns["object"]) == 8 and sorted(set(columns["object"])) == ["box_2", "box_3"]
     for asked in ("heading", "affordance"):
         rows = columns["constraints"] == asked
-        assert sorted(columns["episode"][rows]) == sorted([0, 1, 2] * 2)
-        assert card["counts"][asked]["episodes"] == 6
+        assert sorted(columns["episode"][rows]) == [0, 0, 1, 1]
+        assert card["counts"][asked]["episodes"] == 4
         assert card["counts"][asked]["held"] == columns["held"][rows].sum()
         assert np.isnan(columns["goal_heading_direction"][rows]).all() == (asked != "heading")
         assert np.isfinite(columns["affordance_ratio"][rows]).all() == (asked == "affordance")
@@ -119,7 +131,7 @@ def test_objects_are_stored(whole):
 
 def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tmp_path):
     card = made(tmp_path, "--keep", "held", "clean", "--part", "1/2")
-    of_first = columns["object"] == "box_1"
+    of_first = columns["object"] == "box_2"
     wanted = of_first & columns["held"] & columns["clean"]
     assert pq.read_table(tmp_path / "grasps").num_rows == wanted.sum()
     counted = card["counts"].values()
@@ -131,7 +143,7 @@ def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tm
     ("more", "words"),
     [
         (("--seed", "1"), "another dataset: its seed is 0, not 1.*--out"),
-        (("--batch", "2"), "its batch is 4, not 2"),
+        (("--batch", "1"), "its batch is 2, not 1"),
         (("--part", "4/3"), "--part is '4/3'"),
         (("--constraints", "levitation"), "levitation"),
         (("--shard", "100000"), "--shard"),

@@ -13,6 +13,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects.store import Catalogue
 from congrasp.common.policy import bundle as bundles
 from congrasp.services.cli.main import load
+from congrasp.services.evaluate import episodes as simulation
 from congrasp.services.evaluate import protocol, references
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.failures import failure_sheets
@@ -22,6 +23,8 @@ from tests import task
 
 EPISODES = task.BATCH
 """Of every row, so that all rows share their programs."""
+OBJECTS = sorted(task.OBJECTS, key=lambda obj: obj.name)
+"""In a folder's order: the command finds the references of these."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,8 +33,8 @@ def cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
-        patch.setattr(references, "_ATTEMPTS", 8)
-        patch.setattr(references, "ENGINES", {"native": types.SimpleNamespace(batch=32)})
+        patch.setattr(references, "_ATTEMPTS", 4)
+        patch.setattr(references, "ENGINES", {"native": types.SimpleNamespace(batch=16)})
         yield folder / "congrasp" / "references"
 
 
@@ -44,14 +47,14 @@ def policy(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def evaluator():
-    return Evaluator(task.policy(), task.OBJECTS, batch=task.BATCH)
+    return Evaluator(task.policy(), OBJECTS, batch=task.BATCH)
 
 
 def test_references_are_grasps_and_made_once(evaluator, cache, monkeypatch):
     policy, told = references.reference_policy(task.policy())[0], []
     arguments = (policy, evaluator.task, evaluator.objects, evaluator._bank)
     made = references.make(*arguments, physics="native", threads=2, progress=lambda *counts: told.append(counts))
-    assert made.grasps[:, 0].sum() > 16  # most of the 32 episodes succeed
+    assert made.grasps[:, 0].sum() > 8  # most of the 16 episodes succeed
     assert told[-1][0] >= made.grasps.sum() and [count for count, _ in told] == sorted(count for count, _ in told)
     monkeypatch.setattr(references, "Episodes", None)  # nothing is simulated again
     again = references.make(*arguments, physics="native", threads=2)
@@ -69,8 +72,9 @@ def test_references_are_grasps_and_made_once(evaluator, cache, monkeypatch):
 def test_the_command_evaluates_by_the_protocol(policy, tmp_path, capsys, monkeypatch):
     hold = task.TASK.hold_steps
     monkeypatch.setattr(protocol, "HOLD_SECONDS", hold * task.TASK.control_dt)  # the programs are the evaluator's
+    monkeypatch.setattr(simulation, "two_seconds", lambda task: 0)  # without the stress test, too
     folder, out, samples = tmp_path / "objects", tmp_path / "rows.json", {}
-    for obj in task.OBJECTS:
+    for obj in OBJECTS:
         Catalogue(folder).add(obj)
     row = Evaluator.row
     monkeypatch.setattr(Evaluator, "row", lambda self, name, sample: row(self, name, samples.setdefault(name, sample)))
@@ -100,7 +104,7 @@ def test_rows_by_the_hand_centre_and_under_loads(evaluator):
     told = []
     row, rules = evaluator.row_by_center(EPISODES, told.append)
     assert row.group == CENTER_GROUP and row.episodes == EPISODES == told[-1] and row.paper.success == 0.96
-    assert 0 < rules.kept < rules.kept_by_center < 1
+    assert 0 < rules.kept < rules.kept_by_center <= 1 - rules.from_below + 1e-9 and 0 < rules.opposed <= 1
     levels = [Load("light", mass=(0.1, 0.1)), Load("heavy", mass=(2, 2))]
     light, heavy = evaluator.rows_under_loads(levels, print, EPISODES)
     assert (light.group, light.mass_kg, heavy.mass_kg) == ("light", pytest.approx(0.1), pytest.approx(2.0))

@@ -5,7 +5,6 @@ import json
 
 import pytest
 
-from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import pretrained_hands
@@ -15,8 +14,7 @@ from congrasp.services.evaluate import tables
 from congrasp.services.evaluate.lineup import ABLATION, line_up, read_entrants
 from congrasp.services.train.command import untrained
 from tests.rows import row
-
-CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
+from tests.task import CONFIG
 
 
 @pytest.fixture

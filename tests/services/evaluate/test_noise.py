@@ -8,11 +8,10 @@ from PIL import Image
 
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task.sampling import sets as stored_sets
-from congrasp.common.task.sampling import write_sets as constraint_sets
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.noise import LEVELS, Noise, with_noise
 from congrasp.services.evaluate.noise_sheet import draw_curves
-from tests.task import HAND, OBJECTS, TASK, policy
+from tests.task import HAND, OBJECTS, policy
 from tests.task import bank as make_bank
 
 
@@ -84,8 +83,8 @@ def test_curves_show_every_kind_of_noise(tmp_path):
         assert (blue - red > 100).sum() > 50
 
 
-def test_a_constraint_bank_comes_back_from_its_files(bank):
-    sets = constraint_sets.make_sets(HAND, TASK, OBJECTS, 0)
+def test_a_constraint_bank_comes_back_from_its_files(bank, constraint_sets):
+    sets = constraint_sets
     back = stored_sets.bank_of(sets)
     for name in ("points", "avoid", "heading_position", "pose_q", "trajectory_position", "pose_quaternion"):
         np.testing.assert_array_equal(getattr(back, name), getattr(bank, name))

@@ -6,11 +6,11 @@ import pytest
 
 from congrasp.common.task.constraints import blocks
 from congrasp.services.evaluate.plan import ALIGNED, batches, plan_row
-from congrasp.services.evaluate.protocol import protocol, two_seconds
+from congrasp.services.evaluate.protocol import protocol
 from congrasp.services.evaluate.scores import TABLES
 from tests import task
 
-TASK = protocol(task.TASK, two_seconds(task.TASK))
+TASK = protocol(task.TASK, task.TASK.hold_steps)
 MASKS = {  # affordance, fingers of the pose, wrist of the pose, trajectory; neither fingers nor a force limit
     "heading": (0, 0, 0, 0),
     "pose": (0, 1, 1, 0),
@@ -53,7 +53,7 @@ def test_objects_have_equal_shares_and_the_rows_constraints(bank, name):
 
 def test_episodes_are_independent_of_other_objects(bank):
     """Nor on how many there are, or in which batches they are simulated (but for the rounding of another program)."""
-    fewer = jax.tree.map(lambda x: x[1:], bank)
+    fewer = jax.tree.map(lambda x: np.asarray(x)[1:], bank)
     for name in ("affordance", "pose+trajectory"):
         among = plan_row(TASK, bank, task.OBJECTS, name, 30)
         alone = plan_row(TASK, fewer, task.OBJECTS[1:], name, 8)

@@ -8,34 +8,30 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.common.config import NetworkConfig, RunConfig
-from congrasp.common.hands import get_hand
-from congrasp.common.objects import procedural
 from congrasp.common.task import sensing
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate import evaluator as evaluation
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.protocol import protocol
 from congrasp.services.evaluate.sensing import LEVELS, at_level, sensing_task
 from congrasp.services.train.command import untrained
 from congrasp.services.train.student import TRACKERS
-from tests import draws
+from tests import draws, task
 
-HAND = get_hand("human")
-OBJECTS = [procedural.generate(0, "box")]
-TASK = TaskConfig(constraints=("heading",), surface_points=64)
+OBJECTS = task.OBJECTS[:1]
+TASK = TaskConfig(constraints=("heading",))
+"""Nothing of the other constraints has a level."""
 
 
 @pytest.fixture(scope="module")
 def bank():
-    return build_bank(HAND, TASK, OBJECTS, 0)
+    return jax.tree.map(lambda array: np.asarray(array)[:1], task.bank())
 
 
 def test_a_level_is_what_it_says(bank):
     """At 10 ms a step: 60 ms are 6 steps, 30 Hz a sample every 10/3 steps, and no rate is more than one a step."""
-    task = sensing_task(TASK)
-    drawn = draws.sample(HAND, task, bank, jax.random.key(0), 4)
+    sensed = sensing_task(TASK)
+    drawn = draws.sample(task.HAND, sensed, bank, jax.random.key(0), 4)
     found = {level.label: jax.device_get(at_level(drawn, level, 0.01)) for level in LEVELS}
     assert len(found) == len(LEVELS)
     true, nominal = (found[level.label] for level in LEVELS[:2])
@@ -46,7 +42,7 @@ def test_a_level_is_what_it_says(bank):
     np.testing.assert_allclose(nominal.sensors.position_noise, 0.005)
     np.testing.assert_allclose(nominal.sensors.rotation_noise, math.pi / 60, rtol=1e-6)
     assert (found["100 ms"].sensors.delay == 10).all()
-    assert sensing.longest(task.sensing, task.control_dt) == 11, "room for the longest delay"
+    assert sensing.longest(sensed.sensing, sensed.control_dt) == 11, "room for the longest delay"
     np.testing.assert_allclose(found["10 Hz"].sensors.period, 10.0)
     np.testing.assert_allclose(found["30 % dropped"].sensors.dropout, 0.3)
     np.testing.assert_allclose(found["friction 0.5"].reset_state.friction, 0.5)
@@ -56,10 +52,7 @@ def test_a_level_is_what_it_says(bank):
             name
             for part in ("sensors", "reset_state")
             for name, a, b in zip(
-                getattr(nominal, part)._fields,
-                getattr(nominal, part),
-                getattr(found[level.label], part),
-                strict=True,
+                getattr(nominal, part)._fields, getattr(nominal, part), getattr(found[level.label], part), strict=True
             )
             if not np.array_equal(a, b)
         ]
@@ -68,18 +61,18 @@ def test_a_level_is_what_it_says(bank):
 
 def test_other_tables_have_a_perfect_tracker_and_nominal_gains():
     ranged = dataclasses.replace(TASK, observation="tracked", sensing=TRACKERS, gain_range=(0.8, 1.2))
-    task = protocol(ranged, 25)
-    assert task.sensing == TaskConfig().sensing and task.gain_range == (1.0, 1.0)
-    assert task.observation == "tracked" and task.sensed and not TASK.sensed and sensing_task(TASK).sensed
+    found = protocol(ranged, 25)
+    assert found.sensing == TaskConfig().sensing and found.gain_range == (1.0, 1.0)
+    assert found.observation == "tracked" and found.sensed and not TASK.sensed and sensing_task(TASK).sensed
 
 
 def test_all_rows_have_the_same_episodes(bank, monkeypatch):
-    config = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
-    evaluator, seen, told = Evaluator(untrained(config), OBJECTS, bank=bank), [], []
+    policy = untrained(dataclasses.replace(task.CONFIG, task=TASK))
+    evaluator, seen, told = Evaluator(policy, OBJECTS, bank=bank), [], []
 
     class Running:
         batch = 4
-        stressable = False
+        stressable = True
 
         def __enter__(self):
             return self
@@ -88,6 +81,7 @@ def test_all_rows_have_the_same_episodes(bank, monkeypatch):
             pass
 
         def run(self, begun, stressed):
+            assert stressed
             seen.append(jax.device_get(begun))
             return mock.Mock()
 

@@ -41,7 +41,7 @@ def check(hand, names, episodes):
     """A broken bundle, or physics that it does not know, falls below these floors."""
     recorded_rows = {row.constraint: row for row in RESULTS[hand].rows if not row.group}
     policy = bundles.load(policy_file(None, hand))
-    evaluator = Evaluator(policy, exam_pool("development", episodes), batch=32)
+    evaluator = Evaluator(policy, exam_pool("development", episodes), batch=episodes)
     for row in evaluator.rows(names, episodes):
         record = recorded_rows[row.constraint]
         assert row.success >= farthest(record.success, row.covered, record.independent), row.constraint

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from congrasp.actors.env import metric_names
-from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
@@ -15,10 +14,9 @@ from congrasp.services.evaluate import pools as of_objects
 from congrasp.services.evaluate.pools import Loaded, Pools, folder_pools, procedural_pools
 from congrasp.services.evaluate.scores import Sample
 from congrasp.services.evaluate.unseen import evaluate_objects
-from congrasp.services.train.command import untrained
+from tests.task import TASK, policy
 
-CONFIG = RunConfig(network=NetworkConfig(hidden=(16,), encoder=4))
-POLICY = untrained(CONFIG)
+POLICY = policy()
 OBJECTS = procedural.generate_many(5, 1_000_000)
 SETTINGS = {"physics": "native", "batch": 0, "threads": 1, "seed": 0, "friction": 1.0}
 
@@ -54,7 +52,7 @@ def simulated(monkeypatch):
     def simulate(running, index, total, progress, stressed):
         done.append(([obj.name for obj in running.pools[-1]], stressed))
         progress(total)
-        values = {name: np.ones(total, np.float32) for name in metric_names(CONFIG.task)}
+        values = {name: np.ones(total, np.float32) for name in metric_names(TASK)}
         values |= {"object_index": index.astype(np.float32), "clean": np.zeros(total, np.float32)}
         values |= {"mass_kg": np.full(total, 0.2, np.float32), "identity": np.arange(total, dtype=np.uint32)}
         return Sample(values, np.ones((total, 1, 2), np.float16), np.ones((total, 1, 3), np.float16))

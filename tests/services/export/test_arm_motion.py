@@ -107,7 +107,13 @@ def test_links_have_the_names_parents_and_colours_of_the_file(motion: GraspMotio
     assert robot_joints(motion)[:5] == ["rail", "turn", "bend", first, f"hand_{first}"]
 
 
-@pytest.mark.parametrize("kind", [*motion_formats.FORMATS])
+WRITTEN = ("glb", "usd", "lerobot")
+"""By other tests of this module, too."""
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in WRITTEN)) for kind in motion_formats.FORMATS]
+)
 def test_every_reader_finds_the_arm_where_it_was(motion: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
     path = tmp_path / f"motion{motion_formats.FORMATS[kind]}"
     assert motion_formats.export_motions([motion], kind, path) < 0.01

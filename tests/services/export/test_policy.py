@@ -97,9 +97,7 @@ def test_the_file_s_limits_and_gains_are_those_of_the_hand(bundle: PolicyBundle,
 
 
 @pytest.mark.parametrize("kind", ["onnx", "stablehlo"])
-def test_a_file_that_answers_differently_is_not_written(
-    bundle: PolicyBundle, kind: str, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_answers_differently_is_not_written(bundle, kind, tmp_path, monkeypatch):
     run = getattr(exports, f"_run_{kind}")
     monkeypatch.setattr(exports, f"_run_{kind}", lambda encoded, x: run(encoded, x) + 2e-5)
     with pytest.raises(CongraspError, match=r"differs from the Flax policy by 2\.\d+e-05"):

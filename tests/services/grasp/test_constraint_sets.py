@@ -7,32 +7,26 @@ from PIL import Image
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.outline import outline
-from congrasp.common.objects import procedural, store
-from congrasp.common.task.config import TaskConfig
+from congrasp.common.objects import store
 from congrasp.common.task.sampling import sets as stored_sets
-from congrasp.common.task.sampling import write_sets as constraint_sets
-from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.task.sampling import write_sets
 from congrasp.common.task.sampling.headings import Headings, within_reach
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.main import load
 from congrasp.services.grasp.parse import read_request
+from tests.task import HAND, OBJECTS, bank
 
-HAND = get_hand("human")
-OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
-
-
-@pytest.fixture(scope="module")
-def sets():
-    return constraint_sets.make_sets(HAND, TaskConfig(), OBJECTS, 3)
+BOX, _, MUG, _ = OBJECTS
 
 
 @pytest.fixture(scope="module")
-def file(sets, tmp_path_factory):
-    return constraint_sets.save(sets[0], tmp_path_factory.mktemp("sets"))
+def file(constraint_sets, tmp_path_factory):
+    """That of the mug."""
+    return write_sets.save(constraint_sets[2], tmp_path_factory.mktemp("sets"))
 
 
-def test_every_array_is_explained_and_has_the_shape_that_is_written_down(sets):
-    for constraints in sets:
+def test_every_array_is_explained_and_has_the_shape_that_is_written_down(constraint_sets):
+    for constraints in constraint_sets:
         arrays, meta = constraints.arrays, constraints.meta
         assert set(arrays) == set(meta["arrays"])
         sizes: dict[str, int] = {"V": 2, "F": len(meta["finger_joints"]), "H": 256, "M": 20}
@@ -45,14 +39,14 @@ def test_every_array_is_explained_and_has_the_shape_that_is_written_down(sets):
         assert meta["finger_joints"][0] == HAND.joints[0].name and meta["quaternions"] == "(w, x, y, z)"
 
 
-def test_a_set_is_what_training_draws_from(sets):
-    bank = build_bank(HAND, TaskConfig(), OBJECTS, 3)
-    for n, constraints in enumerate(sets):
+def test_a_set_is_what_training_draws_from(constraint_sets):
+    made = bank()
+    for n, constraints in enumerate(constraint_sets):
         arrays = constraints.arrays
-        np.testing.assert_array_equal(arrays["heading/position"], bank.heading_position[n])
-        np.testing.assert_array_equal(arrays["pose/q"], bank.pose_q[n])
+        np.testing.assert_array_equal(arrays["heading/position"], made.heading_position[n])
+        np.testing.assert_array_equal(arrays["pose/q"], made.pose_q[n])
         rest = arrays["rest"]
-        assert len(np.unique(rest, axis=0)) == len(rest) <= bank.rest.shape[1]
+        assert len(np.unique(rest, axis=0)) == len(rest) <= made.rest.shape[1]
         headings = Headings(*(arrays[f"heading/{name}"][0] for name in Headings._fields))
         all_cleared, reachable = within_reach(headings, OBJECTS[n], rest, outline(HAND))
         np.testing.assert_array_equal(arrays["heading/allowed"][0], reachable)
@@ -63,12 +57,12 @@ def test_a_set_is_what_training_draws_from(sets):
         np.testing.assert_allclose(arrays["trajectory/position"][:, :, -1], arrays["pose/position"], atol=1e-4)
 
 
-def test_files_come_back_whole_and_others_are_refused(sets, file, tmp_path):
+def test_files_come_back_whole_and_others_are_refused(constraint_sets, file, tmp_path):
     read = stored_sets.load(file)
-    assert file.name == "mug_7.constraints.safetensors" and dict(read.meta) == dict(sets[0].meta)
-    for name, array in sets[0].arrays.items():
+    assert file.name == "mug_2.constraints.safetensors" and dict(read.meta) == dict(constraint_sets[2].meta)
+    for name, array in constraint_sets[2].arrays.items():
         np.testing.assert_array_equal(read.arrays[name], array)
-    store.save(OBJECTS[0], tmp_path / "object.safetensors")
+    store.save(MUG, tmp_path / "object.safetensors")
     with pytest.raises(CongraspError, match="not a constraint set"):
         stored_sets.load(tmp_path / "object.safetensors")
     (tmp_path / "text").write_text("not a set")
@@ -83,7 +77,7 @@ def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypat
     picture = tmp_path / "sheet.png"
     assert load("constraints")(["show", str(file), "--png", str(picture)])() == 0
     words = capsys.readouterr().out
-    assert "human, 20 finger joints" in words and "mug_7" in words and "resting pose 1" in words
+    assert "human, 20 finger joints" in words and "mug_2" in words and "resting pose 1" in words
     colours = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3).astype(int)
     red, _, blue = colours.T
     assert (blue - red > 60).sum() > 20  # arrows
@@ -95,11 +89,9 @@ def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypat
 def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
-        constraint_sets,
-        "make_sets",
-        lambda hand, task, objects, seed, bank: made.extend(obj.name for obj in objects) or [],
+        write_sets, "make_sets", lambda hand, task, objects, seed, bank: made.extend(obj.name for obj in objects) or []
     )
-    store.Catalogue(tmp_path / "objects").add(OBJECTS[1])
+    store.Catalogue(tmp_path / "objects").add(BOX)
     folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]
     file = tmp_path / "objects" / "box_0.safetensors"
     arguments = ["box_0", "mug:7", str(file), "--count", "1", "--families", "ball"]
@@ -111,13 +103,12 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
         load("constraints")(["generate", "nothing", *folder])()
 
 
-def test_a_reference_is_refused_for_another_object_or_size(sets, file, tmp_path):
-    mug, box = OBJECTS
-    request = read_request(mug, HAND, 15, pose=f"{file}:3")
-    np.testing.assert_array_equal(request.given("pose", "q"), sets[0].arrays["pose/q"][0, 3])
+def test_a_reference_is_refused_for_another_object_or_size(constraint_sets, file, tmp_path):
+    request = read_request(MUG, HAND, 15, pose=f"{file}:3")
+    np.testing.assert_array_equal(request.given("pose", "q"), constraint_sets[2].arrays["pose/q"][0, 3])
     with pytest.raises(CongraspError, match=r"is for an object of .* cm, .*; 'box_0' has .*Name the set of this"):
-        read_request(box, HAND, 15, trajectory=str(file))
-    larger = Message(sets[0].arrays, {**sets[0].meta, "object_scale": 1.4})
-    file = constraint_sets.save(larger, tmp_path)
+        read_request(BOX, HAND, 15, trajectory=str(file))
+    larger = Message(constraint_sets[2].arrays, {**constraint_sets[2].meta, "object_scale": 1.4})
+    file = write_sets.save(larger, tmp_path)
     with pytest.raises(CongraspError, match=r"1\.4 times as large, as the human hand is trained: add --scale 1\.4"):
-        read_request(mug.scaled(1 / 1.4), HAND, 15, pose=str(file))
+        read_request(MUG.scaled(1 / 1.4), HAND, 15, pose=str(file))

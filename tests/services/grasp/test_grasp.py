@@ -34,6 +34,7 @@ from congrasp.services.grasp.jobs import Result
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.record.reader import read_episodes
 from tests.episodes import episode
+from tests.services.conftest import quick_imports
 
 SIDES = (0.05, 0.06, 0.14)
 
@@ -42,7 +43,8 @@ SIDES = (0.05, 0.06, 0.14)
 def block(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mesh")
     trimesh.creation.box(SIDES).export(folder / "block.stl")
-    return one_object(folder / "block.stl", ImportOptions(cache_dir=str(folder)))
+    with quick_imports():
+        return one_object(folder / "block.stl", ImportOptions(cache_dir=str(folder)))
 
 
 @pytest.fixture(scope="module")
@@ -247,16 +249,6 @@ def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, made_up):
         for part in np.array_split(np.arange(image.shape[1]), columns)[: 2 if name == OBJECT else columns]:
             assert orange[:, part].sum() > 400 and skin[:, part].sum() > 400, name
     assert (tmp_path / "out" / "summary.png").exists()
-
-
-def test_nothing_to_grasp(tmp_path):
-    with pytest.raises(CongraspError, match="nothing to grasp"):
-        command()
-    for option, value in (("--approach", "-1"), ("--approach", "11"), ("--lift", "0.6"), ("--lift", "nan")):
-        with pytest.raises(CongraspError, match=f"{option} is .* It must be from 0 to"):
-            command(tmp_path, option, value)
-    with pytest.raises(CongraspError, match="--attempts is 0"):
-        command(tmp_path, "--attempts", "0")
 
 
 def test_files_of_a_grasp_are_constraints_of_the_next(tmp_path, block, grasper, monkeypatch, made_up):

@@ -59,9 +59,9 @@ def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.nd
     return np.reshape(ball, shape).min(1), np.reshape(table, shape).min(1)
 
 
-@pytest.mark.parametrize("name", ["human", "allegro"])
-@pytest.mark.parametrize("heading", [(0.0, 0.0, -1.0), (-1.0, 0.2, -0.4)])
-@pytest.mark.parametrize("speed", [0.0, 0.36])
+@pytest.mark.parametrize(
+    ("name", "heading", "speed"), [("human", (-1.0, 0.2, -0.4), 0.36), ("allegro", (0.0, 0.0, -1.0), 0.0)]
+)
 def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, heading, speed, ball) -> None:
     hand, way = get_hand(name), np.array(heading) / np.linalg.norm(heading)
     first = beginning(hand, way, ball, 0.16)

@@ -22,6 +22,7 @@ def vector():
     made.close()
 
 
+@pytest.mark.slow
 def test_gymnasium_accepts_the_environment():
     env = GraspEnv(**SHORT)
     check_env(env, skip_render_check=True)

@@ -17,17 +17,6 @@ with on_signal(grace=0.2):
     lock.acquire()
     lock.acquire()  # handlers run, and then it waits on for ever
 """
-POLITE = """
-import sys, time
-from congrasp.services.ops.shutdown import on_signal
-with on_signal() as stop:
-    print("ready", flush=True)
-    stop.wait(30)
-    print("drained", flush=True)
-time.sleep(0.2)
-print("said goodbye", flush=True)
-sys.exit(stop.exit_code)
-"""
 PARENT = """
 import os, subprocess, sys, time
 child = subprocess.Popen(
@@ -42,16 +31,6 @@ time.sleep(60)
 
 def start(code: str) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-
-
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_process_that_polls_drains_and_tells_the_shell_why(number, code):
-    with start(POLITE) as process:
-        assert process.stdout.readline() == "ready\n"
-        process.send_signal(number)
-        output, _ = process.communicate(timeout=20)
-    assert output == "drained\nsaid goodbye\n"
-    assert process.returncode == code
 
 
 def test_a_process_that_is_stuck_ends_all_the_same():

@@ -68,6 +68,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) >> 10)
 """
 
 
+@pytest.mark.slow
 def test_a_recorder_keeps_its_size(tmp_path):
     """150 log messages of new names made the recorder of an earlier version grow by 1.8 GB."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -1,5 +1,6 @@
 """The recorder writes what a run publishes, and nothing that happens to it reaches the run."""
 
+import contextlib
 import errno
 import json
 import os
@@ -9,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -21,13 +22,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.channels import Entry
-from congrasp.services.record.reader import (
-    log_files,
-    read_episodes,
-    read_metrics,
-    read_records,
-    read_rollouts,
-)
+from congrasp.services.record.reader import log_files, read_episodes, read_metrics, read_records, read_rollouts
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
@@ -106,9 +101,7 @@ def test_damaged_messages_are_left_out_and_counted(transport: MemoryTransport, t
     assert [record.topic for record in read_records(recorder.files[0])] == ["/metrics/learner/0"]
 
 
-def test_what_comes_faster_than_it_is_written_is_dropped_and_counted(
-    transport: MemoryTransport, tmp_path: pathlib.Path
-) -> None:
+def test_what_comes_faster_than_it_is_written_is_dropped_and_counted(transport, tmp_path):
     recorder = Recorder(transport, "r", tmp_path, depth=10)
     for update in range(25):
         transport.publish(METRICS, metrics(update))
@@ -117,9 +110,7 @@ def test_what_comes_faster_than_it_is_written_is_dropped_and_counted(
     np.testing.assert_array_equal(read_metrics(tmp_path)["learner/0/kl"][0], range(15, 25))
 
 
-def test_a_full_disk_stops_the_recording_alone(
-    transport: MemoryTransport, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_stops_the_recording_alone(transport, tmp_path, monkeypatch):
     said: list[str] = []
     seen: list[Entry] = []
 
@@ -155,11 +146,14 @@ def test_files_rotate_while_recording(transport: MemoryTransport, tmp_path: path
     assert len(recorder.files) == 3 and all(is_complete(path) for path in recorder.files)
 
 
-def start_recorder(endpoint: str, out: pathlib.Path, *options: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "congrasp", "record", "--connect", endpoint, "--run", "r"]
-    return subprocess.Popen(
-        [*command, "--out", str(out), *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+@contextlib.contextmanager
+def recorder_process(endpoint: str, out: pathlib.Path) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "congrasp", "record", "--connect", endpoint, "--run", "r", "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def publish_until(transport: ZenohTransport, done: Callable[[], bool]) -> int:
@@ -180,48 +174,44 @@ def recorded(out: pathlib.Path) -> int:
     return sum(len(list(read_records(path))) for path in log_files(out)) if out.exists() and any(out.iterdir()) else 0
 
 
-def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path: pathlib.Path) -> None:
+def steps_in(out: pathlib.Path) -> np.ndarray:
+    return read_metrics(out)["learner/0/kl"][0]
+
+
+def test_another_process_records_over_zenoh_until_ctrl_c(tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with ZenohTransport(listen=[endpoint]) as transport:
-        process = start_recorder(endpoint, tmp_path / "out")
-        try:
-            publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
-            transport.publish(KEYS.log("episode", "actor", "a0"), episode())
-            eventually(lambda: bool(list(read_episodes(tmp_path / "out"))))
-            process.send_signal(signal.SIGINT)
-            out, errors = process.communicate(timeout=10)
-        finally:
-            process.kill()
-            process.wait(10)
+    with ZenohTransport(listen=[endpoint]) as transport, recorder_process(endpoint, tmp_path / "out") as process:
+        publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
+        transport.publish(KEYS.log("episode", "actor", "a0"), episode())
+        eventually(lambda: bool(list(read_episodes(tmp_path / "out"))))
+        process.send_signal(signal.SIGINT)
+        out, errors = process.communicate(timeout=10)
     (path,) = log_files(tmp_path / "out")
     assert is_complete(path) and str(path) in out
     assert process.returncode == 130, errors
     assert "messages recorded" in errors and "Traceback" not in errors
 
 
-def test_a_killed_recorder_leaves_a_readable_file_and_the_run_goes_on(tmp_path: pathlib.Path) -> None:
+def test_a_killed_recorder_leaves_every_record_up_to_its_last_flush_and_the_run_goes_on(tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as transport:
-        process = start_recorder(endpoint, tmp_path / "out")
-        try:
-            publish_until(transport, lambda: recorded(tmp_path / "out") > 20)
-        finally:
-            process.kill()
-            process.communicate(timeout=10)
+        with recorder_process(endpoint, tmp_path / "out"):
+            sent = publish_until(transport, lambda: recorded(tmp_path / "out") > 0)
+            eventually(lambda: steps_in(tmp_path / "out")[-1] == sent - 1)
         transport.publish(METRICS, metrics(0))
     (path,) = log_files(tmp_path / "out")
     assert not is_complete(path)
-    steps, _ = read_metrics(tmp_path / "out")["learner/0/kl"]
-    assert len(steps) > 20
-    np.testing.assert_array_equal(np.diff(steps), 1)
+    steps = steps_in(tmp_path / "out")
+    np.testing.assert_array_equal(steps, range(int(steps[0]), sent))
     assert doctor(path) <= CUT
 
 
 CUT = {
     *("BAD_TRAILING_MAGIC", "MISSING_FOOTER", "MISSING_DATA_END", "MISSING_CHUNK_INDEXES", "MISSING_METADATA_INDEXES"),
-    *("MISSING_STATISTICS", "NO_ATTACHMENTS", "TRUNCATED_RECORD", "TRUNCATED_FILE"),
+    *("MISSING_STATISTICS", "NO_ATTACHMENTS", "TRUNCATED_RECORD", "TRUNCATED_FILE", "CHUNK_COMPRESSION_INEFFICIENT"),
 }
-"""What `pymcap-cli doctor` may say about a file whose writer was killed: its end is missing, and nothing is wrong."""
+"""What `pymcap-cli doctor` may say about a file whose writer was killed: its end is missing, chunks of
+a busy moment are small, and nothing is wrong."""
 
 
 def doctor(path: pathlib.Path) -> set[str]:
@@ -242,31 +232,16 @@ def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:
         records = (record for path in log_files(tmp_path / "out") for record in read_records(path))
         return [len(record.data) for record in records if record.topic.startswith("/rollout/")]
 
-    with ZenohTransport(listen=[endpoint]) as transport:
-        process = start_recorder(endpoint, tmp_path / "out")
-        try:
-            publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
-            process.send_signal(signal.SIGSTOP)
-            for _ in range(20):
-                transport.publish(rollouts, big)
-            process.send_signal(signal.SIGCONT)
-            small = Message({"x": np.zeros(1, np.float32)}, {"actor": "a"})  # by which a gap shows
-            eventually(lambda: transport.publish(rollouts, small) or min(sizes(), default=big_size) < big_size)
-            process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=10)
-        finally:
-            process.kill()
-            process.wait(10)
+    with ZenohTransport(listen=[endpoint]) as transport, recorder_process(endpoint, tmp_path / "out") as process:
+        publish_until(transport, lambda: recorded(tmp_path / "out") > 3)
+        process.send_signal(signal.SIGSTOP)
+        for _ in range(20):
+            transport.publish(rollouts, big)
+        process.send_signal(signal.SIGCONT)
+        small = Message({"x": np.zeros(1, np.float32)}, {"actor": "a"})  # by which a gap shows
+        eventually(lambda: transport.publish(rollouts, small) or min(sizes(), default=big_size) < big_size)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=10)
     found = re.search(r"lost (\d+)", errors.splitlines()[-1])
     assert found is not None
     assert sum(size >= big_size for size in sizes()) + int(found[1]) >= 20 and int(found[1]) > 0
-
-
-def test_a_recorder_without_a_run_says_so(tmp_path: pathlib.Path) -> None:
-    process = start_recorder(f"tcp/127.0.0.1:{free_port()}", tmp_path / "out", "--duration", "1")
-    try:
-        _, errors = process.communicate(timeout=40)
-    finally:
-        process.kill()
-    assert process.returncode != 0
-    assert errors.count("congrasp: error:") == 1 and "Traceback" not in errors

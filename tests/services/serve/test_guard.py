@@ -66,10 +66,10 @@ class Clock:
         return self.now
 
 
-def guarded(policy, clock, **options):
+def guarded(policy, clock, limits=LIMITS, request=REQUEST, **options):
     """A guard of a slow loop, so that the policy's thread has time to answer, in an episode."""
-    guard = Guard(policy, LIMITS, OPEN, period=0.5, wait=0.4, clock=clock, **{"stale": 0.6, "hold": 2.0, **options})
-    guard.reset(REQUEST)
+    guard = Guard(policy, limits, OPEN, period=0.5, wait=0.4, clock=clock, **{"stale": 0.6, "hold": 2.0, **options})
+    guard.reset(request)
     return guard
 
 
@@ -92,8 +92,7 @@ def test_velocities_that_are_not_measured_are_estimated_from_positions():
     """A wrist at 0.4 m/s: its servo is that far ahead that friction of 0.1 N s/m leaves 1 N, 2 N/m being its gain."""
     clock, policy = Clock(), ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0])))
     limits = dataclasses.replace(LIMITS, upper=np.full(8, 9.0), lower=np.full(8, -9.0), speed=np.full(8, 50.0))
-    with Guard(policy, limits, OPEN, period=0.5, wait=0.4, clock=clock, stale=0.6, hold=2.0) as guard:
-        guard.reset(REQUEST)
+    with guarded(policy, clock, limits) as guard:
         turned = np.array([3.1, 3.2 - 2 * np.pi, 3.2 - 2 * np.pi, 3.3 - 2 * np.pi])
         way = np.array([0.0, 0.2, 0.2, 0.4])
         fingers = np.linspace(0.0, 0.15, 4)  # measured at every step, unlike the wrist
@@ -230,18 +229,15 @@ def test_the_palm_stays_above_the_table():
     wrist = np.array([0.0, 0.0, 0.1]), np.array([0.0, 1.0, 0.0, 0.0])
     limits = dataclasses.replace(LIMITS, palm=np.array([[0.0, 0.0, 0.03, 0.02]]), speed=np.full(8, 100.0))
     down = answer(np.zeros(2), np.array([0.1, 0.0, 0.15, 0.0, 0.0, 0.0]))
-    with Guard(ScriptedPolicy(down), limits, OPEN, period=0.5, wait=0.4, stale=0.6, hold=2.0, clock=Clock()) as guard:
-        guard.reset(dataclasses.replace(REQUEST, wrist=wrist))
+    request = dataclasses.replace(REQUEST, wrist=wrist)
+    with guarded(ScriptedPolicy(down), Clock(), limits, request) as guard:
         command = guard.step({**STATE, "u": down.u_target})
         np.testing.assert_allclose(command.u_target, [0.1, 0.0, 0.05, 0.0, 0.0, 0.0], atol=1e-9)
         assert guard.counters.table == 1
         for wrong in ((np.zeros(3), np.zeros(4)), (np.full(3, np.nan), wrist[1])):
             with pytest.raises(CongraspError, match="wrist's"):
                 guard.reset(dataclasses.replace(REQUEST, wrist=wrong))
-    with Guard(
-        ScriptedPolicy(down), limits, OPEN, table=(0.0, 0.0, 1.0, -1.0), period=0.5, wait=0.4, hold=2.0
-    ) as guard:
-        guard.reset(dataclasses.replace(REQUEST, wrist=wrist))
+    with guarded(ScriptedPolicy(down), Clock(), limits, request, table=(0.0, 0.0, 1.0, -1.0)) as guard:
         np.testing.assert_allclose(guard.step({**STATE, "u": down.u_target}).u_target[2], 0.15)
 
 
@@ -287,9 +283,8 @@ def test_after_an_answer_that_came_late_the_next_is_waited_for():
             done.wait(20.0)
         return answer(state["q"])
 
-    clock, policy = Clock(), ScriptedPolicy(act)
-    with Guard(policy, LIMITS, OPEN, period=0.5, wait=0.4, stale=0.6, hold=2.0, clock=clock) as guard:
-        guard.reset(REQUEST)
+    clock = Clock()
+    with guarded(ScriptedPolicy(act), clock) as guard:
         guard._wait = 0.0
         assert guard.step(STATE).mode == "hold"
         done.set()

@@ -1,6 +1,7 @@
 """Queries: where their fields land, what is completed, and what is refused."""
 
 import dataclasses
+import functools
 import os
 
 import jax
@@ -192,24 +193,30 @@ CLOSER = TaskConfig(constraints=("heading",), surface_points=8, trajectory_point
 UP = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (8, 1))
 
 
+@functools.cache
+def completing(task):
+    layout = Layout(HAND, task)
+    return layout, jax.jit(lambda vectors: (layout.complete(vectors)[1], layout.surface(layout.complete(vectors)[0])))
+
+
 def normals_of(task=CLOSER, **changes):
     """The normals with which a policy computes features for a query."""
-    layout = Layout(HAND, task)
+    layout, complete = completing(task)
     points = "cloud" if task.observation == "camera" else "surface_points"
     given_arrays = {name: value for name, value in arrays(**changes).items() if name in {*layout.shapes, *changes}}
     if points == "cloud":
         given_arrays = {n: x for n, x in given_arrays.items() if "object" not in n} | {points: changes[points]}
     query = layout.parse(Message(given_arrays, {"constraints": ["heading"]}))
-    fields, checks = layout.complete(query.vectors)
+    checks, surface = complete(query.vectors)
     if error := layout.find_error(query, np.asarray(checks)):
         raise error
-    return np.asarray(layout.surface(fields).normals[0])
+    return np.asarray(surface.normals[0])
 
 
 def test_given_normals_are_used_and_missing_ones_are_estimated():
     points = np.random.default_rng(1).normal(size=(8, 3)).astype(np.float32)
     np.testing.assert_array_equal(normals_of(surface_points=points, surface_normals=UP), UP)
-    estimated = np.asarray(estimated_normals(points[None]))[0]
+    estimated = np.asarray(jax.jit(estimated_normals)(points[None]))[0]
     np.testing.assert_allclose(normals_of(surface_points=points), estimated, atol=1e-5)
     axes = np.eye(3)[np.arange(8) % 3]
     twice = {"surface_points": np.repeat(points, 2, 0), "surface_normals": np.repeat(axes, 2, 0)}

@@ -1,7 +1,6 @@
 """The examples' loops keep a simulated robot to its limits while their policy server is killed and comes back."""
 
 import contextlib
-import dataclasses
 import importlib.util
 import pathlib
 import time
@@ -10,14 +9,11 @@ import psutil
 import pytest
 
 import congrasp
-from congrasp.common.config import NetworkConfig
-from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.services.serve.load import wait_until_ready
-from congrasp.services.train.command import untrained
-from congrasp.services.train.presets import get_preset
 from tests.base_install import steady_server
 from tests.benchmarks.robot import SEED, Rig
+from tests.task import HAND, TASK, policy
 
 EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "robot_loop.py"
 SECONDS = 120.0
@@ -32,21 +28,15 @@ def example():
     return module
 
 
-@pytest.fixture(scope="module")
-def config():
-    return dataclasses.replace(get_preset("quickstart"), network=NetworkConfig(hidden=(32,)))
-
-
 @pytest.fixture
-def robot(example, config):
-    hand = get_hand(config.task.hand)
-    return example.MujocoRobot(hand, config.task, SEED, congrasp.JointLimits.of_hand(hand))
+def robot(example):
+    return example.MujocoRobot(HAND, TASK, SEED, congrasp.JointLimits.of_hand(HAND))
 
 
-def test_the_node_follows_a_server_and_opens_without_one(robot, config, tmp_path):
+def test_the_node_follows_a_server_and_opens_without_one(robot, tmp_path):
     """Over Zenoh, in a process of its own; nothing was lifted, so that the hand opens when the server has gone."""
-    with contextlib.closing(Rig(tmp_path, robot, config.task)) as rig:
-        with steady_server(config.task.hand) as port:
+    with contextlib.closing(Rig(tmp_path, robot, TASK)) as rig:
+        with steady_server(HAND.name) as port:
             rig.begin(f"tcp/127.0.0.1:{port}", "--hold", "0.4")
             rig.run(lambda: "follow" in "".join(rig.lines) and rig.commands > 60, SECONDS)
         rig.run(lambda: rig.lines[-1].startswith("open:"), SECONDS)
@@ -56,19 +46,16 @@ def test_the_node_follows_a_server_and_opens_without_one(robot, config, tmp_path
     assert robot.beyond <= 0.0 and robot.strongest <= 1.0 + 1e-6
 
 
-def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(
-    example, robot, config, tmp_path
-):
-    bundles.save(untrained(config), tmp_path / "policy.safetensors")
-    task, hand = config.task, get_hand(config.task.hand)
-    limits = congrasp.JointLimits.of_hand(hand)
+def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(example, robot, tmp_path):
+    bundles.save(policy(), tmp_path / "policy.safetensors")
+    limits = congrasp.JointLimits.of_hand(HAND)
     robot.reset()
     server = example.Server(tmp_path / "policy.safetensors")
     try:
-        client = congrasp.PolicyClient(server.url, hand=hand.name, timeout=0.2, wait=SECONDS)
+        client = congrasp.PolicyClient(server.url, hand=HAND.name, timeout=0.2, wait=SECONDS)
         wait_until_ready(client, SECONDS)
-        with congrasp.Guard(client, limits, hand.q_open, stale=0.1, hold=0.3, fallback="open") as guard:
-            grasps, ticker, counters = example.Grasps(robot, guard, task), congrasp.Ticker(100.0), guard.counters
+        with congrasp.Guard(client, limits, HAND.q_open, stale=0.1, hold=0.3, fallback="open") as guard:
+            grasps, ticker, counters = example.Grasps(robot, guard, TASK), congrasp.Ticker(100.0), guard.counters
 
             def step_until(done):
                 deadline = time.monotonic() + SECONDS

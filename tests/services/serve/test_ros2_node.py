@@ -2,6 +2,7 @@
 
 import array
 import contextlib
+import functools
 import importlib.util
 import json
 import pathlib
@@ -25,6 +26,7 @@ from congrasp.common.objects import procedural
 from congrasp.common.transport.ports import free_port
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.client.policy import Answer
+from tests.waits import eventually
 
 EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "ros2_node.py"
 OUTPUTS = {"joint_command": "sensor_msgs/msg/JointState", "wrist_command": "geometry_msgs/msg/PoseStamped"}
@@ -125,19 +127,26 @@ def check(policy, obj, commanded):
 
 
 @contextlib.contextmanager
-def node_of(example, bus, lift=0.0, **given):
-    """A node with a steady policy, and the object that it grasps."""
-    policy, obj = SteadyPolicy(), procedural.generate(7)
+def running(example, bus, arguments, age, lift, target):
+    """A node with a steady policy; `target` makes what it grasps of its sensors."""
+    policy = SteadyPolicy()
     limits = congrasp.JointLimits.of_hand(HAND)
-    arguments = example.Arguments("capsule:7", robot_age=3.0, **given)  # on a machine with other work
     plan = example.Plan("world", 3, 3, lift, 0.02, arguments.dry_run)
-    with congrasp.Guard(policy, limits, HAND.q_open, period=0.05, wait=0.04, stale=0.2, hold=0.6) as guard:
-        sensors = example.Sensors(arguments, NAMES, 0.4)
-        target = example.Tracked(sensors, congrasp.GraspRequest(surface=obj.points), obj.origin)
-        try:
-            yield example.PolicyNode(bus, guard, sensors, target, plan), policy, obj
-        finally:
-            bus.close()
+    guard = congrasp.Guard(policy, limits, HAND.q_open, period=0.05, wait=0.04, stale=0.2, hold=0.6)
+    with guard, contextlib.closing(bus):
+        sensors = example.Sensors(arguments, NAMES, age)
+        yield example.PolicyNode(bus, guard, sensors, target(sensors), plan), policy
+
+
+@contextlib.contextmanager
+def node_of(example, bus, lift=0.0, **given):
+    """A node with a tracker, and the object that it grasps."""
+    obj = procedural.generate(7)
+    arguments = example.Arguments("capsule:7", robot_age=3.0, **given)  # on a machine with other work
+    request = congrasp.GraspRequest(surface=obj.points)
+    make = lambda sensors: example.Tracked(sensors, request, obj.origin)  # noqa: E731
+    with running(example, bus, arguments, 0.4, lift, make) as (node, policy):
+        yield node, policy, obj
 
 
 class Wire:
@@ -157,14 +166,6 @@ class Wire:
 
     def close(self):
         pass
-
-
-def until(look, seconds=20.0):
-    deadline = time.monotonic() + seconds
-    while not (found := look()):
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    return found
 
 
 def arrived(node, policy):
@@ -203,14 +204,14 @@ def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
             assert node.step() is None
             return "joint_states: not a sensor_msgs/msg/JointState" in capsys.readouterr().err
 
-        until(refused)
-        until(lambda: turn() and arrived(node, policy))
+        eventually(refused)
+        eventually(lambda: turn() and arrived(node, policy))
         turn()
-        newest = {t: until(lambda s=s: s.try_recv()).payload.to_bytes() for t, s in heard.items()}
+        newest = {t: eventually(lambda s=s: s.try_recv()).payload.to_bytes() for t, s in heard.items()}
         check(policy, obj, [read[OUTPUTS[t]](payload) for t, payload in newest.items()])
         silent.append("object_pose")
-        until(lambda: not turn())
-        assert until(lambda: (turn(), node._guard._latched)[1]) == "freeze"  # a tracker that is lost
+        eventually(lambda: not turn())
+        assert eventually(lambda: (turn(), node._guard._latched)[1]) == "freeze"  # a tracker that is lost
 
 
 def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
@@ -262,23 +263,25 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
             command = node.step()
             return command.mode == "follow" and arrived(node, policy)
 
-        until(turn)
+        eventually(turn)
         turn()
         check(policy, obj, [sent["joint_command"], sent["wrist_command"]])
 
 
-def test_without_rclpy_it_is_one_line(example, monkeypatch):
+ENDPOINT = f"tcp/127.0.0.1:{free_port()}"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], r"ROS 2's rclpy cannot be imported here\. Source"),
+        (["--zenoh", ENDPOINT], f"--zenoh: nothing answers at {ENDPOINT} .*bridge"),
+    ],
+)
+def test_a_bus_that_is_absent_is_one_line(example, monkeypatch, options, words):
     monkeypatch.setitem(sys.modules, "rclpy", None)
-    monkeypatch.setattr(sys, "argv", ["ros2_node.py", "mug:7"])
-    with pytest.raises(congrasp.CongraspError, match=r"ROS 2's rclpy cannot be imported here\. Source") as caught:
-        example.main()
-    assert "\n" not in str(caught.value)
-
-
-def test_without_a_router_it_is_one_line(example, monkeypatch):
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    monkeypatch.setattr(sys, "argv", ["ros2_node.py", "mug:7", "--zenoh", endpoint])
-    with pytest.raises(congrasp.CongraspError, match=f"--zenoh: nothing answers at {endpoint} .*bridge") as caught:
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py", "mug:7", *options])
+    with pytest.raises(congrasp.CongraspError, match=words) as caught:
         example.main()
     assert "\n" not in str(caught.value) and "cargo" not in str(caught.value)
 
@@ -352,7 +355,7 @@ def test_after_the_approach_the_hand_rises_and_a_dry_run_sends_nothing(example):
             seen = 0.0 if policy.state is None else policy.state["object_position"][2]
             return seen == pytest.approx(-0.05) and heights[-1] - heights[0] == pytest.approx(0.1, abs=0.005)
 
-        until(risen)
+        eventually(risen)
         rise = [0.1 * s**2 * (3 - 2 * s) for s in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)]
         assert tables[0] and not tables[-1]
         assert [float(node._plan.rise(3 + n)[2]) for n in range(6)] == pytest.approx(rise)
@@ -410,20 +413,11 @@ CAMERA, CAMERA_TURN = np.array([1.0, 0.5, 0.6]), Rotation.from_euler("xyz", [-2.
 PALM, PALM_TURN = np.array([0.5, 0.1, 0.32]), Rotation.from_euler("x", 180, degrees=True)
 
 
-@contextlib.contextmanager
 def camera_node(example, bus, lift=0.0, age=3.0, **given):
     """A node of a policy with a camera, in a box around (0.5, 0.1)."""
-    policy = SteadyPolicy()
-    box = "0.5 0.1 0.2 0.3 0.3 0.4"
-    arguments = example.Arguments(cloud_topic=TOPIC, robot_age=3.0, box=box, **given)
-    plan = example.Plan("world", 3, 3, lift, 0.02, arguments.dry_run)
-    limits = congrasp.JointLimits.of_hand(HAND)
-    with congrasp.Guard(policy, limits, HAND.q_open, period=0.05, wait=0.04, stale=0.2, hold=0.6) as guard:
-        sensors = example.Sensors(arguments, NAMES, age)
-        yield (
-            example.PolicyNode(bus, guard, sensors, example.target_of(arguments, sensors, HAND, DESCRIBED), plan),
-            policy,
-        )
+    arguments = example.Arguments(cloud_topic=TOPIC, robot_age=3.0, box="0.5 0.1 0.2 0.3 0.3 0.4", **given)
+    make = functools.partial(example.target_of, arguments, hand=HAND, described=DESCRIBED)
+    return running(example, bus, arguments, age, lift, make)
 
 
 def cloud_of(points, rows=1, **stamp):
@@ -470,7 +464,7 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
     mixed = np.concatenate([around[:50], points, around[50:]])
     with camera_node(example, bus) as (node, policy):
         bus.said = camera_says(cloud_of(mixed, rows=4))
-        until(lambda: (node.step() or Fields(mode="")).mode == "follow")
+        eventually(lambda: (node.step() or Fields(mode="")).mode == "follow")
         np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
         np.testing.assert_allclose(policy.state["cloud"], expected, atol=1e-6)
         assert policy.request.surface is None and policy.request.object_pose is None
@@ -482,7 +476,7 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
     off = CAMERA_TURN.apply([0.01, 0.0, 0.0])
     with camera_node(example, bus, hand_eye="0.01 0 0 0 0 0") as (node, policy):
         bus.said = camera_says(cloud_of(points - off))
-        until(lambda: (node.step() or Fields(mode="")).mode == "follow")
+        eventually(lambda: (node.step() or Fields(mode="")).mode == "follow")
         np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
 
 
@@ -515,11 +509,11 @@ def test_a_hidden_object_stays_where_it_was_and_a_silent_camera_stops_the_hand(e
             at = policy.state and policy.state["cloud"][:, 0].mean()
             return command is not None and command.mode == "follow" and abs(at - beyond) < 0.005
 
-        until(lambda: seen(block(), 0.5))
-        until(lambda: seen(block((0.04, 0.0, 0.0)), 0.54))
-        until(lambda: seen(surroundings(), 0.54))  # the hand is before it
+        eventually(lambda: seen(block(), 0.5))
+        eventually(lambda: seen(block((0.04, 0.0, 0.0)), 0.54))
+        eventually(lambda: seen(surroundings(), 0.54))  # the hand is before it
         bus.said = camera_says(cloud_of(block()))[:-1]
-        assert until(lambda: (node.step(), node._guard._latched)[1]) == "freeze"
+        assert eventually(lambda: (node.step(), node._guard._latched)[1]) == "freeze"
 
 
 def test_the_cloud_rises_with_the_hand(example):
@@ -539,7 +533,7 @@ def test_the_cloud_rises_with_the_hand(example):
             return command is not None and wrist[0][2] - PALM[2] == pytest.approx(0.1, abs=0.01)
 
         bus.said = camera_says(cloud_of(block()))
-        until(risen)
+        eventually(risen)
         assert policy.state["cloud"][:, 2].mean() == pytest.approx(block()[:, 2].mean(), abs=0.01)
         assert not policy.state["table"]
 
@@ -571,7 +565,7 @@ def test_constraints_of_a_cloud_are_in_the_world_frame(example, tmp_path):
 
         bus.said = camera_says(cloud_of(block()))
         node.step()
-        until(seen)
+        eventually(seen)
         np.testing.assert_allclose(policy.request.constraints["heading"]["position"], [0.5, 0.1, 0.08])
         for points, avoid in (
             (policy.request.cloud, policy.request.avoid),

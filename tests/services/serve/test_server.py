@@ -11,15 +11,8 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from congrasp.common.errors import (
-    CongraspError,
-    OverloadedError,
-    RefusedError,
-    TransportError,
-    UnknownConstraintError,
-)
+from congrasp.common.errors import CongraspError, OverloadedError, RefusedError, TransportError
 from congrasp.common.policy import bundle as bundles
-from congrasp.common.task.constraints import PAPER
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
@@ -36,8 +29,6 @@ from tests.services.ops.test_metrics import scrape
 from tests.waits import eventually
 
 pytestmark = pytest.mark.timeout(300)
-CONFIG = dataclasses.replace(task.CONFIG, task=dataclasses.replace(task.TASK, constraints=PAPER))
-"""The suite's, without the constraint `fingers`, which is refused."""
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +41,7 @@ def metrics():
 def served(tmp_path_factory, metrics, example):
     """A server over Zenoh that follows a policy file, and the start of an episode."""
     path = tmp_path_factory.mktemp("policy") / "policy.safetensors"
-    bundles.save(untrained(CONFIG), path)
+    bundles.save(task.policy(), path)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint], flows=("policy",)) as transport:
         server = PolicyServer(transport, "policy", follow_file(path), on_answer=metrics.answer, on_batch=metrics.batch)
@@ -93,29 +84,10 @@ def test_answers_refusals_and_batches_are_counted(served, metrics):
     assert after["congrasp_policy_ready",] == 1 and after["congrasp_policy_version",] == 0
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"constraints": {"levitation": {}}}, UnknownConstraintError, "no constraint 'levitation'"),
-        ({"constraints": {"fingers": {}}}, UnknownConstraintError, "does not support the constraint 'fingers'"),
-        ({"q": np.zeros(7)}, RefusedError, "shape"),
-    ],
-)
-def test_a_bad_query_is_refused_and_the_next_one_answered(served, change, error, message):
-    _, endpoint, episode = served
-    with PolicyClient(endpoint) as client:
-        client.reset(dataclasses.replace(episode.request, **change))
-        with pytest.raises(RefusedError, match=message) as caught:
-            client.act(episode.state)
-        assert type(caught.value) is error
-        client.reset(episode.request)
-        assert client.act(episode.state).version == 0
-
-
 def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(served, monkeypatch):
     path, endpoint, episode = served
     monkeypatch.setattr("congrasp.services.serve.server._FOLLOW_SECONDS", 0.001)
-    policy = untrained(CONFIG)
+    policy = task.policy()
     swapped = threading.Event()
 
     def ask(_):
@@ -229,17 +201,17 @@ def test_a_policy_of_another_task_or_hand_is_refused_and_the_old_one_stays(serve
     with PolicyClient(endpoint) as client:
         version = client.health()["version"]
         for other, words in (
-            (dataclasses.replace(CONFIG.task, dynamic_center=False), "another task"),
-            (dataclasses.replace(CONFIG.task, trajectory_points=3), "not for hand"),
+            (dataclasses.replace(task.TASK, dynamic_center=False), "another task"),
+            (dataclasses.replace(task.TASK, trajectory_points=3), "not for hand"),
         ):
-            policy = untrained(dataclasses.replace(CONFIG, task=other))
+            policy = untrained(dataclasses.replace(task.CONFIG, task=other))
             bundles.save(dataclasses.replace(policy, version=99), path)
             eventually(lambda words=words: words in client.health()["trouble"])
             assert client.health()["version"] == version
 
 
 def test_following_a_run_pulls_only_what_is_newer():
-    keys, policy = Keys("r"), untrained(CONFIG)
+    keys, policy = Keys("r"), task.policy()
     with MemoryTransport(MemoryHub()) as transport:
         pull = follow_run(transport, "r", "s")
         with pytest.raises(TransportError):

@@ -10,23 +10,22 @@ import pytest
 from congrasp.actors.attempts import Outcome
 from congrasp.actors.stress import ASSESSED
 from congrasp.common.errors import CongraspError, TransportError
-from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.common.policy.pretrained import policy_file
 from congrasp.services.studio import grasping
 from congrasp.services.studio.grasping import ATTEMPTS, PolicyGrasping
 from congrasp.services.studio.jobs import SECONDS, Jobs
 from congrasp.services.studio.state import Studio
+from tests import task
 from tests.studio import objects
 
-SHIPPED = bundles.load(policy_file(None))
+POLICY = task.policy()
 
 
 class Source:
     """Gives what it is told to."""
 
     def __init__(self) -> None:
-        self.next: Callable[[], PolicyBundle | None] = lambda: SHIPPED
+        self.next: Callable[[], PolicyBundle | None] = lambda: POLICY
 
     def __call__(self, version: int) -> PolicyBundle | None:
         return self.next()
@@ -49,10 +48,10 @@ def outcome(held: list[int], error: list[float]) -> Outcome:
 def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused() -> None:
     source = Source()
     policy = PolicyGrasping(source, "the run 'r'")
-    newer = dataclasses.replace(SHIPPED, version=SHIPPED.version + 5)
+    newer = dataclasses.replace(POLICY, version=POLICY.version + 5)
     source.next = lambda: newer
     policy.refresh()
-    assert policy.newest() == {"source": "the run 'r'", "version": SHIPPED.version + 5, "trouble": ""}
+    assert policy.newest() == {"source": "the run 'r'", "version": POLICY.version + 5, "trouble": ""}
     other = dataclasses.replace(newer, spec=dataclasses.replace(newer.spec, hand="allegro"))
     source.next = lambda: other
     policy.refresh()
@@ -93,9 +92,7 @@ def test_what_was_drawn_is_tried_first_and_the_others_are_near_it() -> None:
         ([], [0.0], 0, ""),
     ],
 )
-def test_what_was_drawn_is_shown_unless_another_is_clearly_better(
-    held: list[int], error: list[float], index: int, says: str
-) -> None:
+def test_what_was_drawn_is_shown_unless_another_is_clearly_better(held, error, index, says):
     found = outcome(held, error)
     removal = int(found.trace.table[:, 0].sum()) - 1
     assert grasping._best(found, (), removal, 0.0) == index

@@ -9,9 +9,8 @@ from congrasp.services.studio.lanes import for_page, lanes
 from tests.episodes import episode, older
 
 STEPS, REMOVAL = 30, 18
-HEADING, TRAJECTORY = (
-    tuple(error.tolerance for error in get_constraint(name).errors) for name in ("heading", "trajectory")
-)
+TOLERANCES = {(name, error.unit): error.tolerance for name in ("heading", "trajectory")
+              for error in get_constraint(name).errors}  # fmt: skip
 
 
 def with_error(made: Message, **values: float | np.ndarray) -> Message:
@@ -47,24 +46,13 @@ def test_with_a_lift_the_grasp_counts_from_its_begin_though_the_table_stays() ->
     assert lifted["trajectory"].counts.tolist() == [True] * 20 + [False] * (STEPS - 20)
 
 
-def test_tolerances_are_those_of_a_grasp_that_may_become_a_reference() -> None:
-    assert HEADING == (0.25, 0.03) and TRAJECTORY == (0.3, 0.03)
-    assert [error.tolerance for error in get_constraint("pose").errors] == [0.25, 0.03]
-
-
-def test_a_wrist_beside_its_path_has_its_distance() -> None:
-    made = episode(STEPS, removal=REMOVAL)
-    lane = lanes(with_error(made, trajectory_m=TRAJECTORY[1] + 0.01))["trajectory"]
-    np.testing.assert_allclose(lane.errors["m"], TRAJECTORY[1] + 0.01, atol=1e-6)
-    assert not lane.met.any()
-    assert lanes(with_error(made, trajectory_m=TRAJECTORY[1] - 0.001))["trajectory"].met.all()
-    assert not lanes(with_error(made, trajectory_rad=TRAJECTORY[0] + 0.01))["trajectory"].met.any()
-
-
-def test_a_hand_beside_the_arrow_has_its_distance() -> None:
-    made = episode(STEPS, removal=REMOVAL)
-    before, after = lanes(made)["heading"], lanes(with_error(made, heading_m=0.05))["heading"]
-    assert before.errors["m"][-1] <= HEADING[1] and after.errors["m"][-1] > HEADING[1] and not after.met[-1]
+@pytest.mark.parametrize("name", ["heading", "trajectory"])
+@pytest.mark.parametrize("unit", ["rad", "m"])
+def test_an_error_above_its_tolerance_breaks_its_lane(name: str, unit: str) -> None:
+    made, most = episode(STEPS, removal=REMOVAL), TOLERANCES[name, unit]
+    lane = lanes(with_error(made, **{f"{name}_{unit}": most + 0.001}))[name]
+    np.testing.assert_allclose(lane.errors[unit], most + 0.001, atol=1e-6)
+    assert not lane.met.any() and lanes(with_error(made, **{f"{name}_{unit}": most - 0.001}))[name].met.any()
 
 
 def test_only_links_that_press_on_the_paint_break_the_affordance() -> None:

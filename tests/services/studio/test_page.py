@@ -20,7 +20,6 @@ from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import TrainingWindow
 from tests import studio as made_up
-from tests.episodes import older
 from tests.studio import BEGIN, DIP
 from tests.waits import eventually
 
@@ -123,6 +122,7 @@ def handle(page: Any, name: str) -> tuple[float, float]:
     return box["x"] + x * box["width"], box["y"] + y * box["height"]
 
 
+@pytest.mark.slow
 def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
     seen = picture(opened)
     small = np.asarray(Image.fromarray(seen.astype(np.uint8)).resize((96, 72), Image.Resampling.BOX)).astype(int)
@@ -136,19 +136,7 @@ def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
     assert shadow[: len(seen) // 2].sum() < shadow[len(seen) // 2 :].sum() and shadow.mean() > 0.003
 
 
-def test_the_rules_act_and_are_explained_when_constraints_are_ticked(opened: Any, site: Site) -> None:
-    opened.check("[data-ask=affordance]")
-    opened.wait_for_selector("[data-mask=affordance][data-on=true]")
-    assert red(picture(opened)).mean() > 0.002
-    opened.check("[data-ask=pose]")
-    opened.wait_for_selector("[data-mask=pose_wrist][data-on=true]")
-    assert opened.get_attribute("[data-mask=affordance]", "data-on") == "false"
-    assert "affordance is overridden" in opened.inner_text("#explanation")
-    opened.uncheck("[data-ask=pose]")
-    opened.wait_for_selector("[data-mask=affordance][data-on=true]")
-    assert site.studio["asked"] == ["affordance"]
-
-
+@pytest.mark.slow
 def test_the_brush_paints_what_it_goes_over(opened: Any, site: Site) -> None:
     x, y = on_object(opened)
     before = red(picture(opened)).sum()
@@ -173,6 +161,7 @@ def test_the_brush_paints_what_it_goes_over(opened: Any, site: Site) -> None:
     eventually(lambda: site.studio["avoid_share"] < painted)
 
 
+@pytest.mark.slow
 def test_the_arrow_is_placed_by_a_click_and_turned_by_its_tail(opened: Any, site: Site) -> None:
     before = site.studio["arrow"]
     opened.click("[data-tool=arrow]")
@@ -196,6 +185,7 @@ def test_the_arrow_is_placed_by_a_click_and_turned_by_its_tail(opened: Any, site
     eventually(lambda: opened.input_value("#roll-number") == "45")
 
 
+@pytest.mark.slow
 def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
     x, y = handle(opened, "tail")
     opened.click("[data-tool=path]")
@@ -207,6 +197,7 @@ def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
     assert "wrist trajectory guides the wrist" in opened.inner_text("#explanation")
 
 
+@pytest.mark.slow
 def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: Any) -> None:
     grasping = made_up.MadeUpGrasping()
     grasping.task = TaskConfig(constraints=("heading", "affordance", "fingers"))
@@ -239,18 +230,6 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     page.expected = ["Failed to load resource: net::ERR_FAILED"] * 2
     server.close()
     session.close()
-
-
-def test_an_older_recording_is_played_with_its_constraints_and_contact_alone(opened: Any, site: Site) -> None:
-    opened.click("#show-training")
-    opened.wait_for_selector("tr[data-actor=a005]", state="attached")
-    before = older(made_up.actor_episode(5))
-    site.window.take(Keys("made-up").log("episode", "actor", "a005"), before, time.time())
-    opened.click("tr[data-actor=a005]")
-    opened.wait_for_selector("#result:has-text('thing-5')")
-    lanes = opened.locator("#lanes [data-lane]").all()
-    assert [item.get_attribute("data-lane") for item in lanes] == ["contact"]
-    assert red(picture(opened)).mean() > 0.001  # what must not be touched
 
 
 def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_path: pathlib.Path) -> None:
@@ -295,6 +274,7 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
     assert handle(opened, "tail") == pytest.approx(tail, abs=1.0)  # the constraints are seen from where they were
 
 
+@pytest.mark.slow
 def test_two_motions_are_compared_and_one_is_deleted(opened: Any, site: Site) -> None:
     first = grasp(opened, site)
     opened.check("[data-ask=affordance]")  # closes the motion: what is edited is seen
@@ -319,6 +299,7 @@ def test_two_motions_are_compared_and_one_is_deleted(opened: Any, site: Site) ->
     assert first not in [motion["id"] for motion in site.session.state()["motions"]]
 
 
+@pytest.mark.slow
 def test_on_a_phone_and_in_the_dark_everything_is_within_reach(opened: Any) -> None:
     opened.set_viewport_size({"width": 390, "height": 844})
     opened.emulate_media(color_scheme="dark")
@@ -334,6 +315,7 @@ def test_on_a_phone_and_in_the_dark_everything_is_within_reach(opened: Any) -> N
     assert picture(opened)[60, 5].min() > 200
 
 
+@pytest.mark.slow
 def test_a_mesh_is_opened_and_a_wrong_file_is_explained(opened: Any, site: Site, tmp_path: pathlib.Path) -> None:
     for name in ("mug.stl", "mug.docx"):
         (tmp_path / name).write_bytes(b"something")
@@ -357,6 +339,7 @@ def test_a_mesh_is_opened_and_a_wrong_file_is_explained(opened: Any, site: Site,
     eventually(lambda: opened.evaluate("document.querySelector('[data-rest=\"1\"] img').naturalWidth") == 150)
 
 
+@pytest.mark.slow
 def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_episodes(opened: Any, site: Site) -> None:
     opened.click("#show-training")
     opened.wait_for_selector("tr[data-actor=a099]", state="attached")

@@ -12,13 +12,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
-from congrasp.services.train.command import (
-    EPISODE,
-    _check_connections,
-    _minutes,
-    _next_steps,
-    _Progress,
-)
+from congrasp.services.train.command import EPISODE, _check_connections, _next_steps, _Progress
 from congrasp.services.train.presets import get_preset
 
 CONFIG = RunConfig(updates=10, environments=4, rollout_steps=5)  # 40 steps an update
@@ -77,15 +71,6 @@ def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(said, clock):
     assert [line.split()[-4] for line in said()] == ["1", "11", "21", "22"]  # the last one at the end
 
 
-def test_times_that_are_not_known_are_a_question_mark():
-    assert [_minutes(float("nan")), _minutes(float("inf")), _minutes(59.9), _minutes(600.0)] == [
-        "?",
-        "?",
-        "0:59",
-        "10:00",
-    ]
-
-
 def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, tmp_path):
     from congrasp.services.cli.main import COMMANDS
 
@@ -119,11 +104,7 @@ def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, fr
 def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, change, words):
     with pytest.raises(CongraspError, match=words):
         command.run_training(
-            dataclasses.replace(CONFIG, **change),
-            tmp_path / "run",
-            actors=1,
-            resume=False,
-            evaluation=0,
+            dataclasses.replace(CONFIG, **change), tmp_path / "run", actors=1, resume=False, evaluation=0
         )
     assert not (tmp_path / "run").exists()
 

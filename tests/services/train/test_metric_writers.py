@@ -72,9 +72,7 @@ def test_weights_and_biases_offline(tmp_path: pathlib.Path, monkeypatch: pytest.
     assert not (tmp_path / "tensorboard").exists()
 
 
-def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(tmp_path, monkeypatch, capsys):
     def refuse(*args: object) -> None:
         raise OSError(28, "No space left on device")
 

@@ -7,7 +7,6 @@ import pathlib
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -18,14 +17,14 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import own_policy_file, policy_file
 from congrasp.learner.run_directory import CHECKPOINTS, CONFIG_FILE, open_run
 from congrasp.services.assets.hands.check import Finding, write_findings
-from congrasp.services.assets.hands.model_files import import_hand
 from congrasp.services.cli import main
 from congrasp.services.train import own_hand
 from congrasp.services.train.command import untrained
 from congrasp.services.train.own_hand import CHECK, HAND, REPORT, Request, train_hand
 from congrasp.services.train.presets import get_preset
+from tests.services.train.conftest import CLAW
+from tests.waits import eventually
 
-CLAW = pathlib.Path(__file__).parents[2] / "hands" / "claw.urdf"
 TINY = (
     "--actors 0 --environments 4 --rollout-steps 8 --updates {} --checkpoint-every 1 --ppo.minibatches 2 "
     "--network.hidden 16 --objects.count 1 --objects.families box"
@@ -35,18 +34,7 @@ BAD = [*GOOD, Finding("ball", "failed", "falls", "close further")]
 
 
 @pytest.fixture
-def hand(monkeypatch, tmp_path):
-    """The claw among the user's own hands."""
-    monkeypatch.setenv("CONGRASP_HANDS", str(tmp_path / "hands"))
-    (tmp_path / "hands").mkdir()
-    (tmp_path / "hands" / "claw.json").write_text(hand_text(import_hand(CLAW).hand))
-    get_hand.cache_clear()
-    yield get_hand("claw")
-    get_hand.cache_clear()
-
-
-@pytest.fixture
-def stages(monkeypatch, tmp_path, hand):
+def stages(monkeypatch, tmp_path, claw):
     """Which stages ran, in their order, and what they do: `findings` of the check, `steps` of the policy."""
     ran, does = [], {"findings": GOOD, "steps": 1000}
 
@@ -83,58 +71,58 @@ def request(hand, out, **changes):
     return dataclasses.replace(asked, **changes)
 
 
-def test_what_is_there_is_not_made_again(stages, hand, tmp_path):
+def test_what_is_there_is_not_made_again(stages, claw, tmp_path):
     ran, _ = stages
     notes = []
-    policy = train_hand(request(hand, tmp_path / "out"), notes.append)
+    policy = train_hand(request(claw, tmp_path / "out"), notes.append)
     assert ran == ["check", "train --preset quickstart --hand claw --updates 3", "report"]
     assert policy_file(None, "claw").read_bytes() == policy.read_bytes()
     text = "\n".join(notes)
     for words in ("passed  palm", "no GPU", "184 million steps", "heading", "95.3 %", str(tmp_path / "out" / REPORT)):
         assert words in text
-    train_hand(request(hand, tmp_path / "out"), notes.append)
+    train_hand(request(claw, tmp_path / "out"), notes.append)
     assert len(ran) == 3
     (tmp_path / "out" / REPORT).unlink()
-    train_hand(request(hand, tmp_path / "out"), notes.append)
+    train_hand(request(claw, tmp_path / "out"), notes.append)
     assert ran[3:] == ["report"]
-    train_hand(request(hand, tmp_path / "out", episodes=9), notes.append)
+    train_hand(request(claw, tmp_path / "out", episodes=9), notes.append)
     assert ran[4:] == ["report"]
     # A GPU trains the full task, beside what was trained without one.
     notes.clear()
-    train_hand(request(hand, tmp_path / "out", full=True), notes.append)
+    train_hand(request(claw, tmp_path / "out", full=True), notes.append)
     assert ran[5:] == ["train --preset full --hand claw --physics auto --updates 560 --updates 3", "report"]
     assert "no GPU" not in "\n".join(notes)
 
 
-def test_a_hand_that_fails_its_check_is_not_trained_unless_told_so(stages, hand, tmp_path):
+def test_a_hand_that_fails_its_check_is_not_trained_unless_told_so(stages, claw, tmp_path):
     ran, does = stages
     does["findings"] = BAD
     for _ in range(2):
         with pytest.raises(CongraspError, match=r"'claw' failed its self-check.*--anyway"):
-            train_hand(request(hand, tmp_path / "out"), lambda text: None)
+            train_hand(request(claw, tmp_path / "out"), lambda text: None)
     assert ran == ["check"] and not own_policy_file("claw").exists()
     # Mended, it is checked anew.
     does["findings"] = GOOD
-    mended = dataclasses.replace(hand, object_scale=0.8)
+    mended = dataclasses.replace(claw, object_scale=0.8)
     train_hand(request(mended, tmp_path / "out"), lambda text: None)
     assert ran[1] == "check" and len(ran) == 4
     with pytest.raises(CongraspError, match="another hand, or of an earlier version of this one"):
-        train_hand(request(hand, tmp_path / "out"), lambda text: None)
+        train_hand(request(claw, tmp_path / "out"), lambda text: None)
     does["findings"] = BAD
-    train_hand(request(hand, tmp_path / "other", anyway=True), lambda text: None)
+    train_hand(request(claw, tmp_path / "other", anyway=True), lambda text: None)
     assert len(ran) == 7
 
 
-def test_a_policy_of_more_experience_stays(stages, hand, tmp_path):
+def test_a_policy_of_more_experience_stays(stages, claw, tmp_path):
     _, does = stages
     does["steps"] = 10**8
-    best = train_hand(request(hand, tmp_path / "long", full=True), lambda text: None)
+    best = train_hand(request(claw, tmp_path / "long", full=True), lambda text: None)
     does["steps"], notes = 1000, []
-    train_hand(request(hand, tmp_path / "short"), notes.append)
+    train_hand(request(claw, tmp_path / "short"), notes.append)
     assert own_policy_file("claw").read_bytes() == best.read_bytes()
     assert "has more training (100,000,000 steps) and remains" in "\n".join(notes)
     # But one of the hand as it was before is replaced.
-    (tmp_path / "hands" / "claw.json").write_text(hand_text(dataclasses.replace(hand, object_scale=0.8)))
+    (tmp_path / "hands" / "claw.json").write_text(hand_text(dataclasses.replace(claw, object_scale=0.8)))
     get_hand.cache_clear()
     fresh = train_hand(request(get_hand("claw"), tmp_path / "new"), lambda text: None)
     assert own_policy_file("claw").read_bytes() == fresh.read_bytes() != best.read_bytes()
@@ -163,10 +151,10 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.timeout(300)
 @pytest.mark.slow
-def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(hand, monkeypatch, tmp_path):
+def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(claw, monkeypatch, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
-    (out / HAND).write_text(hand_text(hand))
+    (out / HAND).write_text(hand_text(claw))
     write_findings(out / CHECK, GOOD)
     run_dir = out / "short"
     command = [sys.executable, "-m", "congrasp", "hands", "train", "claw", "--out", str(out)]
@@ -174,24 +162,23 @@ def test_a_real_training_that_was_killed_goes_on_to_the_policy_of_the_hand(hand,
         [*command, f"--training={TINY.format(10_000)}"], stdout=subprocess.PIPE, start_new_session=True, env=os.environ
     )
     try:
-        deadline = time.monotonic() + 200
-        while len(list((run_dir / CHECKPOINTS).glob("*.safetensors"))) < 2:
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.1)
+        written = lambda: [*(run_dir / CHECKPOINTS).glob("*.safetensors")]  # noqa: E731
+        eventually(lambda: len(written()) >= 2 or process.poll() is not None)
+        assert process.poll() is None
         process.send_signal(signal.SIGTERM)
         assert process.wait(20) == 128 + signal.SIGTERM
     finally:
         process.kill()
         process.communicate()
     (run_dir / "mark").touch()
-    first = max(int(file.stem.rpartition("_")[2]) for file in (run_dir / CHECKPOINTS).glob("*.safetensors"))
+    first = max(int(file.stem.rpartition("_")[2]) for file in written())
 
     monkeypatch.setattr(own_hand, "_report", lambda *arguments: None)
     last = first + 2
     options = ("--updates", str(last))
-    policy = train_hand(request(hand, out, options=options, patience=200.0), lambda text: None)
-    assert open_run(run_dir).task.hand == hand.reference
+    policy = train_hand(request(claw, out, options=options, patience=200.0), lambda text: None)
+    assert open_run(run_dir).task.hand == claw.reference
     trained = bundles.load(policy_file(None, "claw"))
-    assert trained.version == last and trained.spec.hand == hand.reference
+    assert trained.version == last and trained.spec.hand == claw.reference
     assert policy.read_bytes() == own_policy_file("claw").read_bytes()
     assert first >= 1 and (run_dir / "mark").exists()  # one that begins anew clears its folder

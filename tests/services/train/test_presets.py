@@ -1,30 +1,15 @@
 """Presets: they can be had by name, they travel, and they say how they differ from the full task."""
 
 import dataclasses
-import pathlib
 
 import pytest
 
 from congrasp.common.config import run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.files import hand_text
 from congrasp.common.objects import procedural
-from congrasp.services.assets.hands.model_files import import_hand
 from congrasp.services.cli.train import defaults
 from congrasp.services.train.presets import PRESETS, easier, get_preset, with_hand
-
-CLAW = pathlib.Path(__file__).parents[2] / "hands" / "claw.urdf"
-
-
-@pytest.fixture
-def claw(monkeypatch, tmp_path):
-    """The claw among the user's own hands."""
-    monkeypatch.setenv("CONGRASP_HANDS", str(tmp_path))
-    get_hand.cache_clear()
-    (tmp_path / "claw.json").write_text(hand_text(import_hand(CLAW).hand))
-    yield get_hand("claw")
-    get_hand.cache_clear()
 
 
 def test_an_unknown_preset_lists_those_that_exist():

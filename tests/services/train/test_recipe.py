@@ -43,8 +43,7 @@ def test_a_fingertip_presses_with_the_torque_of_the_weakest_joint_over_its_lever
     assert tip_forces(allegro) == pytest.approx([0.7 / 0.151, *3 * [0.7 / 0.119]], rel=0.01)
     links = tuple(
         dataclasses.replace(
-            link,
-            joints=tuple(dataclasses.replace(joint, torque_limit=2 * joint.torque_limit) for joint in link.joints),
+            link, joints=tuple(dataclasses.replace(joint, torque_limit=2 * joint.torque_limit) for joint in link.joints)
         )
         for link in allegro.links
     )
@@ -57,8 +56,7 @@ def test_weaker_hands_train_more_on_parts_and_strong_ones_as_the_human_hand():
     def with_torque(factor):
         links = tuple(
             dataclasses.replace(
-                link,
-                joints=tuple(dataclasses.replace(j, torque_limit=factor * j.torque_limit) for j in link.joints),
+                link, joints=tuple(dataclasses.replace(j, torque_limit=factor * j.torque_limit) for j in link.joints)
             )
             for link in allegro.links
         )

@@ -72,7 +72,7 @@ def test_a_ball_covers_its_projection() -> None:
     assert rows.mean() == pytest.approx(99.5, abs=0.1) and columns.mean() == pytest.approx(99.5, abs=0.1)
 
 
-def test_right_is_right_and_up_is_up() -> None:
+def test_right_is_right_and_up_is_up():
     # Seen from +x, +y lies to the right.
     seen = visible([ball(0.03, at=(0, 0.15, 0.15))], FRONT, (100, 100)) == 0
     rows, columns = np.nonzero(seen)
@@ -82,14 +82,6 @@ def test_right_is_right_and_up_is_up() -> None:
 def test_the_nearer_shape_hides_the_other() -> None:
     seen = visible([ball(0.1), ball(0.02, BLUE, (0.3, 0, 0))], FRONT, (101, 101))
     assert seen[50, 50] == 1 and seen[35, 50] == 0 and seen[0, 0] == -1
-
-
-def test_colours_and_background() -> None:
-    image = render_scene([ball()], FRONT, (60, 60))
-    assert image.shape == (60, 60, 3) and image.dtype == np.uint8
-    red, green, blue = image[25, 30].astype(int)
-    assert red > 2 * green and red > 2 * blue
-    assert image[0].min() > 180
 
 
 def test_what_is_seen_through_takes_its_share_of_the_colour() -> None:
@@ -290,7 +282,6 @@ def test_an_older_recording_is_drawn_as_it_is_now() -> None:
     for now, before in zip(episode_shapes(made, 11), episode_shapes(older(made), 11), strict=True):
         for part, other in zip(vars(now).values(), vars(before).values(), strict=True):
             np.testing.assert_equal(other, part)
-    np.testing.assert_array_equal(episode_sheet(older(made), frames=1), episode_sheet(made, frames=1))
 
 
 def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -> None:
@@ -307,9 +298,11 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
         with pytest.raises(CongraspError, match="holds"):
             pick_episode(tmp_path / "run", index, success=success)
     out = tmp_path / "out.png"
-    for option in ("--frames", "--moments"):  # the second is its older name
-        assert load("render")(["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", option, "1"])() == 0
-        assert 400 < Image.open(out).size[0] < 600
+    # An older name of --frames.
+    assert (
+        load("render")(["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", "--moments", "1"])() == 0
+    )
+    assert 400 < Image.open(out).size[0] < 600
     frames = render_episode_frames(pick_episode(tmp_path / "run", 0), range(4), (64, 48))
     save_video(tmp_path / "film.mp4", frames, (64, 48), 0.5 / CONTROL_DT)
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 4
