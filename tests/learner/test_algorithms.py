@@ -22,7 +22,7 @@ from congrasp.learner.batch import collate, partition_specs
 from congrasp.learner.hub.admission import Ranges
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run
-from tests.benchmarks import toy
+from tests.learner import toy
 from tests.learner.a2c import A2C, SCHEMA
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -113,7 +113,7 @@ from jax.sharding import Mesh
 from congrasp.common.config import RunConfig
 from congrasp.learner.batch import collate
 from congrasp.learner.distributed.collectives import AXIS
-from tests.benchmarks import toy
+from tests.learner import toy
 from tests.learner.a2c import A2C, SCHEMA
 from tests.learner.test_ppo import rollout
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from congrasp.common.errors import CongraspError
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.checkpoint import Checkpoints
-from tests.benchmarks import toy
+from tests.learner import toy
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 

@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate
 from congrasp.learner.distributed.collectives import AXIS, shard
-from tests.benchmarks import toy
+from tests.learner import toy
 from tests.learner.test_ppo import fresh, rollout
 
 # One minibatch: then both have the same samples in it, whatever order they draw.

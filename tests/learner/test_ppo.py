@@ -13,7 +13,7 @@ from congrasp.common.policy import network, normalizer
 from congrasp.learner.algorithms import ppo
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
-from tests.benchmarks import toy
+from tests.learner import toy
 
 ALGORITHM = PPO(toy.SPEC, toy.SETTINGS)
 step = ALGORITHM.update
