@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import pathlib
 import threading
 import time
 
@@ -22,7 +21,6 @@ from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run, open_run
 from tests.learner.made_up_actor import MadeUpActor
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 CONFIG = RunConfig(
     name="t",
     environments=2,
