@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from congrasp.common.config import CurriculumConfig, RunConfig, run_config_from_json, to_json
+from congrasp.common.config import CurriculumConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.task.config import RewardWeights
 from congrasp.services.train.presets import PRESETS, get_preset
@@ -37,7 +37,3 @@ def test_weights_go_along_the_ramp():
     assert curriculum.weights(first, 100) == last
     assert [curriculum.stationary(version) for version in (4, 5)] == [True, False]
     assert CurriculumConfig(reward=last).weights(first, 100) == first  # no ramp
-
-
-def test_objects_are_free_by_default():
-    assert not RunConfig().curriculum.stationary(0)

@@ -28,11 +28,12 @@ from congrasp.common.task.constraints import (
     require_known,
 )
 from congrasp.common.task.constraints.priority import active_blocks
+from congrasp.common.task.control import decode
 from congrasp.common.task.features import scene_of as traced_scene
 from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import GRASP, reward_terms, terms
 from tests import task as suite
-from tests.scenes import HAND, active, evaluated, moved, scene, scene_of
+from tests.scenes import HAND, F, active, evaluated, moved, scene, scene_of
 from tests.task import TASK
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
@@ -66,11 +67,6 @@ def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
         assert [part.shape[-1] for part in parts] == [field.size for field in described[name]], name
         assert sum(part.shape[-1] for part in parts) == sizes[name]
         assert all(field.name and field.meaning for field in described[name])
-
-
-def test_the_observation_is_as_wide_as_its_layout(whole):
-    assert evaluated(observe, whole).shape == (4, sum(size for _, size in layout(HAND, TASK)))
-    assert dict(layout(HAND, TASK))["mask"] == len(blocks(TASK)) == 6
 
 
 def test_names_are_unique_over_all_constraints():
@@ -188,21 +184,27 @@ def test_what_is_not_known_is_named():
 
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 1000))
-def test_errors_and_rewards_do_not_depend_on_where_the_scene_is(seed):
-    """Turned about the vertical and shifted level, with every constraint active."""
+def test_nothing_depends_on_where_the_scene_is(seed):
+    """With every constraint active. Heights decide on `drop`: rewards allow turns about the vertical and level shifts."""
     state, surface, goal = scene(seed)
     rng = np.random.default_rng(seed)
+    action = rng.normal(size=(4, F + 6)).astype(np.float32)
     level = moved(state, np.append(rng.normal(size=2), 0.0), Rotation.from_euler("z", rng.uniform(-3, 3)))
-    some, others = (_judged(each, surface, goal) for each in (state, level))
-    for one, other in zip(jax.tree.leaves(some), jax.tree.leaves(others), strict=True):
-        np.testing.assert_allclose(one, other, rtol=2e-3, atol=5e-3)
+    free = moved(state, rng.normal(size=3), Rotation.random(rng=rng))
+    here, turned, anywhere = (_judged(each, surface, goal, action) for each in (state, level, free))
+    jax.tree.map(lambda *values: np.testing.assert_allclose(*values, rtol=2e-3, atol=5e-3), turned[0], here[0])
+    jax.tree.map(lambda *values: np.testing.assert_allclose(*values, atol=2e-3), anywhere[1], here[1])
 
 
 @jax.jit
-def _judged(state, surface, goal):
-    """Observation, reward terms and errors of a scene."""
+def _judged(state, surface, goal, action):
+    """Reward terms of a scene; and its observation, errors and targets."""
     made = traced_scene(HAND, TASK, state, surface, goal)
-    return observe(made), reward_terms(made, RewardWeights()), metrics.errors(made)
+    return reward_terms(made, RewardWeights()), (
+        observe(made),
+        metrics.errors(made),
+        decode(made, TASK.control, action),
+    )
 
 
 def test_requests_fill_the_arrays_that_they_give():
@@ -217,25 +219,20 @@ def test_requests_fill_the_arrays_that_they_give():
     assert set(goal.flat()) == {f"{c.name}_{name}" for c in CONSTRAINTS for name in c.arrays}
 
 
-TABLE = [
-    dict(zip([c.name for c in OPTIONAL], flags, strict=True)) for flags in itertools.product([False, True], repeat=5)
-]
-
-
-@pytest.mark.parametrize("asked", TABLE, ids=lambda asked: "+".join(name for name in asked if asked[name]) or "heading")
-def test_active_blocks(asked):
+def test_active_blocks():
     """The paper's figure of priorities; the choice of fingers yields to a reference pose as the affordance does."""
-    affordance, pose, trajectory, fingers, force = (asked[c.name] for c in OPTIONAL)
-    found = active_blocks({name: np.full(2, flag) for name, flag in asked.items()})
-    expected = {
-        "affordance": affordance and not pose,
-        "pose_finger": pose,
-        "pose_wrist": pose and not trajectory,
-        "trajectory": trajectory,
-        "fingers": fingers and not pose,
-        "force_limit": force,
-    }
-    assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
+    for flags in itertools.product([False, True], repeat=5):
+        affordance, pose, trajectory, fingers, force = flags
+        found = active_blocks({c.name: np.full(2, flag) for c, flag in zip(OPTIONAL, flags, strict=True)})
+        expected = {
+            "affordance": affordance and not pose,
+            "pose_finger": pose,
+            "pose_wrist": pose and not trajectory,
+            "trajectory": trajectory,
+            "fingers": fingers and not pose,
+            "force_limit": force,
+        }
+        assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
 
 
 def _drawn(names: tuple[str, ...], never: str = "") -> InitialConditions:
