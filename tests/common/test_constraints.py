@@ -185,7 +185,7 @@ def test_what_is_not_known_is_named():
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 1000))
 def test_nothing_depends_on_where_the_scene_is(seed):
-    """With every constraint active. Heights decide on `drop`: rewards allow turns about the vertical and level shifts."""
+    """With every constraint active; as heights decide on `drop`, rewards allow only level motions."""
     state, surface, goal = scene(seed)
     rng = np.random.default_rng(seed)
     action = rng.normal(size=(4, F + 6)).astype(np.float32)

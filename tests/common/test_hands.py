@@ -152,8 +152,8 @@ def test_poses_keep_within_limits_and_name_joints(hand):
 def test_opening_and_palm_side(hand):
     """The heading leads out of the palm, which the closing fingers face."""
     frame = grasp_frame(hand)
-    np.testing.assert_allclose([[frame.heading @ frame.heading, frame.heading @ frame.cross],
-                                [frame.cross @ frame.heading, frame.cross @ frame.cross]], np.eye(2), atol=1e-6)  # fmt: skip
+    axes = np.stack([frame.heading, frame.cross])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-6)
     assert 0.08 < frame.opening / hand.object_scale < 0.16
     opened, half = (_tips(hand, q) for q in (hand.q_open, (hand.q_open + hand.q_closed) / 2))
     gap = [np.linalg.norm(tips[1:].mean(0) - tips[0]) for tips in (opened, half)]
