@@ -57,6 +57,7 @@ def test_a_full_disk_is_one_clear_error_and_the_previous_checkpoint_is_intact(tm
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint_000000001.safetensors", "latest"]
 
 
+@pytest.mark.filterwarnings("ignore:os.fork")
 def test_a_process_that_dies_while_writing_leaves_the_previous_checkpoint(tmp_path):
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save({"host": np.ones(3)}, {}, 1)

@@ -188,8 +188,8 @@ def test_an_update_raises_the_noise_to_its_floor_and_the_last_one_leaves_the_fin
 def test_a_run_that_settles_lowers_its_rate_in_its_last_update():
     """By the divergence that the rate of the first update suits."""
     batch = rollout(toy.bundle_of(fresh()), 0)
-    _, metrics = changed(minibatches=1, epochs=1).update(fresh(), batch)
-    settings = dataclasses.replace(toy.SETTINGS, minibatches=1, epochs=1, kl_target=metrics["kl"], settling=0.5)
+    _, metrics = changed(minibatches=1, epochs=2).update(fresh(), batch)
+    settings = dataclasses.replace(toy.SETTINGS, minibatches=1, epochs=2, kl_target=metrics["kl"], settling=0.5)
     rates = {}
     for version in (0, 8):
         moved, _ = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
