@@ -76,19 +76,20 @@ def placed(tree: Any) -> Any:
     return jax.device_put(tree, jax.local_devices()[0])
 
 
-def programs(probe: Probe = no_probe) -> Programs:
-    """The programs of `worker`."""
+def programs(probe: Probe = no_probe, task: TaskConfig = TASK) -> Programs:
+    """The programs of `worker`, or of those of another task."""
     settings = {"batch": BATCH, "half_precision": True, "probe": probe, "traced": "all", "taught": False}
-    return programs_of(HAND, TASK, NativePhysics, commanded, **settings)
+    return programs_of(HAND, task, NativePhysics, commanded, **settings)
 
 
-def episodes(count: int, episode_bank: ConstraintBank | None = None) -> InitialConditions:
+def episodes(count: int, episode_bank: ConstraintBank | None = None, task: TaskConfig = TASK) -> InitialConditions:
     """Initial conditions of many episodes of the suite's task, by the program that draws those of `worker`.
 
     Args:
       count: number of episodes, rounded up to a multiple of `BATCH`.
       episode_bank: a bank with the shapes of that of the suite; by default, that.
+      task: another task, which costs another program.
     """
     given, keys = placed((episode_bank or bank(), jax.random.split(jax.random.key(3), -(-count // BATCH))))
-    drawn = [jax.device_get(programs().sample(given, key, np.array(False))) for key in keys]
+    drawn = [jax.device_get(programs(task=task).sample(given, key, np.array(False))) for key in keys]
     return jax.tree.map(lambda *rows: np.concatenate(rows), *drawn)

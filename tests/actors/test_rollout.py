@@ -265,10 +265,10 @@ class _Touching:
 
 
 def test_a_continuing_environment_keeps_its_contacts_when_another_restarts():
-    """The program of a compiled engine is one loop, which shares nothing with the programs of the other tests."""
-    physics = _Touching()
+    """A compiled engine's program is one loop, which shares nothing with other tests': here of headings alone."""
+    physics, task = _Touching(), dataclasses.replace(TASK, constraints=("heading",))
     worker = RolloutWorker(
-        HAND, TASK, physics, suite.bank(), suite.commanded, batch=2, seed=0, half_precision=False, traced="none"
+        HAND, task, physics, suite.bank(), suite.commanded, batch=2, seed=0, half_precision=False, traced="none"
     )
     state = worker.state
     worker.state = state._replace(

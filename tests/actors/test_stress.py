@@ -144,6 +144,7 @@ def test_native_pushes_with_a_force_and_forgets_it_at_a_reset():
     physics.close()
 
 
+@pytest.mark.slow
 def test_mjx_gets_the_same_force(monkeypatch):
     """What MJX makes of `xfrc_applied` is MuJoCo's; compiling it takes over a minute."""
     monkeypatch.setattr("congrasp.actors.physics.mjx.mjx.step", lambda model, data: data)
@@ -282,6 +283,7 @@ def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
     assert not any(lost[name][0] for name in protocols.SURVIVAL)
 
 
+@pytest.mark.slow
 def test_attempts_with_a_lift_end_higher_in_the_world():
     """They have programs of their own: a lift off the table, and the policy of a bundle."""
     obj, count, hold = OBJECTS[1], TASK.surface_points, TASK.hold_steps
