@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors.initial import InitialConditions
-from congrasp.actors.physics.engine import Physics
+from congrasp.actors.physics.engine import Physics, ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Probe, Programs, no_probe, programs_of
 from congrasp.actors.worker import RolloutWorker
@@ -42,6 +42,20 @@ def bank() -> ConstraintBank:
 def policy() -> PolicyBundle:
     """The untrained policy of `CONFIG`."""
     return untrained(CONFIG)
+
+
+def start_of(**fields: Any) -> ResetState:
+    """An environment that starts with what is given: else a free object of its own mass at the origin, and the open
+    hand at the world's pose."""
+    level, place = np.array([[1.0, 0.0, 0.0, 0.0]], np.float32), np.zeros((1, 3), np.float32)
+    neutral = {
+        **dict.fromkeys(("mass_scale", "friction", "gain_scale"), np.ones(1, np.float32)),
+        **dict.fromkeys(("base_position", "object_position"), place),
+        **dict.fromkeys(("base_quaternion", "object_quaternion"), level),
+        **{"object_index": np.zeros(1, int), "stationary": np.zeros(1, bool)},
+        **{"u_velocity": np.zeros((1, 6), np.float32), "q": HAND.q_open[None].astype(np.float32)},
+    }
+    return ResetState(**{**neutral, **fields})
 
 
 def commanded(parameters: Array, observation: Array, key: Array) -> tuple[Array, Array]:

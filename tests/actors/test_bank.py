@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from congrasp.actors.harvest import Grasps, renew
-from congrasp.actors.physics.engine import where_environments
 from congrasp.actors.process.own_references import save_references, with_kept_references
 from congrasp.common import rotations as module
 from congrasp.common.errors import CongraspError
@@ -162,14 +161,6 @@ def test_own_references_are_of_all_ages_of_the_policy(bank):
         now = renew(HAND, TASK, now, grasps, jax.random.key(age))
     ages = np.asarray(now.pose_q)[1, 1, : POSES // 2, 0] * 100
     assert np.ptp(ages) > 24 and 1 <= (ages < 32).sum() <= 9
-
-
-def test_only_masked_environments_are_exchanged():
-    mask = jnp.array([True, False])
-    new, old = {"a": jnp.ones((2, 3)), "b": jnp.array([True, True])}, {"a": jnp.zeros((2, 3)), "b": jnp.zeros(2, bool)}
-    merged = where_environments(mask, new, old)
-    np.testing.assert_array_equal(merged["a"], [[1, 1, 1], [0, 0, 0]])
-    np.testing.assert_array_equal(merged["b"], [True, False])
 
 
 def test_references_of_the_policy_outlive_a_restart(bank, tmp_path):

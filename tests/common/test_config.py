@@ -16,11 +16,6 @@ def test_configurations_survive_the_wire(name):
     assert run_config_from_json(to_json(get_preset(name))) == get_preset(name)
 
 
-def test_unknown_keys_are_named():
-    with pytest.raises(CongraspError, match="colour"):
-        run_config_from_json('{"colour": 3}')
-
-
 @pytest.mark.parametrize("task", [None, 3, [], "task", {"control": None}, {"control": [1]}])
 def test_a_task_that_is_none_is_refused(task):
     with pytest.raises(CongraspError, match="does not match this version"):

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.initial import InitialConditions, sample
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
+from congrasp.common.hands import get_hand, kinematics
 from congrasp.common.request import GraspRequest
 from congrasp.common.task import metrics
 from congrasp.common.task.config import RewardWeights, TaskConfig
@@ -34,6 +34,7 @@ from congrasp.common.task.control import decode
 from congrasp.common.task.features import scene_of as traced_scene
 from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import GRASP, reward_terms, terms
+from congrasp.common.task.types import Goal
 from tests import task as suite
 from tests.scenes import HAND, F, active, evaluated, moved, scene, scene_of
 from tests.task import TASK
@@ -207,6 +208,21 @@ def _judged(state, surface, goal, action):
         metrics.errors(made),
         decode(made, TASK.control, action),
     )
+
+
+def test_a_task_ignores_what_it_does_not_know():
+    """A choice of fingers and a limit of the force: f_max stays a number."""
+    task, (state, surface, goal) = TaskConfig(constraints=PAPER), scene(5)
+    flags = {block: goal.active[block] for name in PAPER for block in get_constraint(name).blocks}
+    known_alone = Goal({name: goal[name] for name in PAPER}, flags)
+    some, more = (scene_of(task, state, surface, each) for each in (known_alone, goal))
+    np.testing.assert_array_equal(some.features.center, kinematics.hand_center(HAND, some.features.keypoints))
+    np.testing.assert_array_equal(evaluated(observe, some), evaluated(observe, more))
+    paid = evaluated(reward_terms, some, task.reward)
+    assert not {"force_over", "fingers_contact"} & {*paid}
+    jax.tree.map(np.testing.assert_array_equal, paid, evaluated(reward_terms, more, task.reward))
+    total = np.linalg.norm(more.features.force, axis=-1)
+    np.testing.assert_allclose(paid["force_excess"], -0.01 * np.clip(total - 5.0, 0, 50).sum(-1), rtol=1e-5)
 
 
 def test_requests_fill_the_arrays_that_they_give():

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand
@@ -22,6 +21,7 @@ from congrasp.common.objects.pool import scale_objects
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from tests.mano_file import mano_pickle
+from tests.task import start_of
 
 ROBOTS = ("allegro", "sharpa")
 # Fingertips at zero, m, in the frame of the makers' models, thumb first.
@@ -177,14 +177,10 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
     axes = np.stack([frame.heading, frame.cross, along], -1)
     down = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]) @ axes.T)
     quaternion = (down * Rotation.from_matrix(axes)).as_quat(scalar_first=True)
-    reset_state = ResetState(
-        object_index=np.zeros(1, int),
+    reset_state = start_of(
         mass_scale=np.full(1, 0.4 / cylinder.mass),
-        friction=np.ones(1),
-        gain_scale=np.ones(1),
         base_position=np.array([[0.0, 0.0, 1.0]]),
         base_quaternion=down.as_quat(scalar_first=True)[None],
-        u_velocity=np.zeros((1, 6)),
         q=hand.q_open[None],
         object_position=np.array([[0.0, 0.0, 1.0]]) + down.apply(center),
         object_quaternion=quaternion[None],

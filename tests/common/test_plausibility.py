@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import link_transforms
-from congrasp.common.hands.mjcf import add_hand, overlapping
+from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.distance import distance_field
 from congrasp.common.objects.spec import Piece
@@ -84,16 +84,6 @@ def test_hand_in_hand_is_the_deepest_contact_of_the_hands_model(name):
     found = np.asarray(measured(np.array(poses, np.float32)))
     np.testing.assert_allclose(found, [deepest_contact(name, q) for q in poses], atol=1e-5)
     assert found[0] == 0.0 and found.max() > 0.002  # open hands are free of themselves, some poses are not
-
-
-def test_neighbours_and_nested_links_do_not_count():
-    hand = get_hand("human")
-    capsules = plausibility._capsules(hand)
-    names = [hand.links[i].name for i in hand.capsule_links]
-    pairs = {frozenset((names[a], names[b])) for a, b in capsules.pairs.T}
-    assert frozenset(("thumb_distal", "index_distal")) in pairs and frozenset(("palm", "thumb_distal")) in pairs
-    assert not pairs & {frozenset((link.name, link.parent)) for link in hand.links}
-    assert not pairs & {frozenset(pair) for pair in overlapping(hand)}
 
 
 def test_hand_in_table_is_the_lowest_point_of_a_capsule():

@@ -16,7 +16,6 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.batch import collate
 from congrasp.learner.hub import hub
 from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.deduplication import Sequences
@@ -298,26 +297,6 @@ def test_tokens_by_the_thousand_cost_the_others_nothing(bench):
     while events.receive(0.05):
         told += 1
     assert told == 64  # one for each that was listed
-
-
-def _sized(steps, worlds):
-    """A rollout that agrees with itself, of so many control steps of so many worlds."""
-    return Message(RolloutForm(steps, worlds, D, A, half=True).zeros(), {**rollout().meta, "steps": steps * worlds})
-
-
-@pytest.mark.parametrize(
-    ("steps", "worlds", "rule"),
-    [(T + 1, B, r"\(4, 2, 5\), not \(T=3, B=2"), (T, B + 1, r"\(3, 3, 5\), not \(T=3, B=2")],
-)
-def test_an_actor_of_another_configuration_is_refused_alone(bench, steps, worlds, rule):
-    """Batches are counted in rollouts, so one of another length or width would not fit beside the others."""
-    b = bench()
-    b.hub.publish_weights(bundle(0), 0)
-    reply = b.peer.query(KEYS.rollout("a"), _sized(steps, worlds), timeout=60).meta
-    assert reply["outcome"] == "refused" and re.search(rule, reply["why"])
-    assert b.send(0)["outcome"] == b.send(1)["outcome"] == "accepted"
-    batch = b.hub.next_batch(2, 1)
-    assert collate([message.arrays for message in batch], FORM.arrays)["reward"].shape == (T, 2 * B)
 
 
 def test_refusal_ends_the_ticket(bench):

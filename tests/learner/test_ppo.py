@@ -155,23 +155,6 @@ def test_divergence_and_noise_are_bounded_as_the_run_settles():
     assert PPOConfig(settling=0.3, final_std=0.0).noise_kept_at(9, 10) == np.inf
 
 
-@pytest.mark.parametrize(
-    ("kept", "least", "before", "risen", "after"),
-    [
-        (np.inf, 0.0, (0.8, 0.8, 0.05), (1.2, 0.3, 0.075), (1.2, 0.3, 0.075)),
-        # From 0.8 to 0.1 in three updates: halves. What is below the ceiling stays.
-        (2 / 3, 0.0, (0.8, 0.3, 0.05), (0.8, 0.3, 0.05), (0.4, 0.1 * 3 ** (2 / 3), 0.05)),
-        (1 / 2, 0.0, (0.4, 0.1 * 3 ** (2 / 3), 0.05), (0.6, 0.3, 0.05), (0.2, 0.1 * 3 ** (1 / 3), 0.05)),
-        (0.0, 0.0, (0.2, 0.1, 0.05), (0.3, 0.1, 0.05), (0.1, 0.1, 0.05)),
-        (np.inf, 0.35, (0.2, 0.35, 0.6), (0.2, 0.35, 0.6), (0.35, 0.35, 0.6)),
-    ],
-)
-def test_noise_after_an_update_by_hand(kept, least, before, risen, after):
-    hyper = {"final_std": 0.1, "noise_kept": kept, "least_std": least}
-    moved = ppo._settle({"actor": {"log_std": jnp.log(jnp.array(risen))}}, jnp.log(jnp.array(before)), hyper)
-    np.testing.assert_allclose(np.exp(moved["actor"]["log_std"]), after, rtol=1e-5)
-
-
 @pytest.mark.parametrize("least", [0.0, 0.7])
 def test_an_update_raises_the_noise_to_its_floor_and_the_last_one_leaves_the_final_noise(least):
     """The deviations are 0.6 before each update; a floor of 0.7 is above what an update reaches."""
