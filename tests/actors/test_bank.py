@@ -65,17 +65,6 @@ def test_normals_belong_to_the_points_of_their_object(bank):
     np.testing.assert_array_equal(surface.normals, np.asarray(bank.normals)[[1, 0]])
 
 
-def test_references_below_the_table_are_not_valid():
-    """One pose from above, one from below; the object lies as it is, or upside down."""
-    positions = jnp.array([[0.0, 0.0, 0.15], [0.0, 0.0, -0.15]])
-    poses = Poses(jnp.zeros((2, F)), positions, jnp.stack([_pointing(-1.0), _pointing(1.0)]))
-    upright, upside_down = [0, 0, 0.05, 1, 0, 0, 0], [0, 0, 0.05, 0, 1, 0, 0]
-    rest = jnp.array([[upright, upside_down]] * 2, jnp.float32)
-    path, turns, valid = references(HAND, poses, rest, jax.random.key(0), TASK.trajectory_points)
-    assert path.shape == (2, TASK.trajectory_points, 3) and turns.shape == (2, TASK.trajectory_points, 4)
-    np.testing.assert_array_equal(valid, [[True, False], [False, True]])
-
-
 def test_references_with_fingers_in_the_table_are_not_valid():
     """From above, the lowest finger a centimetre over the table and a centimetre in it."""
     q, down = jnp.zeros((1, F)), _pointing(-1.0)

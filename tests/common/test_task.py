@@ -25,7 +25,7 @@ from congrasp.common.task.reward import reward_terms, terms
 from tests.scenes import HAND, F, K, L, active, near_targets, points_of, scene, units
 
 TASK = TaskConfig(constraints=PAPER)
-TERMS, MASKS = terms(TASK), ("affordance", "pose_finger", "pose_wrist", "trajectory")
+TERMS = terms(TASK)
 UNIT = RewardWeights(**{name: 1.0 for name in TERMS}, force_max=5.0)
 
 
