@@ -94,7 +94,7 @@ def test_peers_that_ask_for_weights_without_end_are_put_off():
         attacked("greedy", endpoint, "r", count=3),
     ):
         link.config(10)
-        _updates(link, hub, 10)
+        _updates(link, hub, 20)
         assert hub._pull_limit.rejected > 0
 
 
