@@ -1,7 +1,7 @@
 # quickstart: set up and train a small policy.  test, test-all, coverage, lint: check the code.  docs: build the site.  bench: install its peers, print the benchmark tables.
 # Everything runs in .venv, which the first target makes; another interpreter: make quickstart PYTHON=python3.12
 
-FAST := tests/test_architecture.py $(addprefix tests/common/,$(addsuffix .py,test_rotations test_kinematics test_motors test_priority \
+FAST := tests/test_architecture.py $(addprefix tests/common/,$(addsuffix .py,test_rotations test_motors test_priority \
   test_trajectories test_plausibility test_codec test_messages)) $(addprefix tests/learner/,$(addsuffix .py,test_gae test_losses \
   test_staleness test_tickets test_rate_limit))
 supported := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))

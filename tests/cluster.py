@@ -6,24 +6,23 @@ file.
 """
 
 import contextlib
+import itertools
 import json
 import os
 import pathlib
 import random
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 
 import numpy as np
 
-from congrasp.actors.process.link import ActorLink, RunFinished, RunRestarted
+from congrasp.actors.process.link import ActorLink, RunFinished
 from congrasp.common.errors import TransportError
 from congrasp.common.io.journal import AUDIT, Journal
 from congrasp.common.transport import urls
-from congrasp.common.transport.keys import FLOWS, Keys
+from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.schema import RolloutForm
@@ -34,7 +33,7 @@ from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
 from congrasp.services.ops.audit import FAULTS, audit
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-KEYS = Keys("chaos")
+KEYS, RUN_ID = Keys("chaos"), "e"
 T, B, D, A = 20, 16, 32, 4
 BATCH = 2
 _PATIENCE = 240.0  # seconds, on a machine that does much else
@@ -48,13 +47,13 @@ def bundle(version, run_id):
     return Message(arrays, {**meta, "format": 1})
 
 
-def rollout(steps, value, version, *, actions=A, schema="s"):
+def rollout(steps, value, version):
     """All values are the same, so that a corrupted one shows."""
-    arrays = RolloutForm(steps, B, D, actions, half=True).zeros()
+    arrays = RolloutForm(steps, B, D, A, half=True).zeros()
     for array in arrays.values():
         if array.dtype != bool:
             array.fill(value)
-    return Message(arrays, {"version": version, "schema": schema, "steps": steps * B})
+    return Message(arrays, {"version": version, "schema": "s", "steps": steps * B})
 
 
 class SlowLog(WriteAheadLog):
@@ -72,7 +71,7 @@ class SlowLog(WriteAheadLog):
 # --- the two roles ---
 
 
-def run_learner(folder, endpoint, *, run_id="e", steps=T, every=1, pause=0.0, write_ahead=True, disk=0.0):
+def run_learner(folder, endpoint, *, steps=T, every=1, pause=0.0, disk=0.0):
     """Consumes batches and checkpoints after `every` updates, until it is told to stop (SIGTERM) or killed.
 
     Its disk takes `disk` seconds for a rollout.
@@ -87,13 +86,13 @@ def run_learner(folder, endpoint, *, run_id="e", steps=T, every=1, pause=0.0, wr
     signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
     with urls.listen(endpoint, "learner") as transport:
         hub = LearnerHub(
-            transport, run="chaos", config_json="{}", run_id=run_id, schema="s",
+            transport, run="chaos", config_json="{}", run_id=RUN_ID, schema="s",
             form=RolloutForm(steps, B, D, A, half=True), staleness=StalenessManager(1, BATCH),
             durable=saved["durable"], audit=AuditLog(folder, "0"),
-            log=SlowLog(folder / FOLDER / "0", 1, write=write_ahead, seconds=disk),
+            log=SlowLog(folder / FOLDER / "0", 1, seconds=disk),
         )  # fmt: skip
         save(published, version)
-        hub.publish_weights(bundle(version, run_id), version)
+        hub.publish_weights(bundle(version, RUN_ID), version)
         print("ready", flush=True)
         updates = 0
         while not stopped:
@@ -108,7 +107,7 @@ def run_learner(folder, endpoint, *, run_id="e", steps=T, every=1, pause=0.0, wr
             time.sleep(pause)
             version, updates = version + 1, updates + 1
             save(published, version)
-            hub.publish_weights(bundle(version, run_id), version)
+            hub.publish_weights(bundle(version, RUN_ID), version)
             if updates % every == 0:
                 durable = hub.durable()
                 save(path, {"durable": durable, "history": history, "version": version})
@@ -125,38 +124,30 @@ def save(path, content):
     os.replace(temporary, path)
 
 
-def run_actor(folder, endpoint, *, name, steps=T, pause=0.0, request_timeout=3.0, **kind):
-    """Makes rollouts of a kind until the run is finished; writes each outcome down."""
+def run_actor(folder, endpoint, *, name, steps=T, pause=0.0, request_timeout=3.0):
+    """Makes rollouts until the run is finished; writes each outcome down."""
     journal = Journal(folder / AUDIT / f"{name}.jsonl")
     with (
         open(folder / f"{name}.log", "a", buffering=1) as log,
         urls.connect(endpoint, "actor") as transport,
         ActorLink(transport, "chaos", name, window=2, request_timeout=request_timeout, journal=journal) as link,
     ):
-        made = []
         with contextlib.suppress(RunFinished):
-            while True:
-                try:
-                    work(link, steps, pause, made, log, kind)
-                except RunRestarted:
-                    log.write(json.dumps({"restarted": link.config(20).run_id}) + "\n")
+            work(link, steps, pause, log)
         link.flush(5)
 
 
-def work(link, steps, pause, made, log, kind):
+def work(link, steps, pause, log):
     link.config(20)
     version = -1
-    while True:
-        ticket = link.acquire_ticket(1.0)
-        if ticket is None:
-            continue
+    for sequence in itertools.count():
+        while (ticket := link.acquire_ticket(1.0)) is None:
+            pass
         pulled = link.weights(version)
         version = pulled.meta["version"] if pulled else version
         time.sleep(pause)
-        future = link.upload(rollout(steps, len(made) % 1000, version, **kind), ticket)
-        entry = {"incarnation": link.incarnation, "sequence": len(made)}
-        made.append(future)
-        future.add_done_callback(
+        entry = {"incarnation": link.incarnation, "sequence": sequence}
+        link.upload(rollout(steps, sequence % 1000, version), ticket).add_done_callback(
             lambda f, entry=entry: log.write(json.dumps({**entry, "outcome": outcome_of(f)}) + "\n")
         )
 
@@ -269,58 +260,6 @@ def assert_books_balance(final):
     assert ledger["granted"] == ledger["running"] + ledger["redeemed"] + ledger["returned"] + ledger["expired"]
     assert ledger["consumed"] == len(final["history"])
     assert len({tuple(identity) for identity in final["history"]}) == len(final["history"])
-
-
-class Proxy:
-    """A network between actors and the learner that can be made silent or slow."""
-
-    def __init__(self, port):
-        """Forwards to the learner's ports, from `endpoint` on."""
-        first = free_port()
-        self.endpoint = f"tcp/127.0.0.1:{first}"
-        self.bytes_per_second = float("inf")
-        self._open, self._ended = threading.Event(), threading.Event()
-        self._open.set()
-        self._sockets = []
-        for i in range(len(FLOWS)):
-            listener = socket.create_server(("127.0.0.1", first + i))
-            self._sockets.append(listener)
-            threading.Thread(target=self._accept, args=(listener, port + i), daemon=True).start()
-
-    def silence(self):
-        """Nothing passes any more, and nobody is told."""
-        self._open.clear()
-
-    def restore(self):
-        self._open.set()
-
-    def close(self):
-        self._ended.set()
-        self._open.set()
-        for one in self._sockets:
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-            one.close()
-
-    def _accept(self, listener, port):
-        with contextlib.suppress(OSError):
-            while True:
-                near, _ = listener.accept()
-                self._open.wait()
-                far = socket.create_connection(("127.0.0.1", port))
-                self._sockets += [near, far]
-                for source, sink in ((near, far), (far, near)):
-                    threading.Thread(target=self._pump, args=(source, sink), daemon=True).start()
-
-    def _pump(self, source, sink):
-        with contextlib.suppress(OSError):
-            while (data := source.recv(1 << 14)) and not self._ended.is_set():
-                self._open.wait()
-                time.sleep(len(data) / self.bytes_per_second)
-                sink.sendall(data)
-        for one in (source, sink):
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
 
 
 if __name__ == "__main__":

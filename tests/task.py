@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors.initial import InitialConditions
-from congrasp.actors.physics.engine import Physics
+from congrasp.actors.physics.engine import Physics, ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Probe, Programs, no_probe, programs_of
 from congrasp.actors.worker import RolloutWorker
@@ -42,6 +42,20 @@ def bank() -> ConstraintBank:
 def policy() -> PolicyBundle:
     """The untrained policy of `CONFIG`."""
     return untrained(CONFIG)
+
+
+def start_of(**fields: Any) -> ResetState:
+    """An environment that starts with what is given: else a free object of its own mass at the origin, and the open
+    hand at the world's pose."""
+    level, place = np.array([[1.0, 0.0, 0.0, 0.0]], np.float32), np.zeros((1, 3), np.float32)
+    neutral = {
+        **dict.fromkeys(("mass_scale", "friction", "gain_scale"), np.ones(1, np.float32)),
+        **dict.fromkeys(("base_position", "object_position"), place),
+        **dict.fromkeys(("base_quaternion", "object_quaternion"), level),
+        **{"object_index": np.zeros(1, int), "stationary": np.zeros(1, bool)},
+        **{"u_velocity": np.zeros((1, 6), np.float32), "q": HAND.q_open[None].astype(np.float32)},
+    }
+    return ResetState(**{**neutral, **fields})
 
 
 def commanded(parameters: Array, observation: Array, key: Array) -> tuple[Array, Array]:
@@ -76,19 +90,20 @@ def placed(tree: Any) -> Any:
     return jax.device_put(tree, jax.local_devices()[0])
 
 
-def programs(probe: Probe = no_probe) -> Programs:
-    """The programs of `worker`."""
+def programs(probe: Probe = no_probe, task: TaskConfig = TASK) -> Programs:
+    """The programs of `worker`, or of those of another task."""
     settings = {"batch": BATCH, "half_precision": True, "probe": probe, "traced": "all", "taught": False}
-    return programs_of(HAND, TASK, NativePhysics, commanded, **settings)
+    return programs_of(HAND, task, NativePhysics, commanded, **settings)
 
 
-def episodes(count: int, episode_bank: ConstraintBank | None = None) -> InitialConditions:
+def episodes(count: int, episode_bank: ConstraintBank | None = None, task: TaskConfig = TASK) -> InitialConditions:
     """Initial conditions of many episodes of the suite's task, by the program that draws those of `worker`.
 
     Args:
       count: number of episodes, rounded up to a multiple of `BATCH`.
       episode_bank: a bank with the shapes of that of the suite; by default, that.
+      task: another task, which costs another program.
     """
     given, keys = placed((episode_bank or bank(), jax.random.split(jax.random.key(3), -(-count // BATCH))))
-    drawn = [jax.device_get(programs().sample(given, key, np.array(False))) for key in keys]
+    drawn = [jax.device_get(programs(task=task).sample(given, key, np.array(False))) for key in keys]
     return jax.tree.map(lambda *rows: np.concatenate(rows), *drawn)

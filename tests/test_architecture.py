@@ -1,11 +1,15 @@
-"""Rooms know only those below them, and no module needs itself to be imported."""
+"""The source: layers, sizes of modules, the one module that unpickles, and plain engineering English in its texts."""
 
 import ast
+import functools
 import io
 import itertools
 import pathlib
+import re
 import tokenize
 from collections.abc import Iterator, Sequence
+
+import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 FOLDERS = ("common", "actors", "learner", "services")
@@ -25,14 +29,20 @@ def imported(body: Sequence[ast.stmt]) -> Iterator[str]:
             yield from imported(node.body)
 
 
+@functools.cache
+def trees(*folders: str) -> dict[pathlib.Path, ast.Module]:
+    """Syntax trees of all modules in some folders."""
+    return {path: ast.parse(path.read_text()) for folder in folders for path in (ROOT / folder).rglob("*.py")}
+
+
+@functools.cache
 def graph(everything: bool) -> dict[str, set[str]]:
-    """Modules by those that they import: at once, or `everything` that stands anywhere in them."""
-    paths = {path: ".".join(("congrasp", *path.relative_to(ROOT).with_suffix("").parts)) for f in FOLDERS
-             for path in (ROOT / f).rglob("*.py")}  # fmt: skip
+    """Modules by those that they import: at once, or `everything` that is anywhere in them."""
+    paths = {path: ".".join(("congrasp", *path.relative_to(ROOT).with_suffix("").parts)) for path in trees(*FOLDERS)}
     names = {name.removesuffix(".__init__") for name in paths.values()}
     found = {}
     for path, name in paths.items():
-        tree = ast.parse(path.read_text())
+        tree = trees(*FOLDERS)[path]
         body = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)] if everything else tree.body
         targets = (t if t in names else t.rpartition(".")[0] for t in imported(body))
         found[name.removesuffix(".__init__")] = {target for target in targets if target in names}
@@ -42,8 +52,8 @@ def graph(everything: bool) -> dict[str, set[str]]:
 def test_every_import_of_ours_exists():
     """Those in functions, too, which nothing finds before they run; mypy takes what it does not find for granted."""
     names = graph(everything=False).keys() | {"congrasp"}
-    for path in (path for folder in (*FOLDERS, "tests", "examples") for path in (ROOT / folder).rglob("*.py")):
-        body = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.stmt)]
+    for path, tree in {**trees(*FOLDERS), **trees("tests", "examples")}.items():
+        body = [node for node in ast.walk(tree) if isinstance(node, ast.stmt)]
         ours = [target for target in imported(body) if target.startswith("congrasp")]
         assert not [t for t in ours if t not in names and t.rpartition(".")[0] not in names], path
 
@@ -86,10 +96,9 @@ def lines_of_code(text: str, tree: ast.AST) -> int:
 def test_modules_and_functions_are_short():
     """A module has at most 400 lines of code; a function's body, without its docstring, at most 60 lines."""
     long = []
-    for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
+    for path, tree in trees(*FOLDERS).items():
         text = path.read_text()
-        tree = ast.parse(text)
-        if lines_of_code(text, tree) > 400:
+        if text.count("\n") > 400 and lines_of_code(text, tree) > 400:
             long.append(f"{path}: {lines_of_code(text, tree)} lines of code")
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -97,3 +106,52 @@ def test_modules_and_functions_are_short():
                 if body and (node.end_lineno or 0) - body[0].lineno >= 60:
                     long.append(f"{path}:{node.lineno}: {node.name}")
     assert not long
+
+
+RUNS_DATA = re.compile(
+    r"^\s*(from|import)\s+(pickle|cPickle|dill|cloudpickle|joblib|marshal|shelve|torch)\b|allow_pickle=True|\beval\(",
+    re.MULTILINE,
+)
+
+
+def test_one_module_imports_what_can_run_code_out_of_data():
+    """The child process with an allow-list."""
+    found = [str(path.relative_to(ROOT)) for path in trees(*FOLDERS) if RUNS_DATA.search(path.read_text())]
+    assert found == ["common/io/unpickle.py"]
+
+
+OPENINGS = re.compile(r"(What|Whether|How|Who|Whoever|That|Where|When|Which|If|So)\b")
+BANNED = re.compile(
+    r"\b(anew|nobody|somebody|mend|mends|mended|goes on|go on|put off|puts off|out of all reason|without a word|"
+    r"turned away|let in|what becomes of|told about|whoever|is told|as it likes|broken surrounding)\b",
+    re.IGNORECASE,
+)
+
+
+def texts(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and text of every string of several words: docstrings, messages and help."""
+    for found in ast.walk(tree):
+        if isinstance(found, ast.Constant) and isinstance(found.value, str) and " " in found.value:
+            yield found.lineno, " ".join(found.value.split())
+
+
+def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Line and text of the docstrings of a module, its classes and functions, and of the strings under fields."""
+    for found in ast.walk(tree):
+        if isinstance(found, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            for statement in found.body:
+                if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
+                    yield statement.lineno, str(statement.value.value).strip()
+
+
+def test_the_rules_find_what_they_ban():
+    tree = ast.parse('"""Whether it is mended."""\nx = 1\n"""What x is."""\nraise ValueError("nobody came")\n')
+    assert [line for line, text in docstrings(tree) if OPENINGS.match(text)] == [1, 3]
+    assert [line for line, text in texts(tree) if BANNED.search(text)] == [1, 4]
+
+
+@pytest.mark.parametrize(("read", "wrong"), [(docstrings, OPENINGS.match), (texts, BANNED.search)])
+def test_docstrings_open_plainly_and_no_banned_word_is_used(read, wrong):
+    modules = trees(*FOLDERS).items()
+    found = [f"{path}:{line}: {text[:100]}" for path, tree in modules for line, text in read(tree) if wrong(text)]
+    assert not found, "\n".join(found)

@@ -32,6 +32,7 @@ _COPLANAR = 0.15
 _SMALL = 1e-9
 
 
+@jax.jit
 def estimated_normals(points: Array, eye: Array | None = None) -> Array:
     """Outward unit normals (B, N, 3) of clouds (B, N, 3).
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from congrasp.actors.harvest import Grasps, renew
-from congrasp.actors.physics.engine import where_environments
 from congrasp.actors.process.own_references import save_references, with_kept_references
 from congrasp.common import rotations as module
 from congrasp.common.errors import CongraspError
@@ -65,17 +64,6 @@ def test_normals_belong_to_the_points_of_their_object(bank):
     assert surface_of(TASK, bank, drawn).normals is None
     surface = surface_of(dataclasses.replace(TASK, surface_normals=True), bank, drawn)
     np.testing.assert_array_equal(surface.normals, np.asarray(bank.normals)[[1, 0]])
-
-
-def test_references_below_the_table_are_not_valid():
-    """One pose from above, one from below; the object lies as it is, or upside down."""
-    positions = jnp.array([[0.0, 0.0, 0.15], [0.0, 0.0, -0.15]])
-    poses = Poses(jnp.zeros((2, F)), positions, jnp.stack([_pointing(-1.0), _pointing(1.0)]))
-    upright, upside_down = [0, 0, 0.05, 1, 0, 0, 0], [0, 0, 0.05, 0, 1, 0, 0]
-    rest = jnp.array([[upright, upside_down]] * 2, jnp.float32)
-    path, turns, valid = references(HAND, poses, rest, jax.random.key(0), TASK.trajectory_points)
-    assert path.shape == (2, TASK.trajectory_points, 3) and turns.shape == (2, TASK.trajectory_points, 4)
-    np.testing.assert_array_equal(valid, [[True, False], [False, True]])
 
 
 def test_references_with_fingers_in_the_table_are_not_valid():
@@ -163,14 +151,6 @@ def test_own_references_are_of_all_ages_of_the_policy(bank):
         now = renew(HAND, TASK, now, grasps, jax.random.key(age))
     ages = np.asarray(now.pose_q)[1, 1, : POSES // 2, 0] * 100
     assert np.ptp(ages) > 24 and 1 <= (ages < 32).sum() <= 9
-
-
-def test_only_masked_environments_are_exchanged():
-    mask = jnp.array([True, False])
-    new, old = {"a": jnp.ones((2, 3)), "b": jnp.array([True, True])}, {"a": jnp.zeros((2, 3)), "b": jnp.zeros(2, bool)}
-    merged = where_environments(mask, new, old)
-    np.testing.assert_array_equal(merged["a"], [[1, 1, 1], [0, 0, 0]])
-    np.testing.assert_array_equal(merged["b"], [True, False])
 
 
 def test_references_of_the_policy_outlive_a_restart(bank, tmp_path):

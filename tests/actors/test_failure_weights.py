@@ -42,10 +42,3 @@ def test_weights_stay_within_a_factor_of_four_and_follow_uncertainty(episodes):
     found.add(index, success)
     weights = found.weights
     assert weights.min() >= 0.5 and weights.max() <= 2.0
-
-
-def test_what_succeeds_half_the_time_is_drawn_more_than_what_always_does_or_never():
-    found = FailureWeights(np.ones(3), ["a", "a", "a"])
-    found.add(np.repeat([0, 1, 2], 40), np.concatenate([np.zeros(40), np.tile([0.0, 1.0], 20), np.ones(40)]))
-    never, half, always = found.weights
-    assert half > 2 * max(never, always)

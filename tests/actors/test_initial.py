@@ -23,9 +23,9 @@ from congrasp.common.task.metrics import errors
 from congrasp.common.task.reward import reward_terms
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.types import Goal, Surface
-from tests.scenes import HAND, F, K, quaternions, scene, units
+from tests.scenes import F, K, quaternions, scene, units
+from tests.task import HAND, TASK
 
-TASK = TaskConfig(p_affordance=0.5, p_pose=0.5, p_trajectory=0.5)
 BATCH, M = 2000, 6
 
 
@@ -151,14 +151,10 @@ def test_a_share_of_the_affordances_gets_a_trajectory_as_well(share):
     assert not (before["trajectory"] & ~active["trajectory"]).any()
 
 
-def test_no_object_gets_a_trajectory_that_its_affordance_excludes():
-    active, _, _ = _drawn(TASK, (0, 1, 2), together=1.0)
+@pytest.mark.parametrize("together", [0.0, 1.0])
+def test_where_no_trajectory_agrees_with_the_affordance_none_is_drawn(together):
+    active, pose, trajectory = _drawn(TASK, (0, 1, 2), together=together)
     assert not (active["trajectory"] & active["region"]).any() and active["affordance"].any()
-
-
-def test_where_no_trajectory_agrees_with_the_affordance_none_is_drawn():
-    active, pose, trajectory = _drawn(TASK, (0, 1, 2))
-    assert not (active["trajectory"] & active["region"]).any()
     assert set(pose[active["pose_finger"] & active["region"]]) == {0, 1, 2}
     assert set(trajectory[active["trajectory"]]) == {0, 1, 2}
 

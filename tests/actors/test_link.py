@@ -22,7 +22,7 @@ class Learner:
     """Answers as told, and remembers what it was asked."""
 
     def __init__(self, hub, *, run_id="e", session_id="1"):
-        self.transport = MemoryTransport(hub)
+        self.hub, self.transport = hub, MemoryTransport(hub)
         self.state = {"version": 0, "run_id": run_id, "session_id": session_id, "finished": False}
         self.granted = True
         self.outcomes = []  # what rollouts are told, the last one for ever
@@ -82,6 +82,19 @@ def ends():
         transport.close()
 
 
+@pytest.fixture
+def joined(ends):
+    """A function that makes a learner and a link that has its configuration."""
+    hub, make = ends
+
+    def join(**options):
+        learner, link = Learner(hub), make(**options)
+        link.config(60)
+        return learner, link
+
+    return join
+
+
 def rollout(value=0.0):
     return Message({"reward": np.full(3, value)}, {"version": 0, "schema": "s", "steps": 3})
 
@@ -103,19 +116,16 @@ def test_identity_is_added_and_counts(ends):
     link.config(60)
     for n in range(3):
         assert link.upload(rollout(n), Ticket(f"t{n}", 0)).result(60) == "accepted"
-    other = make()
-    assert other.incarnation != link.incarnation
+    assert make().incarnation != link.incarnation
     for n, message in enumerate(learner.received):
         assert message.arrays["reward"][0] == n
         expected = {"actor": "a", "incarnation": link.incarnation, "sequence": n, "run_id": "e", "ticket": f"t{n}"}
         assert message.meta == {"version": 0, "schema": "s", "steps": 3, **expected}
 
 
-def test_tickets_are_waited_for_and_asked_for_under_one_id(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make()
+def test_tickets_are_waited_for_and_asked_for_under_one_id(joined):
+    learner, link = joined()
     learner.granted = False
-    link.config(60)
     assert link.acquire_ticket(0.2) is None
     assert len(learner.tickets) >= 2
     learner.granted = True
@@ -129,11 +139,9 @@ def test_tickets_are_waited_for_and_asked_for_under_one_id(ends):
     }  # fmt: skip
 
 
-def test_an_announcement_ends_the_wait_for_a_ticket(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make()
+def test_an_announcement_ends_the_wait_for_a_ticket(joined):
+    learner, link = joined()
     learner.reply = lambda **meta: Message(meta={**learner.state, "retry_after": 20.0, **meta})
-    link.config(60)
     learner.granted = False
 
     def move_on():
@@ -144,10 +152,8 @@ def test_an_announcement_ends_the_wait_for_a_ticket(ends):
     assert link.acquire_ticket(15).version == 1
 
 
-def test_weights_are_pulled_only_when_there_are_others(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make()
-    link.config(60)
+def test_weights_are_pulled_only_when_there_are_others(joined):
+    learner, link = joined()
     assert link.weights(-1).meta["version"] == 0
     for _ in range(5):
         assert link.weights(0) is None
@@ -166,20 +172,16 @@ def test_weights_are_pulled_only_when_there_are_others(ends):
     assert link.weights(1) is None
 
 
-def test_rollout_is_sent_under_one_identity_until_it_is_answered(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make()
-    link.config(60)
+def test_rollout_is_sent_under_one_identity_until_it_is_answered(joined):
+    learner, link = joined()
     learner.outcomes = ["retry", RuntimeError("bug"), "retry", "duplicate"]
     assert link.upload(rollout(), TICKET).result(60) == "duplicate"
     assert len({id(message) for message in learner.received}) == 1 and len(learner.received) == 4
 
 
 @pytest.mark.parametrize("by", ["ticket", "weights", "announcement"])
-def test_another_training_is_noticed_by_every_way(ends, by):
-    hub, make = ends
-    learner, link = Learner(hub), make()
-    link.config(60)
+def test_another_training_is_noticed_by_every_way(joined, by):
+    learner, link = joined()
     if by == "announcement":
         learner.announce(run_id="f")
     learner.state["run_id"] = "f"
@@ -187,19 +189,15 @@ def test_another_training_is_noticed_by_every_way(ends, by):
         link.acquire_ticket(1) if by == "ticket" else link.weights(-1)
 
 
-def test_finished_run_is_told_to_the_caller(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make()
-    link.config(60)
+def test_finished_run_is_told_to_the_caller(joined):
+    learner, link = joined()
     learner.state["finished"] = True
     with pytest.raises(RunFinished):
         link.acquire_ticket(60)
 
 
-def test_uploads_overlap_with_the_caller_up_to_the_window(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make(window=2)
-    link.config(60)
+def test_uploads_overlap_with_the_caller_up_to_the_window(joined):
+    learner, link = joined(window=2)
     gate = threading.Event()
     learner.outcomes = [lambda: gate.wait(10) and "accepted"]
     outcomes = [link.upload(rollout(n), TICKET) for n in range(2)]  # both return at once
@@ -214,10 +212,8 @@ def test_uploads_overlap_with_the_caller_up_to_the_window(ends):
     assert [outcome.result(0) for outcome in outcomes] == ["accepted"] * 3
 
 
-def test_refusals_in_a_row_stop_the_actor_with_a_reason(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make(max_refusals=3)
-    link.config(60)
+def test_refusals_in_a_row_stop_the_actor_with_a_reason(joined):
+    learner, link = joined(max_refusals=3)
     learner.outcomes = ["refused", "refused", "stale", "refused", "refused", "refused"]
     assert [link.upload(rollout(), TICKET).result(60) for _ in range(6)][2:4] == ["stale", "refused"]
     for use in (lambda: link.upload(rollout(), TICKET), lambda: link.acquire_ticket(1), lambda: link.weights(0)):
@@ -226,10 +222,8 @@ def test_refusals_in_a_row_stop_the_actor_with_a_reason(ends):
     assert len(learner.received) == 6
 
 
-def test_message_that_always_arrives_damaged_is_not_sent_for_ever(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make(max_refusals=2)
-    link.config(60)
+def test_message_that_always_arrives_damaged_is_not_sent_for_ever(joined):
+    learner, link = joined(max_refusals=2)
     learner.outcomes = [CongraspError("The message's data do not match their checksum.")]
     assert link.upload(rollout(), TICKET).result(60) == "refused"
     assert len(learner.received) == 2
@@ -238,10 +232,8 @@ def test_message_that_always_arrives_damaged_is_not_sent_for_ever(ends):
         link.upload(rollout(), TICKET)
 
 
-def test_silent_learner_is_given_up(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make(patience=0.3)
-    link.config(60)
+def test_silent_learner_is_given_up(joined):
+    learner, link = joined(patience=0.3)
     learner.transport.close()
     with pytest.raises(TransportError, match=r"not answered for 0\.3 s"):
         link.upload(rollout(), TICKET).result(60)
@@ -249,25 +241,21 @@ def test_silent_learner_is_given_up(ends):
         link.acquire_ticket(60)
 
 
-def test_one_line_is_logged_while_a_learner_does_not_answer(ends, monkeypatch, caplog):
+def test_one_line_is_logged_while_a_learner_does_not_answer(joined, monkeypatch, caplog):
     monkeypatch.setattr(uploads, "_NOTICED", 0.2)
-    hub, make = ends
-    learner, link = Learner(hub), make(patience=20.0)
-    link.config(60)
+    learner, link = joined(patience=20.0)
     learner.transport.close()
     outcome = link.upload(rollout(), TICKET)
     for _ in range(3):
         assert link.acquire_ticket(0.3) is None
-    Learner(hub, session_id="2")
+    Learner(learner.hub, session_id="2")
     assert outcome.result(60) == "accepted" and link.acquire_ticket(60)
     (line,) = (record.getMessage() for record in caplog.records)
     assert line.startswith("The learner does not answer; waiting for up to 20 s: No response for ")
 
 
-def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(ends, monkeypatch):
-    hub, make = ends
-    learner, link = Learner(hub), make(patience=5.0)
-    link.config(60)
+def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(joined, monkeypatch):
+    learner, link = joined(patience=5.0)
     learner.transport.close()
     outcome = link.upload(rollout(), TICKET)
     assert link.acquire_ticket(0.2) is None
@@ -275,14 +263,12 @@ def test_actor_that_was_frozen_does_not_take_that_for_the_learners_silence(ends,
     monkeypatch.setattr(time, "monotonic", lambda: running() + 60.0)  # what a process sees that was stopped
     assert link.acquire_ticket(0.2) is None
     assert not outcome.done()
-    Learner(hub, session_id="2")
+    Learner(learner.hub, session_id="2")
     assert outcome.result(60) == "accepted" and link.acquire_ticket(60)
 
 
-def test_learner_that_talks_nonsense_ends_the_link(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make()
-    link.config(60)
+def test_learner_that_talks_nonsense_ends_the_link(joined):
+    learner, link = joined()
     learner.reply = lambda **meta: Message(meta={"hello": 1})
     with pytest.raises(CongraspError, match="is not valid"):
         link.upload(rollout(), TICKET).result(60)
@@ -290,10 +276,8 @@ def test_learner_that_talks_nonsense_ends_the_link(ends):
         link.acquire_ticket(1)
 
 
-def test_closing_gives_up_what_is_on_its_way(ends):
-    hub, make = ends
-    learner, link = Learner(hub), make()
-    link.config(60)
+def test_closing_gives_up_what_is_on_its_way(joined):
+    learner, link = joined()
     learner.outcomes = ["retry"]
     outcome = link.upload(rollout(), TICKET)
     link.close()

@@ -68,15 +68,6 @@ def test_the_true_pose_changes_neither_observation_nor_targets(running):
         assert np.abs(changed - before).max() > least
 
 
-def test_normals_of_the_cloud_point_toward_the_camera(running):
-    worker, _ = running
-    camera = worker.state.camera
-    points, normals = np.asarray(camera.cloud.points), np.asarray(camera.cloud.normals)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0, atol=1e-5)
-    eye = np.asarray(camera.origin + camera.sensors.eye)[:, None]
-    assert (np.sum(normals * (eye - points), -1) >= 0).all()
-
-
 def test_the_cloud_is_the_object_s_surface_as_of_the_last_image(running):
     worker, rollout = running
     state, trace = worker.state, rollout.trace

@@ -24,9 +24,9 @@ from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.transport.ports import free_port
 from tests.actors.test_physics import HAND, TASK, above, grasp, one_each, servoed
+from tests.conftest import ROOT
 from tests.solids import mujoco_mass_properties
 
-ROOT = pathlib.Path(__file__).parents[2]
 OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "bowl", "mug", "ring"])]
 OTHERS = [procedural.generate(i, family) for i, family in enumerate(["ring", "cylinder", "bowl", "bowl", "box"], 7)]
 
@@ -246,13 +246,13 @@ def test_meshes_are_absent_from_an_environment_alone_too(start):
     """An unused mesh slot in the middle of a sheet would touch the table."""
     sheet = dataclasses.replace(OBJECTS[0], pieces=(Piece("box", (0.04, 0.04, 0.0003)),))
     warp = WarpPhysics(HAND, TASK, [sheet])
-    occupancy = []
+    step, occupancy = jax.jit(warp.step), []
     for batch in (1, 2):
         flat = _picked(start, [0] * batch)._replace(
             object_position=jnp.tile(jnp.array([0.0, 0.0, 0.0003]), (batch, 1)),
             object_quaternion=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (batch, 1)),
         )
-        _, after = warp.step(warp.start(flat), jnp.asarray(grasp(flat, 0)), jnp.ones(batch, bool))
+        _, after = step(warp.start(flat), jnp.asarray(grasp(flat, 0)), jnp.ones(batch, bool))
         occupancy.append(after.occupancy)
     np.testing.assert_array_equal(*occupancy)
 

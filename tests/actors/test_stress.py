@@ -90,18 +90,17 @@ def test_pushes_follow_one_another_along_the_axes_of_the_world():
 
 @functools.cache
 def start():
-    """Objects at rest and headings alone, with the hand far above and not quite aligned."""
-    fresh = suite.episodes(BATCH)
+    """Objects at rest under headings alone, with the hand far above them and turned away from the heading by up to 40
+    degrees: so little that its wrist has come to it, and lags behind by the servos' acceleration alone, when it is
+    lifted."""
+    drawn = suite.episodes(8 * BATCH)
+    headed = np.flatnonzero(~(drawn.goal.active["pose_finger"] | drawn.goal.active["trajectory"]))[:BATCH]
+    fresh = jax.tree.map(lambda rows: rows[headed], drawn)
     goal = dataclasses.replace(fresh.goal, active=jax.tree.map(np.zeros_like, fresh.goal.active))
-    index = np.arange(BATCH) % len(OBJECTS)
-    rest = np.array([OBJECTS[i].rest_poses[0] for i in index], np.float32)
     aligned = Rotation.from_quat(fresh.reset_state.base_quaternion, scalar_first=True)
     turns = aligned * Rotation.from_euler("x", np.linspace(-40, 40, BATCH)[:, None], degrees=True)
     state = fresh.reset_state._replace(
-        object_index=index.astype(np.int32),
-        object_position=rest[:, :3],
-        object_quaternion=rest[:, 3:],
-        base_position=rest[:, :3] + np.float32([0.0, 0.0, 0.4]),
+        base_position=fresh.reset_state.object_position + np.float32([0.0, 0.0, 0.4]),
         base_quaternion=turns.as_quat(scalar_first=True).astype(np.float32),
         u_velocity=np.zeros((BATCH, 6), np.float32),
         q=np.tile(HAND.q_open, (BATCH, 1)).astype(np.float32),
@@ -144,6 +143,7 @@ def test_native_pushes_with_a_force_and_forgets_it_at_a_reset():
     physics.close()
 
 
+@pytest.mark.slow
 def test_mjx_gets_the_same_force(monkeypatch):
     """What MJX makes of `xfrc_applied` is MuJoCo's; compiling it takes over a minute."""
     monkeypatch.setattr("congrasp.actors.physics.mjx.mjx.step", lambda model, data: data)
@@ -204,7 +204,7 @@ def test_a_lift_is_unseen_by_the_policy_and_takes_the_wrist_along():
         released(protocol(start=begin)._replace(push_start=np.float32(NEVER)), 215) for begin in (NEVER, 145)
     )
     # The policy sees the same within half a millimetre: targets are held for a control step each.
-    for name, size, tolerance in (("wrist_position", 3, 5e-4), ("u", 3, 1e-3), ("u", 6, 5e-3), ("u_velocity", 3, 0.01)):
+    for name, size, tolerance in (("wrist_position", 3, 5e-4), ("u", 6, 5e-4), ("u_velocity", 3, 0.01)):
         shown = (getattr(rollout.probed, name)[..., :size] for rollout in (moving, still))
         np.testing.assert_allclose(*shown, atol=tolerance, err_msg=name)
     height = np.zeros(215)
@@ -282,6 +282,7 @@ def test_survival_is_within_5_cm_and_15_degrees(moves, survived):
     assert not any(lost[name][0] for name in protocols.SURVIVAL)
 
 
+@pytest.mark.slow
 def test_attempts_with_a_lift_end_higher_in_the_world():
     """They have programs of their own: a lift off the table, and the policy of a bundle."""
     obj, count, hold = OBJECTS[1], TASK.surface_points, TASK.hold_steps

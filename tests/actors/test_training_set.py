@@ -17,28 +17,47 @@ from congrasp.common.hands.outline import outline
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.sampling import kept
 from congrasp.common.task.sampling.bank import rows_of, stacked
 from congrasp.common.task.sampling.build import headings_of
 from congrasp.common.task.sampling.sets import load, load_for
 from congrasp.common.task.sampling.write_sets import make_sets, save
+from congrasp.common.wire.codec import Message
 from tests import task as suite
+from tests.task import HAND, OBJECTS, TASK
 
-HAND = get_hand("human")
-OBJECTS = [procedural.generate(7, "mug"), procedural.generate(0, "box")]
+FAMILIES = tuple(obj.family for obj in OBJECTS)
+BOX, _, MUG, _ = OBJECTS
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _banks_are_built_once(tmp_path_factory):
+    """Also those of pools as small as these."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr(kept, "LEAST_OBJECTS", 1)
+        yield
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    """A folder of two objects, and one of the constraint set of the first."""
-    objects, sets = tmp_path_factory.mktemp("objects"), tmp_path_factory.mktemp("sets")
+def sets():
+    """Constraint sets of the suite's objects."""
+    return dict(zip((obj.name for obj in OBJECTS), make_sets(HAND, TASK, OBJECTS, 5, suite.bank()), strict=True))
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory, sets):
+    """A folder of the suite's objects, and one of the mug's constraint set."""
+    folder, constraints = tmp_path_factory.mktemp("objects"), tmp_path_factory.mktemp("sets")
     for obj in OBJECTS:
-        Catalogue(objects).add(obj)
-    save(make_sets(HAND, TaskConfig(), OBJECTS[:1], 5)[0], sets)
-    return str(objects), str(sets)
+        Catalogue(folder).add(obj)
+    save(sets[MUG.name], constraints)
+    return str(folder), str(constraints)
 
 
 def _run(**objects) -> RunConfig:
-    return RunConfig(objects=ObjectsConfig(count=2, **objects))
+    """Pools of the suite's size, whose references are made by its program."""
+    return RunConfig(objects=ObjectsConfig(count=len(OBJECTS), families=FAMILIES, **objects))
 
 
 @pytest.fixture(scope="module")
@@ -48,56 +67,63 @@ def scanned(folders):
 
 
 def test_a_folder_replaces_procedural_objects_or_is_mixed_with_them(folders, scanned):
-    names = [obj.name for obj in training_set(HAND, _run(), 0).objects]
-    assert names == [obj.name for obj in procedural.generate_many(2, 0)]
-    assert [obj.name for obj in scanned.objects] == ["box_0", "mug_7"]
-    mixed = training_set(HAND, _run(folder=folders[0], procedural=2, folder_share=0.75), 0)
-    assert len(mixed.objects) == 4 and len(mixed.bank.points) == 4
-    np.testing.assert_allclose(mixed.bank.weight, [0.375] * 2 + [0.125] * 2)
+    made = training_set(HAND, _run(), 0)
+    assert [obj.name for obj in made.objects] == [obj.name for obj in OBJECTS]
+    jax.tree.map(np.testing.assert_array_equal, made.bank, suite.bank())
+    assert [obj.name for obj in scanned.objects] == sorted(obj.name for obj in OBJECTS)
+    mixed = training_set(HAND, _run(folder=folders[0], procedural=4, folder_share=0.75), 0)
+    assert len(mixed.objects) == 8 and len(mixed.bank.points) == 8
+    np.testing.assert_allclose(mixed.bank.weight, [0.75 / 4] * 4 + [0.25 / 4] * 4)
 
 
 def test_constraint_sets_keep_their_split_and_their_references(folders):
     """Grasps of the policy in training replace references of its procedural objects, never captured ones."""
-    objects, sets = folders
-    found = training_set(HAND, _run(folder=objects, constraints=sets, procedural=1), 0)
-    assert found.objects[0].name == "mug_7" and len(found.objects) == 2
-    assert np.asarray(found.bank.renewable).tolist() == [False, True]
+    objects, constraints = folders
+    mixed = training_set(HAND, _run(folder=objects, constraints=constraints, procedural=4), 0)
+    assert mixed.objects[0].name == MUG.name and len(mixed.objects) == 5
+    assert np.asarray(mixed.bank.renewable).tolist() == [False, True, True, True, True]
     apart = [
-        np.asarray(training_set(HAND, _run(folder=objects, constraints=sets, split=split), 0).bank.pose_valid)
+        np.asarray(training_set(HAND, _run(folder=objects, constraints=constraints, split=split), 0).bank.pose_valid)
         for split in ("training", "held-out", "all")
     ]
     assert not (apart[0] & apart[1]).any() and np.array_equal(apart[0] | apart[1], apart[2])
     index = np.array([0, 1], np.int32)
-    poses = np.asarray(found.bank.pose_q)[:, 0, 0], np.asarray(found.bank.pose_position)[:, 0, 0]
-    grasps = Grasps(
-        np.ones(2, bool), index, 0 * index, poses[0] + 0.01, poses[1], np.asarray(found.bank.pose_quaternion)[:, 0, 0]
+    q, position, quaternion = (
+        np.asarray(getattr(mixed.bank, f"pose_{name}"))[:2, 0, 0] for name in ("q", "position", "quaternion")
     )
+    grasps = Grasps(np.ones(2, bool), index, 0 * index, q + 0.01, position, quaternion)
     for _ in range(4):  # a random place each time
-        renewed = harvest.renew(HAND, TaskConfig(), found.bank, grasps, jax.random.key(0))
-        np.testing.assert_array_equal(renewed.pose_q[0], found.bank.pose_q[0])
+        renewed = harvest.renew(HAND, TASK, mixed.bank, grasps, jax.random.key(0))
+        np.testing.assert_array_equal(renewed.pose_q[0], mixed.bank.pose_q[0])
 
 
-def test_an_object_without_a_heading_of_the_split_is_left_out(tmp_path):
-    for obj, made in zip(OBJECTS, make_sets(HAND, TaskConfig(), OBJECTS, 5), strict=True):
-        if obj is OBJECTS[0]:
-            made.arrays["heading/allowed"] &= made.arrays["heading/training"][:, None]
-        save(made, tmp_path)
-    kept = {split: [obj.name for obj in load_for(tmp_path, OBJECTS, split)[0]] for split in get_args(Split)}
-    every = [obj.name for obj in OBJECTS]
-    assert kept == {"all": every, "training": every, "held-out": every[1:]}
+def test_an_object_without_a_heading_of_the_split_is_left_out(tmp_path, sets):
+    mug = sets[MUG.name].arrays
+    allowed = mug["heading/allowed"] & mug["heading/training"][:, None]
+    save(Message({**mug, "heading/allowed": allowed}, sets[MUG.name].meta), tmp_path)
+    save(sets[BOX.name], tmp_path)
+    left = {split: [obj.name for obj in load_for(tmp_path, [MUG, BOX], split)[0]] for split in get_args(Split)}
+    every = [MUG.name, BOX.name]
+    assert left == {"all": every, "training": every, "held-out": every[1:]}
 
 
-def test_sets_without_normals_get_estimated_ones(tmp_path):
+def test_sets_without_normals_get_estimated_ones(tmp_path, sets):
     """As of versions whose sets have none; most are near those of the mesh."""
-    (made,) = make_sets(HAND, TaskConfig(), OBJECTS[1:], 5)
-    exact = made.arrays.pop("surface/normals")
-    normals = load(save(made, tmp_path)).arrays["surface/normals"]
+    arrays = dict(sets[BOX.name].arrays)
+    exact = arrays.pop("surface/normals")
+    normals = load(save(Message(arrays, sets[BOX.name].meta), tmp_path)).arrays["surface/normals"]
     assert normals.dtype == np.float32 and np.median(np.sum(normals * exact, -1)) > 0.99
 
 
-@pytest.mark.parametrize("family", procedural.HOUSEHOLD_FAMILIES)
+@pytest.mark.parametrize(
+    "family",
+    [
+        pytest.param(family, marks=[pytest.mark.slow] * (number % 5 > 0))
+        for number, family in enumerate(procedural.HOUSEHOLD_FAMILIES)
+    ],
+)
 def test_household_objects_can_be_approached_and_grasped_by_a_part(family):
-    row = headings_of(TaskConfig(), procedural.generate(1, family), (0, 1), None, 1.0, outline(HAND))
+    row = headings_of(TASK, procedural.generate(1, family), (0, 1), None, 1.0, outline(HAND))
     # Eyeglasses lie so flat that no hand closes on a part of them without the other.
     assert row["has_affordance"].any() == (family != "eyeglasses")
 
@@ -122,7 +148,7 @@ def test_an_object_that_lies_too_flat_is_in_no_episode():
     """A board of 24 x 13 cm, 8 mm thick: fingers find opposite surfaces only above and beneath it."""
     board = procedural.generate(1_000_045, "board")
     assert np.ptp(board.points, axis=0).min() < 0.009
-    row = headings_of(TaskConfig(), board, (0, 1), None, 1.0, outline(HAND))
+    row = headings_of(TASK, board, (0, 1), None, 1.0, outline(HAND))
     assert row["weight"] == 0 and np.isfinite(row["heading_position"]).all()
 
 

@@ -1,34 +1,86 @@
-"""Hostile peers, for benchmarks and tests: `python -m tests.benchmarks.attackers KIND ENDPOINT RUN [FILE]`.
+"""Hostile and slow peers, for benchmarks and tests: `python -m tests.benchmarks.attackers KIND ENDPOINT RUN [FILE]`.
 
-Each does one thing without end, as fast as it can, over plain TCP and with Zenoh's own interface: nothing that the
-project's own peers do to be polite holds it back. It prints a line when it has begun.
+Each attacker does one thing without end, as fast as it can, over plain TCP and with Zenoh's own interface: nothing that
+the project's own peers do to be polite holds it back. It prints a line when it has begun.
 """
 
 import contextlib
 import json
 import pathlib
 import socket
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import zenoh
 from zenoh.handlers import Callback, FifoChannel
 
-from congrasp.common.transport.keys import Keys
-from congrasp.common.transport.ports import shifted
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.keys import FLOWS, Keys
+from congrasp.common.transport.ports import free_port, shifted
 from congrasp.common.wire.codec import Message, encode
 
-_SILENT = 300
-_HUGE = 60 << 20
+_SILENT = 300  # connections
+_HUGE = 60 << 20  # bytes
 _PULLS = 83.0  # a second
 _FOREVER = 3600.0
-_BURST = 0.001  # seconds of processor time
+
+
+@contextlib.contextmanager
+def attacked(kind: str, endpoint: str, run: str, query: pathlib.Path | None = None, count: int = 1) -> Iterator[None]:
+    """Attackers of a kind, in processes of their own, while the block runs."""
+    command = [sys.executable, "-m", "tests.benchmarks.attackers", kind, endpoint, run, str(query or "")]
+    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) for _ in range(count)]
+    try:
+        for process in processes:
+            assert process.stdout is not None
+            if not process.stdout.readline():
+                raise CongraspError(f"The attacker '{kind}' did not start.")
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+@contextlib.contextmanager
+def throttled(endpoint: str, rate: float) -> Iterator[str]:
+    """An endpoint through which another one, with all its flows, is reached at so many bytes a second each way."""
+    port, ended = free_port(), threading.Event()
+
+    def pump(source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError), source, target:
+            while not ended.is_set() and (data := source.recv(int(rate / 50))):
+                target.sendall(data)
+                time.sleep(len(data) / rate)
+
+    def accept(listener: socket.socket, target: tuple[str, int]) -> None:
+        with contextlib.suppress(OSError), listener:
+            while True:
+                near, far = listener.accept()[0], socket.create_connection(target, 5.0)
+                for one in (near, far):
+                    one.settimeout(None)
+                    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 64 << 10)
+                for pair in ((near, far), (far, near)):
+                    threading.Thread(target=pump, args=pair, daemon=True).start()
+
+    listeners = []
+    for index in range(len(FLOWS)):
+        host, _, number = shifted(endpoint, index).partition("/")[2].rpartition(":")
+        listeners.append(socket.create_server(("127.0.0.1", port + index)))
+        threading.Thread(target=accept, args=(listeners[-1], (host, int(number))), daemon=True).start()
+    try:
+        yield f"tcp/127.0.0.1:{port}"
+    finally:
+        ended.set()
+        for listener in listeners:
+            listener.close()
 
 
 def unread(endpoint: str, run: str, query: bytes) -> None:
-    """Asks a policy server and never reads an answer: the thread that should is asleep."""
+    """Sends queries to a policy server and never reads an answer: the thread that should is asleep."""
     stopped: Callback[zenoh.Reply] = Callback(lambda reply: time.sleep(_FOREVER), indirect=False)
     with _session(endpoint, 0) as session:
         print("began", flush=True)
@@ -38,25 +90,25 @@ def unread(endpoint: str, run: str, query: bytes) -> None:
 
 
 def greedy(endpoint: str, run: str, query: bytes) -> None:
-    """Asks a learner for all its weights, 83 times a second, and for every further piece that it is told of."""
+    """Pulls all the weights of a learner 83 times a second, and every further chunk that it announces."""
     request = encode(Message(meta={"newer_than": -1}))
     with _session(endpoint, 1) as session:
         print("began", flush=True)
 
-        def pull(name: str) -> None:
-            key = Keys(run).weights_for("actor", name)
+        def pull() -> None:
+            key = Keys(run).weights_for("actor", "greedy")
             while True:
                 began = time.monotonic()
                 _whole(session, key, request)
                 time.sleep(max(0.0, 8 / _PULLS - (time.monotonic() - began)))
 
         for _ in range(8):
-            threading.Thread(target=pull, args=("greedy",), daemon=True).start()
+            threading.Thread(target=pull, daemon=True).start()
         time.sleep(_FOREVER)
 
 
 def silent(endpoint: str, run: str, query: bytes) -> None:
-    """Opens 300 TCP connections and says nothing; opens one anew for each that is closed."""
+    """Opens 300 TCP connections, sends nothing, and replaces each that is closed."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
 
     def opened() -> socket.socket:
@@ -94,20 +146,7 @@ def huge(endpoint: str, run: str, query: bytes) -> None:
     time.sleep(_FOREVER)
 
 
-def burn(endpoint: str, run: str, query: bytes) -> None:
-    """Harms nobody: takes the share of a processor that the file names, and talks to nobody."""
-    share = float(query)
-    print("began", flush=True)
-    while True:
-        began = time.thread_time()
-        while (spent := time.thread_time() - began) < _BURST:
-            pass
-        time.sleep(spent / share - spent)
-
-
-KINDS: dict[str, Callable[[str, str, bytes], None]] = {
-    "unread": unread, "greedy": greedy, "silent": silent, "huge": huge, "burn": burn,
-}  # fmt: skip
+KINDS: dict[str, Callable[[str, str, bytes], None]] = {kind.__name__: kind for kind in (unread, greedy, silent, huge)}
 
 
 def _session(endpoint: str, flow: int) -> zenoh.Session:
@@ -120,7 +159,7 @@ def _session(endpoint: str, flow: int) -> zenoh.Session:
 
 
 def _whole(session: zenoh.Session, key: str, request: bytes) -> None:
-    """Asks, and for four mebibytes more at a time while there is more to have."""
+    """Sends a query, and requests four mebibytes more at a time while the answer has more."""
     offset, head = 0, b""
     while True:
         attachment = head[:8] + offset.to_bytes(8, "little") + (4 << 20).to_bytes(4, "little") if head else None

@@ -14,6 +14,7 @@ from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool, scale_objects
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import acting
 from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.plan import batches, plan_row
 from congrasp.services.evaluate.protocol import protocol, two_seconds
@@ -59,28 +60,36 @@ class Held(NamedTuple):
     """Share of physics steps whose solver reached its limit."""
 
 
-def bench_creep(policies: tuple[str, ...], objects: int, episodes: int, threads: int) -> None:
-    """Prints creep in two seconds of hold, from a quarter of a second after the table's removal on.
+def creep(
+    policies: tuple[str, ...] = ("human", "sharpa", "allegro"), objects: int = 24, episodes: int = 24, threads: int = 0
+) -> int:
+    """Creep of held objects in mm and degrees, under the old and the new settings of friction and solver.
 
-    Creep is that of episodes that are held under both settings.
+    It is that of two seconds of hold, from a quarter of a second after the table's removal on, in the episodes that are
+    held under both settings.
 
     Args:
-      policies: policy files, or names of pretrained policies.
-      objects: number of procedural objects that no policy was trained with.
-      episodes: least number of episodes of a policy, under the heading alone.
-      threads: threads of the physics.
+      policies: Policy files, or names of pretrained policies.
+      objects: Number of procedural objects that no policy was trained with.
+      episodes: Least number of episodes of a policy, under the heading alone.
+      threads: Threads of the physics; 0 takes all cores.
+
+    Examples:
+      python -m tests.benchmarks creep
+      python -m tests.benchmarks creep --policies human --objects 8 --episodes 8
     """
     columns = ("policy", "impratio, iterations, line search", "held", "creep, mm", "90 %", "degrees", "90 %")
     columns += ("mm in the last second", "90 %", "at limit")
     print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
     for name in policies:
-        found = [_run(name, solver, objects, episodes, threads) for solver in SOLVERS]
+        found = [_run(name, solver, objects, episodes, threads or cores()) for solver in SOLVERS]
         both = found[0].held & found[1].held
         for solver, one in zip(SOLVERS, found, strict=True):
             amounts = [f"{np.quantile(x[both], q):.2f}" for x in (one.moved, one.turned, one.late) for q in (0.5, 0.9)]
             numbers = f"{solver.impratio:g}, {solver.iterations}, {solver.ls_iterations}"
             cells = [name, numbers, f"{one.held.sum()} of {len(both)}", *amounts, f"{100 * one.limited:.2f} %"]
             print(f"| {' | '.join(cells)} |", flush=True)
+    return 0
 
 
 def _run(name: str, solver: Solver, count: int, episodes: int, threads: int) -> Held:
@@ -110,12 +119,12 @@ def _run(name: str, solver: Solver, count: int, episodes: int, threads: int) -> 
     rollout = worker.collect(bundle.inference_parameters, task.approach_steps + hold)
     physics.close()
     held = finished_episodes(rollout, task)["episode/held"] > 0
-    moved, turned = creep(rollout.trace, task.approach_steps + window - 1)
-    late, _ = creep(rollout.trace, task.approach_steps + hold - 1 - round(1.0 / task.control_dt))
+    moved, turned = _creep(rollout.trace, task.approach_steps + window - 1)
+    late, _ = _creep(rollout.trace, task.approach_steps + hold - 1 - round(1.0 / task.control_dt))
     return Held(held, moved, turned, late, float(np.asarray(rollout.occupancy)[:, 2].mean()))
 
 
-def creep(trace: Trace, start: int) -> tuple[np.ndarray, np.ndarray]:
+def _creep(trace: Trace, start: int) -> tuple[np.ndarray, np.ndarray]:
     """Motion of objects in the wrist frame from a step of a trace (T, B, ...) to the last: (B,) mm, (B,) degrees."""
 
     def pose(step: int) -> tuple[np.ndarray, Rotation]:

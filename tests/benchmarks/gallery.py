@@ -84,7 +84,32 @@ SHOWN = (
 )
 
 
-def make_gallery(scans: pathlib.Path, work: pathlib.Path, out: pathlib.Path, attempts: int) -> Iterator[Result]:
+def gallery(
+    scans: pathlib.Path,
+    work: pathlib.Path = pathlib.Path("runs/gallery"),
+    out: pathlib.Path = pathlib.Path("docs/gallery"),
+    attempts: int = 16,
+) -> int:
+    """Grasps of 24 objects as a page with pictures and short films.
+
+    Args:
+      scans: Folder of the scanned objects; the others come with the repository.
+      work: Folder for the grasps; those that are finished in it are drawn again, not made again.
+      out: Folder for page and pictures.
+      attempts: Grasps that are simulated side by side, for each object.
+
+    Examples:
+      python -m tests.benchmarks gallery --scans my-objects
+      python -m tests.benchmarks gallery --scans my-objects --out pictures
+    """
+    results = []
+    for result in _results(scans, work, out, attempts):
+        print(f"{result.name}: {result.line()}", flush=True)
+        results.append(result)
+    return 0 if all(result.held for result in results) else 1
+
+
+def _results(scans: pathlib.Path, work: pathlib.Path, out: pathlib.Path, attempts: int) -> Iterator[Result]:
     """Grasps what is not finished in `work`, and draws pictures, films and the page in `out`; yields each result."""
     graspers: dict[str, Grasper] = {}
     out.mkdir(parents=True, exist_ok=True)

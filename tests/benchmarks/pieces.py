@@ -1,8 +1,8 @@
 """What the number of an object's convex pieces and vertices costs a physics step, and what it gains in shape."""
 
 import dataclasses
+import pathlib
 import time
-from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -16,6 +16,7 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.objects.fidelity import fidelity
+from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.pieces import merge, simplify
 
 _CLOSING = 100
@@ -37,25 +38,33 @@ def coarser(obj: GraspObject, max_pieces: int, max_vertices: int) -> GraspObject
     return dataclasses.replace(obj, pieces=pieces)
 
 
-def bench_pieces(
-    objects: Sequence[GraspObject], hand_name: str, pieces: Sequence[int], vertices: Sequence[int], repeats: int
-) -> None:
-    """Physics steps a second for budgets of pieces and vertices, measured in turns.
+def pieces(
+    objects: pathlib.Path,
+    hand: str = "human",
+    counts: tuple[int, ...] = (8, 16, 32, 48),
+    vertices: tuple[int, ...] = (32, 64),
+    repeats: int = 5,
+) -> int:
+    """What convex pieces and their vertices cost a physics step (MuJoCo C), and what they gain in shape.
 
     Args:
-      objects: of mesh pieces, imported with as many as the largest budget at least.
-      hand_name: the hand that closes around them.
-      pieces: most pieces of an object, the first is what the others are compared with.
-      vertices: most vertices of a piece; each with each number of pieces.
-      repeats: measurements of each; medians count.
+      objects: Folder of objects or meshes; their pieces are joined to fewer for each budget.
+      hand: The hand that closes around them.
+      counts: Most pieces of an object; rates are compared with the first.
+      vertices: Most vertices of a piece.
+      repeats: Measurements of each, in turns; medians are printed.
+
+    Examples:
+      python -m tests.benchmarks pieces --objects my-objects
+      python -m tests.benchmarks pieces --objects my-objects --counts 8 32 --vertices 32
     """
-    hand, task = get_hand(hand_name), TaskConfig(hand=hand_name)
-    budgets = [(p, v) for p in pieces for v in vertices]
-    variants = [[coarser(obj, p, v) for obj in objects] for p, v in budgets]
-    held = [[_closed_around(hand, task, obj) for obj in row] for row in variants]
+    found, task = objects_of(objects), TaskConfig(hand=hand)
+    budgets = [(p, v) for p in counts for v in vertices]
+    variants = [[coarser(obj, p, v) for obj in found] for p, v in budgets]
+    held = [[_closed_around(get_hand(hand), task, obj) for obj in row] for row in variants]
     seconds = np.array([[[_timed(*scene, task) for scene in row] for row in held] for _ in range(repeats)])
-    per_step = np.median(seconds, axis=0).sum(-1) / (len(objects) * _STEPS * task.substeps)
-    table = Table(title=f"{len(objects)} objects, {hand_name} hand, {repeats} repeats")
+    per_step = np.median(seconds, axis=0).sum(-1) / (len(found) * _STEPS * task.substeps)
+    table = Table(title=f"{len(found)} objects, {hand} hand, {repeats} repeats")
     for column in ("pieces", "vertices", "pieces used", "contacts", "surface error", "physics steps/s", "ratio"):
         table.add_column(column, justify="right")
     for i, (p, v) in enumerate(budgets):
@@ -67,6 +76,7 @@ def bench_pieces(
     console = Console()
     console.print(table)
     console.print(_DEFINITION)
+    return 0
 
 
 def _closed_around(hand: Hand, task: TaskConfig, obj: GraspObject) -> tuple[mujoco.MjModel, mujoco.MjData]:

@@ -34,12 +34,18 @@ CONDITIONS = {
 }
 
 
-def bench_sensors(policies: tuple[str, ...], episodes: int) -> None:
-    """Prints a table of grasps held for two seconds without the table, of several policies and conditions.
+def sensors(policies: tuple[str, ...] = ("allegro", "allegro-student"), episodes: int = 24) -> int:
+    """Grasps with all measurements, without contact forces, and without velocities either, in simulated time.
+
+    Counts the objects that are held for two seconds without the table.
 
     Args:
-      policies: policy files, or names of pretrained policies.
-      episodes: number of objects, one episode each.
+      policies: Policy files, or names of pretrained policies.
+      episodes: Number of procedural objects, one episode each.
+
+    Examples:
+      python -m tests.benchmarks sensors
+      python -m tests.benchmarks sensors --policies allegro-student --episodes 4
     """
     loop = example("robot_loop")
     print(f"| policy | {' | '.join(CONDITIONS)} |\n|---|{'---|' * len(CONDITIONS)}")
@@ -55,6 +61,7 @@ def bench_sensors(policies: tuple[str, ...], episodes: int) -> None:
                 for label, condition in CONDITIONS.items():
                     held[label] += _held(robot, policy, condition, task, loop.HOLD_STEPS)
         print(f"| {name} | {' | '.join(f'{n} of {episodes}' for n in held.values())} |", flush=True)
+    return 0
 
 
 def _held(robot: Any, policy: congrasp.Policy, condition: Condition, task: TaskConfig, hold: int) -> bool:

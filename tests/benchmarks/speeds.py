@@ -62,8 +62,22 @@ def profile(motion: GraspMotion) -> Profile:
     return Profile(speed, dt, phases["grasp"], arrival * dt, float(steps[:arrival].sum()), len(peaks))
 
 
-def bench_speeds(grasps: pathlib.Path, out: pathlib.Path, count: int) -> None:
-    """Draws and prints the profiles of the first `count` grasps of the gallery."""
+def speeds(
+    grasps: pathlib.Path = pathlib.Path("runs/gallery"),
+    out: pathlib.Path = pathlib.Path("docs/notes/speeds.png"),
+    count: int = 12,
+) -> int:
+    """Wrist speed of the gallery's grasps over time, with the range of human reaches, as one sheet.
+
+    Args:
+      grasps: Folder of the gallery's grasps.
+      out: The picture.
+      count: Number of grasps, by the order of their names.
+
+    Examples:
+      python -m tests.benchmarks speeds
+      python -m tests.benchmarks speeds --grasps runs/gallery --out speeds.svg
+    """
     files = sorted(grasps.glob(f"*/*/{MOTION}"))[:count]
     if not files:
         raise CongraspError(f"There is no {MOTION} in the folders of {grasps}.", "Run the gallery first.")
@@ -81,6 +95,7 @@ def bench_speeds(grasps: pathlib.Path, out: pathlib.Path, count: int) -> None:
             f"| {name} | {one.way:.2f} m | {one.peak:.2f} m/s | {100 * one.at:.0f} % | {one.peaks} | "
             f"{one.after:.2f} m/s | {one.arrival:.2f} s |"
         )
+    return 0
 
 
 def _draw(axes: Any, name: str, one: Profile) -> None:

@@ -46,8 +46,20 @@ _INTERVAL = 0.25  # seconds between two versions of the weights
 _WEIGHTS_MB = 4.0
 
 
-def bench_transport(senders: int, seconds: float, repeats: int, actors: int, versions: int) -> None:
-    """Prints the throughput of rollouts beside both references, and the delays of weights."""
+def transport(senders: int = 1, seconds: float = 5.0, repeats: int = 3, actors: int = 4, versions: int = 100) -> int:
+    """Rollouts of 8 MB into one learner, bare Zenoh and bare PUSH/PULL (pyzmq); 4 MB of weights to its actors.
+
+    Args:
+      senders: Actor processes that send rollouts.
+      seconds: Length of one measurement.
+      repeats: Measurements of each kind of ingest, alternating; medians are printed.
+      actors: Actor processes that wait for weights.
+      versions: Publications of weights, four a second.
+
+    Examples:
+      python -m tests.benchmarks transport
+      python -m tests.benchmarks transport --senders 4
+    """
     ours, on_disk, queries, bare = measure_ingest(senders, seconds, repeats)
     sockets = "pyzmq is not installed" if math.isnan(bare) else f"{bare:.0f} MB/s, ratio {ours / bare:.2f}"
     print(
@@ -64,6 +76,7 @@ def bench_transport(senders: int, seconds: float, repeats: int, actors: int, ver
         f"weights of {_WEIGHTS_MB:g} MB to {actors} actors: "
         f"p50 {p50:.0f} ms, p99 {p99:.0f} ms, longest {1e3 * delays[-1]:.0f} ms"
     )
+    return 0
 
 
 def measure_ingest(senders: int, seconds: float, repeats: int) -> list[float]:

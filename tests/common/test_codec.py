@@ -202,16 +202,6 @@ def test_every_flipped_bit_is_found():
 
 
 @settings(deadline=None, max_examples=100)
-@given(st.data())
-def test_damaged_bytes_raise_nothing_else(data):
-    damaged = bytearray(WHOLE)
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = data.draw(st.integers(0, len(damaged) - 1))
-        damaged[at : at + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
-    _decode_or_refuse(bytes(damaged))
-
-
-@settings(deadline=None, max_examples=100)
 @given(st.dictionaries(st.sampled_from("xyz"), st.fixed_dictionaries({
     "dtype": st.sampled_from(["F32", "BOOL", "U8", "F64", ""]) | json_values,
     "shape": st.lists(st.integers(-1, 2**70) | st.integers(0, 4), max_size=10) | json_values,

@@ -1,8 +1,10 @@
 """What every constraint must keep to, so that all that is derived from its one file fits together."""
 
 import dataclasses
+import functools
 import itertools
 from collections import Counter
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -13,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.initial import InitialConditions, sample
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
+from congrasp.common.hands import get_hand, kinematics
 from congrasp.common.request import GraspRequest
 from congrasp.common.task import metrics
 from congrasp.common.task.config import RewardWeights, TaskConfig
@@ -28,11 +30,13 @@ from congrasp.common.task.constraints import (
     require_known,
 )
 from congrasp.common.task.constraints.priority import active_blocks
+from congrasp.common.task.control import decode
 from congrasp.common.task.features import scene_of as traced_scene
 from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import GRASP, reward_terms, terms
+from congrasp.common.task.types import Goal
 from tests import task as suite
-from tests.scenes import HAND, active, evaluated, moved, scene, scene_of
+from tests.scenes import HAND, F, active, evaluated, moved, scene, scene_of
 from tests.task import TASK
 
 NAMES = tuple(constraint.name for constraint in CONSTRAINTS)
@@ -66,11 +70,6 @@ def test_blocks_are_as_wide_as_their_fields_say(constraint, whole):
         assert [part.shape[-1] for part in parts] == [field.size for field in described[name]], name
         assert sum(part.shape[-1] for part in parts) == sizes[name]
         assert all(field.name and field.meaning for field in described[name])
-
-
-def test_the_observation_is_as_wide_as_its_layout(whole):
-    assert evaluated(observe, whole).shape == (4, sum(size for _, size in layout(HAND, TASK)))
-    assert dict(layout(HAND, TASK))["mask"] == len(blocks(TASK)) == 6
 
 
 def test_names_are_unique_over_all_constraints():
@@ -188,21 +187,42 @@ def test_what_is_not_known_is_named():
 
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 1000))
-def test_errors_and_rewards_do_not_depend_on_where_the_scene_is(seed):
-    """Turned about the vertical and shifted level, with every constraint active."""
+def test_nothing_depends_on_where_the_scene_is(seed):
+    """With every constraint active; as heights decide on `drop`, rewards allow only level motions."""
     state, surface, goal = scene(seed)
     rng = np.random.default_rng(seed)
+    action = rng.normal(size=(4, F + 6)).astype(np.float32)
     level = moved(state, np.append(rng.normal(size=2), 0.0), Rotation.from_euler("z", rng.uniform(-3, 3)))
-    some, others = (_judged(each, surface, goal) for each in (state, level))
-    for one, other in zip(jax.tree.leaves(some), jax.tree.leaves(others), strict=True):
-        np.testing.assert_allclose(one, other, rtol=2e-3, atol=5e-3)
+    free = moved(state, rng.normal(size=3), Rotation.random(rng=rng))
+    here, turned, anywhere = (_judged(each, surface, goal, action) for each in (state, level, free))
+    jax.tree.map(lambda *values: np.testing.assert_allclose(*values, rtol=2e-3, atol=5e-3), turned[0], here[0])
+    jax.tree.map(lambda *values: np.testing.assert_allclose(*values, atol=2e-3), anywhere[1], here[1])
 
 
 @jax.jit
-def _judged(state, surface, goal):
-    """Observation, reward terms and errors of a scene."""
+def _judged(state, surface, goal, action):
+    """Reward terms of a scene; and its observation, errors and targets."""
     made = traced_scene(HAND, TASK, state, surface, goal)
-    return observe(made), reward_terms(made, RewardWeights()), metrics.errors(made)
+    return reward_terms(made, RewardWeights()), (
+        observe(made),
+        metrics.errors(made),
+        decode(made, TASK.control, action),
+    )
+
+
+def test_a_task_ignores_what_it_does_not_know():
+    """A choice of fingers and a limit of the force: f_max stays a number."""
+    task, (state, surface, goal) = TaskConfig(constraints=PAPER), scene(5)
+    flags = {block: goal.active[block] for name in PAPER for block in get_constraint(name).blocks}
+    known_alone = Goal({name: goal[name] for name in PAPER}, flags)
+    some, more = (scene_of(task, state, surface, each) for each in (known_alone, goal))
+    np.testing.assert_array_equal(some.features.center, kinematics.hand_center(HAND, some.features.keypoints))
+    np.testing.assert_array_equal(evaluated(observe, some), evaluated(observe, more))
+    paid = evaluated(reward_terms, some, task.reward)
+    assert not {"force_over", "fingers_contact"} & {*paid}
+    jax.tree.map(np.testing.assert_array_equal, paid, evaluated(reward_terms, more, task.reward))
+    total = np.linalg.norm(more.features.force, axis=-1)
+    np.testing.assert_allclose(paid["force_excess"], -0.01 * np.clip(total - 5.0, 0, 50).sum(-1), rtol=1e-5)
 
 
 def test_requests_fill_the_arrays_that_they_give():
@@ -217,25 +237,20 @@ def test_requests_fill_the_arrays_that_they_give():
     assert set(goal.flat()) == {f"{c.name}_{name}" for c in CONSTRAINTS for name in c.arrays}
 
 
-TABLE = [
-    dict(zip([c.name for c in OPTIONAL], flags, strict=True)) for flags in itertools.product([False, True], repeat=5)
-]
-
-
-@pytest.mark.parametrize("asked", TABLE, ids=lambda asked: "+".join(name for name in asked if asked[name]) or "heading")
-def test_active_blocks(asked):
+def test_active_blocks():
     """The paper's figure of priorities; the choice of fingers yields to a reference pose as the affordance does."""
-    affordance, pose, trajectory, fingers, force = (asked[c.name] for c in OPTIONAL)
-    found = active_blocks({name: np.full(2, flag) for name, flag in asked.items()})
-    expected = {
-        "affordance": affordance and not pose,
-        "pose_finger": pose,
-        "pose_wrist": pose and not trajectory,
-        "trajectory": trajectory,
-        "fingers": fingers and not pose,
-        "force_limit": force,
-    }
-    assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
+    for flags in itertools.product([False, True], repeat=5):
+        affordance, pose, trajectory, fingers, force = flags
+        found = active_blocks({c.name: np.full(2, flag) for c, flag in zip(OPTIONAL, flags, strict=True)})
+        expected = {
+            "affordance": affordance and not pose,
+            "pose_finger": pose,
+            "pose_wrist": pose and not trajectory,
+            "trajectory": trajectory,
+            "fingers": fingers and not pose,
+            "force_limit": force,
+        }
+        assert {name: flags.tolist() for name, flags in found.items()} == {n: [x, x] for n, x in expected.items()}
 
 
 def _drawn(names: tuple[str, ...], never: str = "") -> InitialConditions:
@@ -248,16 +263,16 @@ def _drawn(names: tuple[str, ...], never: str = "") -> InitialConditions:
     return jax.device_get(sample(HAND, task, suite.bank(), jax.random.key(3), DRAWN))
 
 
-def _same(some: InitialConditions, more: InitialConditions, but: str, moved: np.ndarray | None = None) -> None:
-    """Everything that does not belong to one constraint is the same, but for places of the hand that moved (B,)."""
-    if moved is not None:
-        position = np.where(moved[:, None], some.goal["heading"].position, more.goal["heading"].position)
-        base = np.where(moved[:, None], some.reset_state.base_position, more.reset_state.base_position)
-        q = np.where(moved[:, None], some.reset_state.q, more.reset_state.q)  # opened to the width at the heading
-        more = more._replace(
-            goal=more.goal.replace("heading", position=position),
-            reset_state=more.reset_state._replace(base_position=base, q=q),
-        )
+def _same(some: InitialConditions, more: InitialConditions, but: str, check: Callable = np.testing.assert_array_equal):
+    """Everything that does not belong to one constraint is the same, but for places of hands whose fingers it chose."""
+    moved = more.goal.active["fingers"] if but == "fingers" else np.zeros(1, bool)
+    position = np.where(moved[:, None], some.goal["heading"].position, more.goal["heading"].position)
+    base = np.where(moved[:, None], some.reset_state.base_position, more.reset_state.base_position)
+    q = np.where(moved[:, None], some.reset_state.q, more.reset_state.q)  # opened to the width at the heading
+    more = more._replace(
+        goal=more.goal.replace("heading", position=position),
+        reset_state=more.reset_state._replace(base_position=base, q=q),
+    )
     goals = [dict(part.goal.flat().items()) for part in (some, more)]
     actives = [part.goal.active for part in (some, more)]
     own = {*get_constraint(but).blocks, *(f"{but}_{name}" for name in get_constraint(but).arrays)}
@@ -266,11 +281,12 @@ def _same(some: InitialConditions, more: InitialConditions, but: str, moved: np.
     )
     for one, other in (goals, actives):
         for name in one:
-            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+            check(one[name], other[name], err_msg=name)
     for name in ("reset_state", "surface", "region", "hold"):
-        jax.tree.map(np.testing.assert_array_equal, getattr(some, name), getattr(more, name))
+        jax.tree.map(check, getattr(some, name), getattr(more, name))
 
 
+@pytest.mark.slow
 @each_optional
 def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint):
     """A policy that knows a constraint, of which no episode has it, learns from the same episodes."""
@@ -281,8 +297,9 @@ def test_knowing_one_more_leaves_the_draws_of_the_others_as_they_were(constraint
 
 
 def test_episodes_with_fingers_are_those_without_in_all_else():
-    some, more = _drawn(PAPER), _drawn((*PAPER, "fingers"))
-    _same(some, more, "fingers", np.asarray(more.goal.active["fingers"]))
-    chosen = np.asarray(more.goal.active["fingers"])
-    pose = np.asarray(more.goal.active["pose_finger"])
+    """By compiled programs, whose last bits depend on the constraints."""
+    without = dataclasses.replace(TASK, constraints=tuple(name for name in NAMES if name != "fingers"))
+    some, more = suite.episodes(DRAWN, task=without), suite.episodes(DRAWN)
+    _same(some, more, "fingers", functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6))
+    chosen, pose = (np.asarray(more.goal.active[name]) for name in ("fingers", "pose_finger"))
     assert not chosen[pose].any() and abs(chosen[~pose].mean() - 0.5) < 0.15

@@ -73,12 +73,6 @@ def test_off_the_surface_of_a_convex_piece_it_is_the_way_along_the_normal(kind, 
     np.testing.assert_allclose(primitive_distance([piece], points + way[:, None] * normals), way, atol=2e-5)
 
 
-def test_of_several_pieces_the_nearest_counts():
-    pieces = [Piece("box", (0.01, 0.01, 0.01)), Piece("capsule", (0.01, 0.01, 0.0), pos=(0.1, 0.0, 0.0))]
-    found = primitive_distance(pieces, np.array([(0.03, 0.0, 0.0), (0.07, 0.0, 0.0)]))
-    np.testing.assert_allclose(found, [0.02, 0.02], atol=1e-6)
-
-
 @pytest.mark.parametrize("family", ["mug", "knife", "ellipsoid"])
 def test_grids_of_primitives_are_near_the_exact_distance(family):
     obj = procedural.generate(5, family)

@@ -12,7 +12,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.task import metrics
 from congrasp.common.task.config import RewardWeights, TaskConfig
-from congrasp.common.task.constraints import PAPER, get_constraint
+from congrasp.common.task.constraints import get_constraint
 from congrasp.common.task.constraints.force import ForceGoal, least_force
 from congrasp.common.task.observation import fields
 from congrasp.common.task.reward import reward_terms, terms
@@ -141,12 +141,3 @@ def test_words():
             read_request(mug, HAND, 15, force=text)
     with pytest.raises(CongraspError, match="--force and --gentle both set the force limit"):
         read_request(mug, HAND, 15, force="3", gentle=True)
-
-
-def test_tasks_that_do_not_know_it_are_paid_as_before():
-    """f_max stays a number, whatever limit the goal holds."""
-    state, surface, goal = scene(3)
-    paid = evaluated(reward_terms, scene_of(TaskConfig(constraints=PAPER), state, surface, goal), RewardWeights())
-    assert "force_over" not in paid
-    total = np.linalg.norm(scene_of(TASK, state, surface, goal).features.force, axis=-1)
-    np.testing.assert_allclose(paid["force_excess"], -0.01 * np.clip(total - 5.0, 0, 50).sum(-1), rtol=1e-5)

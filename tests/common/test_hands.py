@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand
@@ -22,6 +21,7 @@ from congrasp.common.objects.pool import scale_objects
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from tests.mano_file import mano_pickle
+from tests.task import start_of
 
 ROBOTS = ("allegro", "sharpa")
 # Fingertips at zero, m, in the frame of the makers' models, thumb first.
@@ -117,8 +117,9 @@ def test_joints_are_where_the_makers_have_them(name, joint, tip, anchor, axis):
     np.testing.assert_allclose(found.axis, axis, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", ("human", *ROBOTS))
 def test_product_of_exponentials_agrees_with_mujoco(name):
+    """Of the fingers; the wrist's joints are slides, then intrinsic x, y, z hinges."""
     hand = get_hand(name)
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -132,6 +133,12 @@ def test_product_of_exponentials_agrees_with_mujoco(name):
         mujoco.mj_kinematics(model, data)
         np.testing.assert_allclose(position, data.xpos[2:], atol=1e-6)
         np.testing.assert_allclose(np.abs(np.sum(quaternion * data.xquat[2:], -1)), 1.0, atol=1e-5)
+    data.qpos[:6] = [0.1, -0.2, 0.3, 0.4, -0.5, 0.6]
+    mujoco.mj_kinematics(model, data)
+    palm = model.body(hand.links[0].name).id
+    np.testing.assert_allclose(data.xpos[palm], [0.1, -0.2, 0.3], atol=1e-9)
+    turned = Rotation.from_euler("XYZ", [0.4, -0.5, 0.6]).as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs(turned @ data.xquat[palm]), 1.0, atol=1e-6)
 
 
 def test_poses_keep_within_limits_and_name_joints(hand):
@@ -145,10 +152,13 @@ def test_poses_keep_within_limits_and_name_joints(hand):
 def test_opening_and_palm_side(hand):
     """The heading leads out of the palm, which the closing fingers face."""
     frame = grasp_frame(hand)
+    axes = np.stack([frame.heading, frame.cross])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-6)
     assert 0.08 < frame.opening / hand.object_scale < 0.16
     opened, half = (_tips(hand, q) for q in (hand.q_open, (hand.q_open + hand.q_closed) / 2))
     gap = [np.linalg.norm(tips[1:].mean(0) - tips[0]) for tips in (opened, half)]
     assert gap[1] < 0.7 * gap[0]  # thumb and fingers come together
+    assert frame.cross @ (opened[1:].mean(0) - opened[0]) > 0  # from the thumb to the fingers
     np.testing.assert_allclose(gap[0], frame.opening, rtol=1e-5)
     np.testing.assert_allclose(frame.center, 0.5 * (opened[0] + opened[1:].mean(0)), atol=1e-6)
     knuckles = np.mean([link_origin(link) for link in hand.links if link.name.endswith("_proximal")], 0)
@@ -167,14 +177,10 @@ def test_every_hand_holds_a_heavy_cylinder_between_thumb_and_fingers(hand):
     axes = np.stack([frame.heading, frame.cross, along], -1)
     down = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]) @ axes.T)
     quaternion = (down * Rotation.from_matrix(axes)).as_quat(scalar_first=True)
-    reset_state = ResetState(
-        object_index=np.zeros(1, int),
+    reset_state = start_of(
         mass_scale=np.full(1, 0.4 / cylinder.mass),
-        friction=np.ones(1),
-        gain_scale=np.ones(1),
         base_position=np.array([[0.0, 0.0, 1.0]]),
         base_quaternion=down.as_quat(scalar_first=True)[None],
-        u_velocity=np.zeros((1, 6)),
         q=hand.q_open[None],
         object_position=np.array([[0.0, 0.0, 1.0]]) + down.apply(center),
         object_quaternion=quaternion[None],

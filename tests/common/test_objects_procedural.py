@@ -43,7 +43,7 @@ def test_most_basic_families_are_primitive():
     assert {obj.family for obj in made if is_primitive(obj)} == set(PRIMITIVE_FAMILIES)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(objects)
 def test_geometry_is_sound(obj):
     points, normals = obj.points.astype(float), obj.normals.astype(float)
@@ -62,21 +62,7 @@ def test_geometry_is_sound(obj):
     assert obj.visual_faces.max() < len(obj.visual_vertices)
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-@pytest.mark.parametrize("family", HOUSEHOLD_FAMILIES)
-def test_household_objects_are_of_one_piece(family, seed):
-    spec = mujoco.MjSpec()
-    add_object(spec, generate(seed, family))
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    touching = np.eye(model.ngeom, dtype=bool)
-    for i, j in itertools.combinations(range(model.ngeom), 2):
-        touching[i, j] = mujoco.mj_geomDistance(model, data, i, j, 0.01, None) < 5e-4
-    assert connected_components(touching, directed=False)[0] == 1
-
-
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(objects)
 def test_parts_and_slots_are_usable(obj):
     assert obj.graspable.shape == (len(obj.part_names),)
@@ -92,7 +78,7 @@ def test_parts_and_slots_are_usable(obj):
     assert all(len(piece.vertices) <= MAX_MESH_VERTICES for piece in obj.pieces if piece.kind == "mesh")
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(objects)
 def test_mass_and_inertia_are_those_of_a_body(obj):
     assert MASS_RANGE[0] <= obj.mass <= MASS_RANGE[1]
@@ -102,16 +88,33 @@ def test_mass_and_inertia_are_those_of_a_body(obj):
     assert a + b > c
 
 
-@pytest.mark.parametrize("family", [name for name in FAMILIES if not BUILDERS[name](np.random.default_rng(0)).weight])
-def test_inertia_of_evenly_dense_objects_equals_mujocos(family):
-    obj = generate(3, family)
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.parametrize("family", HOUSEHOLD_FAMILIES)
+def test_household_objects_are_of_one_piece(family, seed):
+    spec = mujoco.MjSpec()
+    add_object(spec, generate(seed, family))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    touching = np.eye(model.ngeom, dtype=bool)
+    for i, j in itertools.combinations(range(model.ngeom), 2):
+        touching[i, j] = mujoco.mj_geomDistance(model, data, i, j, 0.01, None) < 5e-4
+    assert connected_components(touching, directed=False)[0] == 1
+
+
+EVEN = [name for name in FAMILIES if not BUILDERS[name](np.random.default_rng(0)).weight]
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.builds(generate, st.integers(0, 2_000_000), st.sampled_from(EVEN)))
+def test_inertia_of_evenly_dense_objects_equals_mujocos(obj):
     density = obj.mass / sum(shapes.volume(piece) for piece in obj.pieces)
     _, center, inertia = mujoco_mass_properties(obj.pieces, [density] * len(obj.pieces))
     np.testing.assert_allclose(center, 0, atol=1e-6)
     np.testing.assert_allclose(obj.inertia, inertia, atol=1e-4 * np.abs(inertia).max())
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(objects)
 @example(generate(12322, "teapot"))  # a pose out of which it rolls ever faster, and slowly at first
 @example(generate(6516, "flashlight"))  # a contact comes and goes
@@ -128,9 +131,11 @@ def test_resting_poses_touch_the_table_and_rest(obj):
         settled = scene.settle(pose, 2.0)
         assert settled.speed < 0.01
         assert settled.moved < 0.01
+        if obj.family in HOUSEHOLD_FAMILIES:
+            assert 2 * np.degrees(np.arccos(min(1.0, abs(settled.pose[3:] @ pose[3:])))) < 5.0
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(st.integers(0, 2_000_000), st.sampled_from(FAMILIES))
 def test_seed_and_family_decide_the_object(seed, family):
     assert digest(generate(seed, family)) == digest(generate(seed, family))
@@ -172,16 +177,6 @@ def test_held_out_objects_of_basic_families_stay_what_they_are(family, mass, mom
     """Figures of different versions are of the same objects."""
     obj = generate(1_000_000, family)
     np.testing.assert_allclose([obj.mass, 1e6 * np.trace(obj.inertia)], [mass, moment], rtol=1e-6)
-
-
-@pytest.mark.parametrize("family", HOUSEHOLD_FAMILIES)
-def test_household_objects_rest_where_they_are_put(family):
-    obj = generate(1, family)
-    scene = TableScene(obj)
-    for pose in obj.rest_poses:
-        settled = scene.settle(pose, 1.0)
-        assert settled.moved < 0.005
-        assert 2 * np.degrees(np.arccos(min(1.0, abs(settled.pose[3:] @ pose[3:])))) < 5.0
 
 
 def test_an_object_does_not_depend_on_how_many_are_made_with_it():

@@ -10,14 +10,12 @@ import threading
 import numpy as np
 import pytest
 import scipy.sparse
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io import pickles
 from congrasp.common.io.pickles import read_pickle, read_pickles
 from tests.limits import limited
-from tests.mano_file import Reduced, content, dumps, mano_pickle, selection
+from tests.mano_file import Reduced, dumps, mano_pickle, selection
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
@@ -188,18 +186,3 @@ def test_a_small_pickle_takes_little_memory_and_time(data, word, monkeypatch):
 
 def parse(data):
     return type(read_pickles([("a.pkl", data)]))
-
-
-_MANO = mano_pickle({name: value for name, value in content().items() if name in ("J", "shapedirs", "all_directions")})
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, len(_MANO) - 1), st.binary(min_size=1, max_size=4))
-@pytest.mark.slow
-def test_whatever_a_file_says_it_is_read_or_refused(tmp_path_factory, at, noise):
-    path = tmp_path_factory.getbasetemp() / "noise.pkl"
-    path.write_bytes(_MANO[:at] + noise + _MANO[at + len(noise) :])
-    try:
-        read_pickle(path)
-    except CongraspError as error:
-        assert str(path) in str(error)

@@ -23,6 +23,8 @@ MASKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 SIZE = sum(size for _, size in LAYOUT)
 ACTIONS = 3
 CONFIG = NetworkConfig(hidden=(16, 8), encoder=4, initial_std=0.6)
+mean_of = jax.jit(lambda params, x: network.policy(params, LAYOUT, x)[0])
+value_of = jax.jit(lambda params, x, *inputs: network.value(params, LAYOUT, x, *inputs))
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +54,9 @@ def test_weights_start_orthogonal(params):
 
 def test_leading_axes_are_free(params):
     x = observations((1, 0, 1, 0))
-    mean, _ = network.policy(params, LAYOUT, x)
-    stacked, _ = network.policy(params, LAYOUT, x.reshape(2, 3, SIZE))
-    np.testing.assert_allclose(stacked.reshape(6, ACTIONS), mean, rtol=1e-5, atol=1e-7)
-    assert network.value(params, LAYOUT, x.reshape(2, 3, SIZE)).shape == (2, 3)
+    stacked = mean_of(params, x.reshape(2, 3, SIZE)).reshape(6, ACTIONS)
+    np.testing.assert_allclose(stacked, mean_of(params, x), rtol=1e-5, atol=1e-7)
+    assert value_of(params, x.reshape(2, 3, SIZE)).shape == (2, 3)
 
 
 @pytest.mark.parametrize("mask", list(itertools.product((0, 1), repeat=4)))
@@ -63,13 +64,13 @@ def test_a_block_matters_exactly_while_its_bit_is_set(params, mask):
     # Biases that are not zero: an encoder's output is then not zero by itself for a zero block.
     params = jax.tree.map(lambda leaf: leaf + 0.1, params)
     x = observations(mask)
-    base = network.policy(params, LAYOUT, x)[0], network.value(params, LAYOUT, x)
+    base = mean_of(params, x), value_of(params, x)
     start = 0
     for name, size in LAYOUT[:-1]:
         changed = x.copy()
         changed[:, start : start + size] += 1.0
         start += size
-        other = network.policy(params, LAYOUT, changed)[0], network.value(params, LAYOUT, changed)
+        other = mean_of(params, changed), value_of(params, changed)
         active = name not in MASKS or mask[MASKS.index(name)]
         for before, after in zip(base, other, strict=True):
             assert bool(jnp.any(before != after)) == bool(active)
@@ -110,7 +111,7 @@ def test_privileged_inputs_reach_the_critic_alone(params):
     x, inputs = np.ones((2, SIZE), np.float32), np.zeros((2, 3), np.float32)
     inputs[1, 2] = 1.0
     assert len(wide["critic"]["trunk_0"]["kernel"]) == len(params["critic"]["trunk_0"]["kernel"]) + 3
-    first, second = network.value(wide, LAYOUT, x, inputs)
+    first, second = value_of(wide, x, inputs)
     assert first != second
 
 
@@ -118,5 +119,5 @@ def test_new_privileged_inputs_leave_a_critic_s_estimates_unchanged(params):
     rng = np.random.default_rng(0)
     x, inputs = rng.normal(size=(5, SIZE)).astype(np.float32), rng.normal(size=(5, 3)).astype(np.float32)
     wide = network.with_privileged(params, 0, 3)
-    np.testing.assert_allclose(network.value(wide, LAYOUT, x, inputs), network.value(params, LAYOUT, x), rtol=1e-5)
+    np.testing.assert_allclose(value_of(wide, x, inputs), value_of(params, x), rtol=1e-5)
     jax.tree.map(np.testing.assert_array_equal, network.with_privileged(wide, 3, 0), jax.device_get(params))

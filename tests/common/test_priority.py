@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.task.constraints.priority import explain, resolve
+from congrasp.common.task.constraints.priority import active_blocks, explain, resolve
 from tests.scenes import HAND, points_of, scene
 
 
@@ -27,18 +27,9 @@ def _resolve(affordance: bool, pose: bool, trajectory: bool):
     return asked, resolved(surface, asked, _flags(affordance, pose, trajectory))
 
 
-@pytest.mark.parametrize(("affordance", "pose", "trajectory"), list(itertools.product([False, True], repeat=3)))
-def test_truth_table(affordance, pose, trajectory):
-    _, done = _resolve(affordance, pose, trajectory)
-    expected = {
-        "affordance": affordance and not pose,
-        "pose_finger": pose,
-        "pose_wrist": pose and not trajectory,
-        "trajectory": trajectory,
-    }
-    assert done.goal.active.keys() == expected.keys()
-    for block, active in expected.items():
-        np.testing.assert_array_equal(done.goal.active[block], np.full(4, active), err_msg=block)
+def test_what_is_active_follows_the_order_of_priority():
+    for flags in itertools.product([False, True], repeat=3):
+        jax.tree.map(np.testing.assert_array_equal, _resolve(*flags)[1].goal.active, active_blocks(_flags(*flags)))
 
 
 def test_a_lone_heading_stays_as_asked():

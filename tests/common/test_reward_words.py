@@ -11,9 +11,8 @@ import pytest
 from congrasp.common import rotations
 from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
-from congrasp.common.task.features import scene_of
 from congrasp.common.task.reward import GRASP, reward_terms, terms
-from tests.scenes import HAND, L, near_targets, scene
+from tests.scenes import HAND, L, evaluated, near_targets, scene, scene_of
 
 TASK, X = TaskConfig(), np.array([1.0, 0.0, 0.0])
 turned = partial(rotations.multiply, rotations.from_rotation_vector(0.2 * X))
@@ -82,7 +81,7 @@ def base():
     state, surface, goal = scene(0)
     goal, force = near_targets(state, goal, 0), np.zeros((L, 3))
     force[[PRESSING, HARD, SOFT], 0] = 1.0, 12.0, 6.0  # of which the first is in contact
-    found = scene_of(HAND, TASK, state, surface, goal)
+    found = scene_of(TASK, state, surface, goal)
     for path, value in {
         "state.object_position_initial": state.object_position + X,  # beyond 0.2 m, where the cost saturates
         "state.object_quaternion_initial": state.object_quaternion,
@@ -98,12 +97,12 @@ def base():
         "goal.values.force.limit": 8.0,
     }.items():
         found = replaced(found, path, lambda old, value=value: np.broadcast_to(value, old.shape).astype(old.dtype))
-    return found, reward_terms(found, RewardWeights())
+    return found, evaluated(reward_terms, found, RewardWeights())
 
 
 @pytest.mark.parametrize("name", terms(TASK))
 def test_a_quantity_changes_its_term_alone(name, base):
     found, before = base
-    after = reward_terms(replaced(found, *CASES[name][1:]), RewardWeights())
+    after = evaluated(reward_terms, replaced(found, *CASES[name][1:]), RewardWeights())
     assert {other for other, value in after.items() if np.any(value != before[other])} == {name}
     assert np.all(after[name] != before[name])

@@ -15,13 +15,16 @@ import pytest
 import yaml
 
 from congrasp.services.record.reader import read_metrics
-from tests.benchmarks.shutdown import SMALL
 from tests.conftest import ROOT
 
 SERVICES = yaml.safe_load((ROOT / "deploy" / "compose.yaml").read_text())["services"]
 HOSTS = {"learner": "10.77.0.1", "actor": "10.77.0.2", "server": "10.77.0.3"}
 """The recorder is on the learner's host."""
-TINY = SMALL[3:-6]
+TINY = (
+    *("--updates", "1000000", "--environments", "4", "--checkpoint-every", "3", "--objects.count", "2"),
+    *("--objects.families", "box", "--network.hidden", "32", "--network.encoder", "8"),
+    *("--ppo.epochs", "1", "--ppo.minibatches", "2"),
+)
 CONGRASP = f"{shlex.quote(sys.executable)} -m services.cli.main"
 pytestmark = pytest.mark.timeout(600)
 

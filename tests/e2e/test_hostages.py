@@ -12,7 +12,6 @@ import psutil
 import pytest
 
 from congrasp.actors.process.link import ActorLink
-from congrasp.common.errors import TransportError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.ports import local_url, shifted
@@ -20,7 +19,7 @@ from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
-from tests.benchmarks.attacks import attacked, throttled
+from tests.benchmarks.attackers import attacked, throttled
 from tests.cluster import A, B, D, T, bundle, rollout
 
 KEYS = Keys("r")
@@ -81,7 +80,7 @@ def test_two_who_leave_their_answers_unread_hold_nobody_up(tmp_path):
         urls.connect(endpoint, "client") as client,
         attacked("unread", endpoint, "r", query, count=2),
     ):
-        deadline = time.monotonic() + 6.0
+        deadline = time.monotonic() + 3.0
         while time.monotonic() < deadline:
             client.query(KEYS.act_for("c"), Message(), timeout=1.5)
             time.sleep(0.01)
@@ -117,7 +116,7 @@ def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
         link.config(10)
         thread = threading.Thread(target=pull, args=(slow,))
         thread.start()
-        for _ in range(20):
+        for _ in range(15):
             _updates(link, hub, 1)
             time.sleep(0.05)
         thread.join(60)
@@ -125,29 +124,7 @@ def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
     assert (weights.arrays["actor/w"] == weights.meta["version"]).all()
 
 
-@pytest.mark.slow
-def test_three_slow_links_leave_the_weights_to_others():
-    """8 MB at 200 kB/s: forty seconds each, in which answers that wait for their readers would hold up all pulls."""
-
-    def pull(slow, name):
-        with contextlib.suppress(TransportError), urls.connect(slow, "actor") as transport:
-            transport.query(KEYS.weights_for("actor", name), Message(meta={"newer_than": -1}), timeout=60)
-
-    with (
-        learner(2_000_000) as (endpoint, _),
-        throttled(endpoint, 200e3) as slow,
-        urls.connect(endpoint, "actor") as transport,
-    ):
-        for name in "abc":
-            threading.Thread(target=pull, args=(slow, name), daemon=True).start()
-        deadline = time.monotonic() + 6.0
-        while time.monotonic() < deadline:
-            reply = transport.query(KEYS.weights_for("actor", "d"), Message(meta={"newer_than": -1}), timeout=3)
-            assert reply.meta["version"] == 0
-            time.sleep(0.3)
-
-
-@pytest.mark.parametrize("flow", [0, 1])
+@pytest.mark.parametrize("flow", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_silent_connections_keep_nobody_out(flow):
     """Connections that show nothing for seconds are closed, and hundreds of them are not too many."""
     with learner(1000) as (endpoint, _), attacked("silent", shifted(endpoint, flow), "r"):
@@ -158,10 +135,10 @@ def test_silent_connections_keep_nobody_out(flow):
 
 
 def _grown(honest):
-    """Bytes by which this process grows while it does something 200 times."""
+    """Bytes by which this process grows while it does something 150 times."""
     process, most = psutil.Process(), 0
     before = process.memory_info().rss
-    for _ in range(200):
+    for _ in range(150):
         honest()
         most = max(most, process.memory_info().rss - before)
         time.sleep(0.01)

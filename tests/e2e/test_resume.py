@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import os
-import pathlib
 import signal
 import subprocess
 import sys
@@ -11,7 +10,6 @@ import threading
 import time
 
 import numpy as np
-import pytest
 
 from congrasp.common.errors import TransportError
 from congrasp.common.transport.keys import Keys
@@ -20,9 +18,9 @@ from congrasp.common.wire.codec import Message, decode
 from congrasp.learner.hub.used_rollouts import journal_path, replay
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run, open_run
+from tests.conftest import ROOT
 from tests.learner.test_process import CONFIG
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 UPDATES, EVERY, KILLED_AFTER = 8, 3, 5
 # The stream is fixed by `feed` alone: what a write-ahead log takes up would be used in another order.
 RUN = dataclasses.replace(CONFIG, updates=UPDATES, checkpoint_every=EVERY, write_ahead=False)
@@ -33,9 +31,8 @@ def rollout(number, bundle):
     """The same whatever policy is asked for it."""
     rng = np.random.default_rng(number)
     size = sum(width for _, width in bundle.meta["layout"])
-    observation = rng.uniform(-1.0, 1.0, (STEPS + 1, WORLDS, size)).astype(
-        np.float16
-    )  # what every entry of a task can be
+    # Within what every entry of a task can be.
+    observation = rng.uniform(-1.0, 1.0, (STEPS + 1, WORLDS, size)).astype(np.float16)
     privileged = sum(width for _, width in bundle.meta["privileged"])
     inputs = rng.uniform(0.0, 1.0, (STEPS + 1, WORLDS, privileged)).astype(np.float16)
     arrays = {
@@ -53,10 +50,10 @@ def rollout(number, bundle):
     return Message(arrays, {**who, **{name: bundle.meta[name] for name in ("version", "run_id", "schema")}, "steps": 8})
 
 
-def feed(hub):
+def feed(hub, ended):
     """Sends every update the rollouts of its number, and no others."""
     keys, known, transport = Keys(RUN.name), None, MemoryTransport(hub)
-    while True:
+    while not ended.is_set():
         try:
             bundle = transport.query(keys.weights_for("actor", "a"), Message(meta={"newer_than": -1}), timeout=5)
             if not bundle.arrays or bundle.meta["version"] == known:
@@ -74,37 +71,31 @@ def feed(hub):
             time.sleep(0.01)
 
 
-def train(run_dir, resume, killed_after):
+def train(run_dir, resume=False, killed_after=0):
     """A session of the learner; with `killed_after`, it ends by SIGKILL right after that update."""
-    hub = MemoryHub()
-    threading.Thread(target=feed, args=(hub,), daemon=True).start()
+    hub, ended = MemoryHub(), threading.Event()
+    feeder = threading.Thread(target=feed, args=(hub, ended), daemon=True)
+    feeder.start()
     with MemoryTransport(hub) as transport:
         run_learner(
             run_dir, open_run(run_dir), transport, stop_event=threading.Event(), resume=resume,
             on_update=lambda values: values["update"] == killed_after and os.kill(os.getpid(), signal.SIGKILL),
         )  # fmt: skip
+    ended.set()
+    feeder.join(10.0)
 
 
-def in_a_process(run_dir, resume, killed_after=0):
-    script = (
-        "import pathlib, sys; from tests.e2e.test_resume import train;"
-        "train(pathlib.Path(sys.argv[1]), sys.argv[2] == 'resume', int(sys.argv[3]))"
-    )
-    command = [sys.executable, "-c", script, str(run_dir), "resume" if resume else "begin", str(killed_after)]
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-    return subprocess.run(command, env=environment, timeout=120, stderr=subprocess.PIPE, text=True)
-
-
-@pytest.mark.timeout(300)
 def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
     for name in ("straight", "killed"):
         create_run(tmp_path / name, RUN)
-    straight = in_a_process(tmp_path / "straight", resume=False)
-    assert straight.returncode == 0, straight.stderr
-    assert in_a_process(tmp_path / "killed", resume=False, killed_after=KILLED_AFTER).returncode == -signal.SIGKILL
+    train(tmp_path / "straight")
+    script = "import pathlib, sys; from tests.e2e.test_resume import train; train(pathlib.Path(sys.argv[1]), "
+    command = [sys.executable, "-c", script + f"killed_after={KILLED_AFTER})", str(tmp_path / "killed")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, timeout=240, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == -signal.SIGKILL, done.stderr
     assert (tmp_path / "killed" / "checkpoints" / "latest").resolve().name.endswith(f"{EVERY}.safetensors")
-    resumed = in_a_process(tmp_path / "killed", resume=True)
-    assert resumed.returncode == 0, resumed.stderr
+    train(tmp_path / "killed", resume=True)
 
     ends = []
     for name in ("straight", "killed"):

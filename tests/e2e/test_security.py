@@ -2,12 +2,9 @@
 
 import contextlib
 import dataclasses
-import json
 import pathlib
-import re
 import subprocess
 import sys
-import threading
 import time
 
 import numpy as np
@@ -60,7 +57,7 @@ def evil(tmp_path_factory):
 class Run:
     """A learner and a policy server that ask for certificates."""
 
-    certs: object
+    certs: pathlib.Path
     endpoint: str
     policy: str
     hub: LearnerHub
@@ -75,8 +72,9 @@ class Run:
         return self.stack.enter_context(ZenohTransport(connect=[endpoint], credentials=mine, **options))
 
 
-@pytest.fixture
-def run(certs):
+@contextlib.contextmanager
+def listening(certs):
+    """A run that waits for peers."""
     endpoint, policy = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     with contextlib.ExitStack() as stack:
         learner, server = (Credentials(certs / f"{role}.0", role) for role in ("learner", "server"))
@@ -90,6 +88,26 @@ def run(certs):
         for key in (below(KEYS.act), KEYS.health):
             serving.serve(key, lambda key, request: Message(meta={"ready": True, "served": key}))
         yield Run(certs, endpoint, policy, hub, transport, stack)
+
+
+@pytest.fixture
+def fresh(certs):
+    """A run of a test's own."""
+    with listening(certs) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def shared(certs):
+    with listening(certs) as made:
+        yield made
+
+
+@pytest.fixture
+def run(shared):
+    """The run of the module; sessions that a test opens with it end with the test."""
+    with contextlib.ExitStack() as stack:
+        yield dataclasses.replace(shared, stack=stack)
 
 
 def heard(subscription, seconds=0.7):
@@ -112,18 +130,18 @@ def answers(transport, key, message=None):
 # --- what is allowed works ---
 
 
-def test_with_the_right_certificates_a_run_works_from_end_to_end(run):
-    observer, server = run.connect("observer.0"), run.connect("server.0")
+def test_with_the_right_certificates_a_run_works_from_end_to_end(fresh):
+    observer, server = fresh.connect("observer.0"), fresh.connect("server.0")
     logs = observer.subscribe(KEYS.logs, depth=64)
-    transport = run.connect("actor.0")
+    transport = fresh.connect("actor.0")
     with ActorLink(transport, "safe", ME, request_timeout=5.0) as link:
         assert link.config(10).schema == "s"
         assert link.weights(-1).meta["version"] == 0
         for _ in range(2):
             ticket = link.acquire_ticket(5)
             assert link.upload(rollout(T, 0, 0), ticket).result(10) == "accepted"
-        assert len(run.hub.next_batch(2, 5)) == 2
-        run.hub.publish_weights(bundle(1, "e"), 1)
+        assert len(fresh.hub.next_batch(2, 5)) == 2
+        fresh.hub.publish_weights(bundle(1, "e"), 1)
         # The announcement arrives by itself: without one, a link that holds the newest version asks for nothing.
         eventually(lambda: (new := link.weights(0)) and new.meta["version"] == 1)
         key = KEYS.log("metrics", "actor", ME)
@@ -136,10 +154,10 @@ def test_with_the_right_certificates_a_run_works_from_end_to_end(run):
         server.query(KEYS.weights_for("server", "0.s"), Message(meta={"newer_than": -1}), timeout=5).meta["version"]
         == 1
     )
-    with PolicyClient(run.policy, "safe", certs=run.certs / "client.0") as client:
+    with PolicyClient(fresh.policy, "safe", certs=fresh.certs / "client.0") as client:
         assert client.health()["ready"]
-    assert answers(run.connect("client.0", run.policy), KEYS.act_for("0.c")).meta["served"] == KEYS.act_for("0.c")
-    assert answers(run.connect("observer.0", run.policy), KEYS.health)
+    assert answers(fresh.connect("client.0", fresh.policy), KEYS.act_for("0.c")).meta["served"] == KEYS.act_for("0.c")
+    assert answers(fresh.connect("observer.0", fresh.policy), KEYS.health)
 
 
 def test_an_actor_whose_certificate_came_later_works_at_once(run):
@@ -184,35 +202,30 @@ EVERYTHING = {
 }
 
 
-@pytest.mark.parametrize(
-    ("who", "may"),
-    [
-        ("actor.0", {"config", "my weights", "my ticket", "my rollout"}),
-        ("actor.1", {"config", "another's weights", "another's ticket", "another's rollout"}),
-        ("server.0", {"config", "a server's weights"}),
-        ("observer.0", {"config", "status"}),
-        ("client.0", set()),
-        ("learner.0", set()),
-    ],
-)
-def test_each_role_can_ask_the_learner_for_its_own_and_nothing_else(run, who, may):
-    transport, learner = run.connect(who), str(run.transport._session(KEYS.config).info.zid())
+MAY = {
+    "actor.0": {"config", "my weights", "my ticket", "my rollout"},
+    "server.0": {"config", "a server's weights"},
+    "observer.0": {"config", "status"},
+    "client.0": set(),
+    "learner.0": set(),
+}
+MAY_ASK_THE_POLICY = {"client.0": {KEYS.act_for("0.c"), KEYS.health}, "observer.0": {KEYS.health}, "actor.0": set()}
 
-    def answered(key):
+
+def test_each_role_asks_learner_and_policy_server_for_its_own_and_nothing_else(run):
+    learner = str(run.transport._session(KEYS.config).info.zid())
+
+    def answered(transport, key):
         replies = transport._session(key).get(key.replace("{learner}", learner), FifoChannel(8), timeout=3.0)
         return bool(list(replies))  # an empty question is answered with an error in words
 
-    assert {name for name, key in EVERYTHING.items() if answered(key)} == may
-
-
-@pytest.mark.parametrize(
-    ("who", "may"),
-    [("client.0", {KEYS.act_for("0.c"), KEYS.health}), ("observer.0", {KEYS.health}), ("actor.0", set())],
-)
-def test_only_clients_can_ask_the_policy(run, who, may):
-    session = run.connect(who, run.policy)
-    asked = (KEYS.act_for("0.c"), KEYS.act_for("1.c"), KEYS.act, KEYS.health)
-    assert {key for key in asked if answers(session, key)} == may
+    for who, may in MAY.items():
+        transport = run.connect(who)
+        assert {name for name, key in EVERYTHING.items() if answered(transport, key)} == may, who
+    for who, may in MAY_ASK_THE_POLICY.items():
+        session = run.connect(who, run.policy)
+        asked = (KEYS.act_for("0.c"), KEYS.act_for("1.c"), KEYS.act, KEYS.health)
+        assert {key for key in asked if answers(session, key)} == may, who
 
 
 @pytest.mark.parametrize("who", ["actor.0", "client.0", "observer.0", "server.0"])
@@ -235,8 +248,8 @@ def test_nobody_else_publishes_or_serves_what_is_the_learners(run, who):
     assert answers(run.transport, KEYS.act) is None and asked == []
 
 
-def test_actors_do_not_speak_for_or_listen_to_one_another(run):
-    actor, victim, observer = run.connect("actor.0"), run.connect("actor.1"), run.connect("observer.0")
+def test_actors_do_not_speak_for_or_listen_to_one_another(fresh):
+    actor, victim, observer = fresh.connect("actor.0"), fresh.connect("actor.1"), fresh.connect("observer.0")
     everything = [actor.subscribe(key, depth=64) for key in ("congrasp/**", KEYS.logs, "congrasp/safe/alive/**")]
     seen = []
     actor.watch_alive(KEYS.everyone, lambda key, alive: seen.append(key))
@@ -245,9 +258,9 @@ def test_actors_do_not_speak_for_or_listen_to_one_another(run):
         session.publish(KEYS.log("event", "actor", name), Message())
     for role, name in (("actor", OTHER), ("learner", "0"), ("actor", "a"), ("actor", ME)):
         actor.declare_alive(KEYS.alive(role, name, "66"))
-    roles = eventually(lambda: (roles := run.hub.status()["roles"]) and len(roles) >= 3 and roles)
+    roles = eventually(lambda: (roles := fresh.hub.status()["roles"]) and len(roles) >= 3 and roles)
     assert {(role["role"], role["id"], role["incarnation"]) for role in roles} == {
-        ("learner", "0", run.hub.session_id),
+        ("learner", "0", fresh.hub.session_id),
         ("actor", OTHER, "01"),
         ("actor", ME, "66"),
     }
@@ -259,7 +272,7 @@ def test_actors_do_not_speak_for_or_listen_to_one_another(run):
                      "sequence": 0, "run_id": "e", "ticket": "t"})  # fmt: skip
     reply = actor.query(KEYS.rollout(ME), forged, timeout=5).meta
     assert reply["outcome"] == "refused" and "came under the key" in reply["why"]
-    assert run.hub.status()["counters"]["accepted"] == 0
+    assert fresh.hub.status()["counters"]["accepted"] == 0
 
 
 def test_a_client_hears_no_logs(run):
@@ -281,7 +294,7 @@ def _raw_session(endpoint, folder, mode):
     return zenoh.open(config)
 
 
-@pytest.mark.parametrize("mode", ["peer", "router"])
+@pytest.mark.parametrize("mode", [pytest.param("peer", marks=pytest.mark.slow), "router"])
 def test_another_mode_of_connecting_gives_no_more(run, mode):
     """Zenoh's peers and routers exchange more than its clients; the same rules hold for them."""
     with _raw_session(run.endpoint, run.certs / "actor.0", mode) as session:
@@ -393,8 +406,8 @@ def test_a_learner_that_is_replaced_by_another_role_gets_nothing(certs):
             assert answers(actor, KEYS.config) is None and answers(actor, KEYS.ticket(ME)) is None and asked == []
 
 
-def test_who_is_revoked_is_out_and_the_others_stay(run):
-    thief, actor, observer = run.connect("actor.1"), run.connect("actor.0"), run.connect("observer.0")
+def test_who_is_revoked_is_out_and_the_others_stay(fresh):
+    thief, actor, observer = fresh.connect("actor.1"), fresh.connect("actor.0"), fresh.connect("observer.0")
     logs = observer.subscribe(KEYS.logs, depth=64)
     thief.declare_alive(KEYS.alive("actor", OTHER, "66"))
     actor.declare_alive(KEYS.alive("actor", ME, "01"))
@@ -404,14 +417,14 @@ def test_who_is_revoked_is_out_and_the_others_stay(run):
         return not any(time.sleep(0.05) or answers(thief, KEYS.config) for _ in range(10))
 
     assert not out()
-    eventually(lambda: len(run.hub.status()["roles"]) == 3)
+    eventually(lambda: len(fresh.hub.status()["roles"]) == 3)
     with ActorLink(actor, "safe", ME, request_timeout=5.0) as link:
         link.config(10)
-        revoke(run.certs, "actor", 1)
+        revoke(fresh.certs, "actor", 1)
         try:
             eventually(out)
-            eventually(lambda: OTHER not in {role["id"] for role in run.hub.status()["roles"]})
-            eventually(lambda: ME in {role["id"] for role in run.hub.status()["roles"]})
+            eventually(lambda: OTHER not in {role["id"] for role in fresh.hub.status()["roles"]})
+            eventually(lambda: ME in {role["id"] for role in fresh.hub.status()["roles"]})
             ticket = eventually(lambda: link.acquire_ticket(5))
             assert link.upload(rollout(T, 0, 0), ticket).result(20) == "accepted"
             thief.publish(KEYS.log("event", "actor", OTHER), Message())
@@ -420,7 +433,7 @@ def test_who_is_revoked_is_out_and_the_others_stay(run):
             with pytest.raises(TransportError, match=r"may have .* revoked the certificate safe\.actor\.1\."):
                 thief.query(KEYS.config, Message(), timeout=5)
         finally:
-            for path in run.certs.rglob("revoked"):
+            for path in fresh.certs.rglob("revoked"):
                 path.unlink()
     eventually(lambda: answers(thief, KEYS.config))  # and let in again once the list is empty
 
@@ -461,11 +474,12 @@ def forgiven(certs):
         path.unlink()
 
 
-def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(forgiven, run, certs):
-    status = ["-m", "congrasp", "status", "--watch", "--json", "--run", "safe", "--connect", run.endpoint]
-    processes = _started("-c", ACTOR, run.endpoint, certs / "actor.0"), _started(*status, "--certs", certs)
+@pytest.mark.slow
+def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(forgiven, fresh, certs):
+    status = ["-m", "congrasp", "status", "--watch", "--json", "--run", "safe", "--connect", fresh.endpoint]
+    processes = _started("-c", ACTOR, fresh.endpoint, certs / "actor.0"), _started(*status, "--certs", certs)
     try:
-        with PolicyClient(run.policy, "safe", certs=certs / "client.0") as client:
+        with PolicyClient(fresh.policy, "safe", certs=certs / "client.0") as client:
             revoke(certs, "learner", 0)
             for process in processes:
                 _, said = process.communicate(timeout=40)
@@ -479,8 +493,8 @@ def test_processes_that_are_connected_to_one_that_is_revoked_end_with_one_line(f
             process.wait()
 
 
-def test_a_client_of_a_policy_server_that_is_revoked_is_told_so(forgiven, run, certs):
-    client = run.connect("client.0", run.policy, revocation_seconds=0.1)
+def test_a_client_of_a_policy_server_that_is_revoked_is_told_so(forgiven, fresh, certs):
+    client = fresh.connect("client.0", fresh.policy, revocation_seconds=0.1)
     key = KEYS.act_for("0.c")
     assert answers(client, key)
     revoke(certs, "server", 0)
@@ -508,71 +522,8 @@ def test_a_connection_ends_when_its_certificate_expires(run):
     _refused(run.endpoint, Credentials(made, "actor"), "expired")
 
 
-def test_the_command_line_says_why_in_one_line(run, evil, certs):
-    """A process of its own, for which nobody waits to the end of its patience."""
-    issue(evil, "observer", force=True, number=0)
-    for folder, words in ((evil, "not trusted"), (certs, None)):
-        command = ["status", "--connect", run.endpoint, "--run", "safe", "--certs", str(folder), "--json"]
-        done = subprocess.run(
-            [sys.executable, "-m", "congrasp", *command], capture_output=True, text=True, timeout=50, check=False
-        )
-        if words is None:
-            assert done.returncode == 0 and json.loads(done.stdout)["run"] == "safe", done.stderr
-        else:
-            (line,) = done.stderr.splitlines()
-            assert done.returncode == 2 and line.startswith("congrasp: error: ") and words in line
-
-
-def test_nothing_unpickles():
-    """One module imports what can run code out of data: the child process with an allow-list."""
-    forbidden = re.compile(
-        r"^\s*(from|import)\s+(pickle|cPickle|dill|cloudpickle|joblib|marshal|shelve|torch)\b|allow_pickle=True|\beval\(",
-        re.MULTILINE,
-    )
-    root = pathlib.Path(__file__).resolve().parents[2]
-    files = [path for folder in ("common", "actors", "learner", "services") for path in (root / folder).rglob("*.py")]
-    assert len(files) > 100
-    found = [str(path.relative_to(root)) for path in files if forbidden.search(path.read_text())]
-    assert found == ["common/io/unpickle.py"]
-
-
-# --- floods ---
-
-
-def test_a_flood_is_rejected_and_the_others_go_on(run):
-    """Useless requests, more than the learner could look at, from one certificate under many names."""
-    stop = threading.Event()
-
-    def flood(number):
-        session = run.connect("actor.1")
-        bad = Message({"x": np.zeros(1 << 18, np.float32)}, {"actor": f"1.{number}", "incarnation": "6", "ticket": "t"})
-        while not stop.is_set():
-            with contextlib.suppress(TransportError):
-                session.query(KEYS.rollout(f"1.{number}"), bad, timeout=5)
-
-    threads = [threading.Thread(target=flood, args=(number,)) for number in range(3)]
-    for thread in threads:
-        thread.start()
-    try:
-        eventually(lambda: run.hub.status()["counters"]["rejected"] > 50)
-        with ActorLink(run.connect("actor.0"), "safe", ME, request_timeout=5.0) as link:
-            link.config(10)
-            for version in range(20):
-                for _ in range(2):
-                    assert link.upload(rollout(T, 0, version), link.acquire_ticket(10)).result(10) == "accepted"
-                assert run.hub.next_batch(2, 5)
-                run.hub.publish_weights(bundle(version + 1, "e"), version + 1)
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join(10)
-    ledger = run.hub.status()["counters"]
-    assert ledger["accepted"] == ledger["consumed"] == 40
-    assert ledger["damaged"] < ledger["rejected"] + 1000
-
-
-def test_what_is_too_long_or_too_often_is_dropped(run):
-    observer, actor = run.connect("observer.0"), run.connect("actor.0")
+def test_what_is_too_long_or_too_often_is_dropped(fresh):
+    observer, actor = fresh.connect("observer.0"), fresh.connect("actor.0")
     long = Message({"x": np.zeros(100_000, np.uint8)})
     assert answers(actor, KEYS.config, long) is None and answers(actor, KEYS.ticket(ME), long) is None
     session = observer._session(KEYS.status)

@@ -1,9 +1,5 @@
 """An algorithm from outside: registered by name, it trains in the real learner, and nothing else knows of it."""
 
-import os
-import pathlib
-import subprocess
-import sys
 import threading
 
 import jax
@@ -22,10 +18,9 @@ from congrasp.learner.batch import collate, partition_specs
 from congrasp.learner.hub.admission import Ranges
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run
-from tests.benchmarks import toy
+from tests.learner import toy
 from tests.learner.a2c import A2C, SCHEMA
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 WORLDS, UPDATES = 64, 150
 CONFIG = RunConfig(
     name="t",
@@ -105,46 +100,6 @@ def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypa
     assert toy.mean_return(last) > toy.HALVING
     shipped = bundles.load(tmp_path / "policy.safetensors")
     jax.tree.map(np.testing.assert_array_equal, shipped.params, jax.device_get(last.params))
-
-
-TWO_DEVICES = """
-import jax, numpy as np
-from jax.sharding import Mesh
-from congrasp.common.config import RunConfig
-from congrasp.learner.batch import collate
-from congrasp.learner.distributed.collectives import AXIS
-from tests.benchmarks import toy
-from tests.learner.a2c import A2C, SCHEMA
-from tests.learner.test_ppo import rollout
-
-mesh = Mesh(np.array(jax.devices()), (AXIS,))
-assert mesh.size == 2
-a2c = A2C(toy.SPEC, RunConfig())
-one, two = a2c.init(0), a2c.init(0)
-for seed in range(3):
-    batch = collate([rollout(toy.bundle_of(one), seed)], SCHEMA)
-    batch["reward"][:, :32] *= 3.0  # the halves are unlike
-    one, expected = a2c.update(one, batch)
-    two, metrics = a2c.update(two, batch, mesh)
-    assert two.transitions == one.transitions
-    for name, value in expected.items():
-        np.testing.assert_allclose(metrics[name], value, rtol=2e-3, atol=2e-5, err_msg=name)
-jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4), two.params, one.params)
-"""
-
-
-@pytest.mark.slow
-def test_its_batch_is_divided_between_two_devices():
-    environment = {
-        **os.environ,
-        "JAX_PLATFORMS": "cpu",
-        "PYTHONPATH": str(ROOT),
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
-    }
-    done = subprocess.run(
-        [sys.executable, "-c", TWO_DEVICES], env=environment, capture_output=True, text=True, timeout=100.0
-    )
-    assert done.returncode == 0, done.stderr
 
 
 def test_a_batch_is_joined_and_divided_along_the_axis_of_worlds():

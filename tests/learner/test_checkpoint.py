@@ -1,28 +1,17 @@
+"""Checkpoints: exact, atomic, found without their link, and left out where they are damaged."""
+
 import os
-import pathlib
 import resource
-import subprocess
-import sys
-import tempfile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.checkpoint import Checkpoints
-from tests.benchmarks import toy
-
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-
-
-def in_a_fresh_process(script: str, directory: pathlib.Path) -> int:
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-    return subprocess.run([sys.executable, "-c", script, str(directory)], env=environment, timeout=120).returncode
+from tests.learner import toy
 
 
 def tree(value: float) -> dict:
@@ -68,19 +57,19 @@ def test_a_full_disk_is_one_clear_error_and_the_previous_checkpoint_is_intact(tm
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint_000000001.safetensors", "latest"]
 
 
+@pytest.mark.filterwarnings("ignore:os.fork")
 def test_a_process_that_dies_while_writing_leaves_the_previous_checkpoint(tmp_path):
     checkpoints = Checkpoints(tmp_path)
-    checkpoints.save(tree(1.0), {}, 1)
-    script = """
-import os, pathlib, sys
-import congrasp.learner.checkpoint as checkpoint
-from tests.learner.test_checkpoint import tree
-checkpoint.sync_directory = lambda path: None
-os.fsync = lambda descriptor: os._exit(9)  # gone after the data were written, before the rename
-checkpoint.Checkpoints(pathlib.Path(sys.argv[1])).save(tree(2.0), {}, 2)
-"""
-    assert in_a_fresh_process(script, tmp_path) == 9
-    assert checkpoints.load(tree(0.0))[0]["host"][0] == 1.0
+    checkpoints.save({"host": np.ones(3)}, {}, 1)
+    child = os.fork()
+    if not child:
+        os.fsync = lambda descriptor: os._exit(9)  # gone after the data were written, before the rename
+        try:
+            checkpoints.save({"host": np.zeros(3)}, {}, 2)
+        finally:
+            os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    np.testing.assert_array_equal(checkpoints.load({"host": np.zeros(3)})[0]["host"], np.ones(3))
 
 
 def test_a_checkpoint_of_a_version_with_another_optimiser_is_one_line(tmp_path):
@@ -141,19 +130,3 @@ def test_damaged_checkpoints_are_left_out_named_and_kept(tmp_path):
     checkpoints.save(tree(7.0), {}, 3)  # training comes to update 3 again
     assert len((tmp_path / "checkpoint_000000003.safetensors.aside").read_bytes()) > 0
     assert lines_of(checkpoints)[0] == 7.0
-
-
-@settings(max_examples=150, deadline=None)
-@given(bit=st.integers(0, 8 * 900 - 1))
-def test_no_flipped_bit_goes_unnoticed(bit):
-    with tempfile.TemporaryDirectory() as name:
-        checkpoints = Checkpoints(pathlib.Path(name))
-        checkpoints.save(tree(1.0), {"skipped": 0}, 1)
-        path = checkpoints.save(tree(2.0), {"skipped": 0}, 2)
-        data = bytearray(path.read_bytes())
-        data[bit // 8 % len(data)] ^= 1 << bit % 8
-        path.write_bytes(data)
-        loaded, meta = checkpoints.load(tree(0.0))
-        # The older one, or the newer one with the same content: a bit of white space may differ.
-        assert meta == {"skipped": 0} and loaded["host"][0] in (1.0, 2.0)
-        jax.tree.map(np.testing.assert_array_equal, loaded, tree(loaded["host"][0]))

@@ -1,29 +1,34 @@
-"""Two devices with half of the batch each do what one does with all of it."""
+"""Two devices with half of the batch each do what one does with all of it, for every algorithm."""
 
 import os
-import pathlib
 import subprocess
 import sys
 
 import pytest
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-TWO_DEVICES = """
-import dataclasses, functools
+from tests.conftest import ROOT
+from tests.learner.test_distill import save_teacher
+
+PREAMBLE = """
+import dataclasses, functools, sys
 import jax, numpy as np
 from jax.sharding import Mesh
+from congrasp.common.config import RunConfig
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate
+from congrasp.learner.batch import collate
 from congrasp.learner.distributed.collectives import AXIS, shard
-from tests.benchmarks import toy
+from tests.learner import toy
 from tests.learner.test_ppo import fresh, rollout
 
-# One minibatch: then both have the same samples in it, whatever order they draw.
-ppo = PPO(toy.SPEC, dataclasses.replace(toy.SETTINGS, minibatches=1, entropy=0.01, importance_max=1.02))
 mesh = Mesh(np.array(jax.devices()), (AXIS,))
 assert mesh.size == 2
+"""
+PPO = """
+# One minibatch: then both have the same samples in it, whatever order they draw.
+ppo = PPO(toy.SPEC, dataclasses.replace(toy.SETTINGS, minibatches=1, entropy=0.01, importance_max=1.02))
 one, two = fresh(), fresh()
-for seed in range(4):
+for seed in range(3):
     batch = rollout(toy.bundle_of(one), seed)
     # The halves are unlike, so that a mean of each instead of all would show; and stale, so that weights are truncated.
     batch["reward"][:, :32] *= 3.0
@@ -47,18 +52,56 @@ except NonFiniteUpdate as error:
     assert "reward" in str(error)
     print("agreed")
 """
+A2C = """
+from tests.learner.a2c import A2C, SCHEMA
+a2c = A2C(toy.SPEC, RunConfig())
+one, two = a2c.init(0), a2c.init(0)
+for seed in range(3):
+    batch = collate([rollout(toy.bundle_of(one), seed)], SCHEMA)
+    batch["reward"][:, :32] *= 3.0  # the halves are unlike
+    one, expected = a2c.update(one, batch)
+    two, metrics = a2c.update(two, batch, mesh)
+    assert two.transitions == one.transitions
+    for name, value in expected.items():
+        np.testing.assert_allclose(metrics[name], value, rtol=2e-3, atol=2e-5, err_msg=name)
+jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4), two.params, one.params)
+"""
+DISTILLATION = """
+from tests.learner.test_distill import algorithm, batch, run_of
+run = run_of(sys.argv[1], epochs=1)
+student = algorithm(run)
+one, two = student.init(0), student.init(0)
+one, expected = student.update(one, batch(run, 0))
+two, metrics = student.update(two, batch(run, 0), mesh)
+assert two.transitions == one.transitions
+np.testing.assert_allclose(metrics["imitation_kl"], expected["imitation_kl"], rtol=0.05)
+np.testing.assert_allclose(two.observation.mean, one.observation.mean, atol=1e-5)
+"""
 
 
-@pytest.mark.timeout(300)
-def test_half_of_the_batch_on_each_of_two_devices_is_the_whole_batch():
+def two_devices(program, *arguments):
+    """What a program prints that sees two devices."""
     environment = {
         **os.environ,
-        "JAX_PLATFORMS": "cpu",
         "PYTHONPATH": str(ROOT),
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "true",
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2",
     }
-    command = [sys.executable, "-c", TWO_DEVICES]
+    command = [sys.executable, "-c", PREAMBLE + program, *map(str, arguments)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=280.0)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "agreed"
+    return done.stdout.strip()
+
+
+def test_half_of_the_batch_on_each_of_two_devices_is_the_whole_batch():
+    assert two_devices(PPO) == "agreed"
+
+
+@pytest.mark.slow
+def test_an_algorithm_from_outside_is_divided_between_two_devices():
+    two_devices(A2C)
+
+
+@pytest.mark.slow
+def test_distillation_is_divided_between_two_devices(tmp_path):
+    save_teacher(tmp_path / "teacher.safetensors")
+    two_devices(DISTILLATION, tmp_path / "teacher.safetensors")

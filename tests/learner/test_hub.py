@@ -16,7 +16,6 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.batch import collate
 from congrasp.learner.hub import hub
 from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.deduplication import Sequences
@@ -46,14 +45,16 @@ def bundle(version, run_id="e"):
 
 
 class Bench:
-    """A hub and a peer of it."""
+    """A hub, which has published weights where a version is given, and a peer of it."""
 
-    def __init__(self, *, max_staleness=1, batch=2, **options):
+    def __init__(self, *, version=None, max_staleness=1, batch=2, **options):
         shared = MemoryHub()
         self.server, self.peer = MemoryTransport(shared), MemoryTransport(shared)
         self.staleness = StalenessManager(max_staleness, batch)
         defaults = {"run": "test", "config_json": "{}", "run_id": "e", "schema": "s", "form": FORM}
         self.hub = LearnerHub(self.server, **{**defaults, **options}, staleness=self.staleness)
+        if version is not None:
+            self.hub.publish_weights(bundle(version), version)
 
     def ask(self, key, meta=None, arrays=None):
         return self.peer.query(key, Message(arrays or {}, meta or {}), timeout=60).meta
@@ -104,8 +105,7 @@ def test_nothing_is_granted_or_taken_before_the_first_weights(bench):
 
 
 def test_tickets_run_out_and_return(bench):
-    b = bench(max_staleness=0, batch=1)
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, max_staleness=0, batch=1)
     assert b.ticket("t")["granted"] and b.ticket("t")["granted"]
     assert not b.ticket("u")["granted"]
     b.ticket("t", give_back=True)
@@ -118,8 +118,7 @@ def test_tickets_run_out_and_return(bench):
 
 def test_death_returns_tickets_and_is_told(bench):
     said = []
-    b = bench(max_staleness=0, batch=1, on_event=lambda *event: said.append(event))
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, max_staleness=0, batch=1, on_event=lambda *event: said.append(event))
     events = b.peer.subscribe(KEYS.logs, depth=8)
     actor = MemoryTransport(b.peer._hub)
     actor.declare_alive(KEYS.alive("actor", "a", "01"))
@@ -140,8 +139,7 @@ def _roles(b):
 
 
 def test_batches_come_in_order_and_wait(bench):
-    b = bench()
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0)
     assert b.hub.next_batch(2, 0.05) is None
     assert b.send(0)["outcome"] == b.send(1)["outcome"] == b.send(2)["outcome"] == "accepted"
     batch = b.hub.next_batch(2, 1)
@@ -158,16 +156,14 @@ def test_batches_come_in_order_and_wait(bench):
 
 
 def test_full_learner_says_when_to_come_again(bench):
-    b = bench(batch=1)
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, batch=1)
     assert [b.send(i)["outcome"] for i in range(2)] == ["accepted"] * 2
     reply = b.send(2)
     assert reply["outcome"] == "retry" and reply["retry_after"] > 0
     assert b.hub.next_batch(1, 1)
     b.hub.publish_weights(bundle(1), 1)
     assert b.send(2)["outcome"] == "accepted"
-    limited = bench(batch=10, queue_limit=1)
-    limited.hub.publish_weights(bundle(0), 0)
+    limited = bench(version=0, batch=10, queue_limit=1)
     assert [limited.send(i)["outcome"] for i in range(2)] == ["accepted", "retry"]
 
 
@@ -192,8 +188,7 @@ def test_too_old_is_refused_on_arrival_and_dropped_in_the_queue(bench):
 
 
 def test_nobody_speaks_for_another(bench):
-    b = bench()
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0)
     assert b.ticket("t")["granted"]
     asked = {"actor": "a", "incarnation": "01", "ticket": "t", "give_back": True}
     with pytest.raises(RefusedError, match=r"actor 'a' came under the key .*/ticket/b'"):
@@ -205,8 +200,7 @@ def test_nobody_speaks_for_another(bench):
 
 
 def test_nobody_makes_the_learner_forget_what_another_sent(bench):
-    b = bench()
-    b.hub.publish_weights(bundle(9), 9)
+    b = bench(version=9)
     assert b.send(0, version=9, actor="0.a")["outcome"] == "accepted"
     for i in range(1100):  # more starts of an actor than are remembered
         assert b.send(0, actor=f"1.{i % 7}", incarnation=f"{i}")["outcome"] == "stale"
@@ -215,8 +209,7 @@ def test_nobody_makes_the_learner_forget_what_another_sent(bench):
 
 def test_floods_are_rejected_and_cost_the_others_nothing(bench, monkeypatch):
     monkeypatch.setattr(hub, "RateLimit", functools.partial(RateLimit, clock=lambda: 0.0))  # no token returns
-    b = bench()
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0)
     events = b.peer.subscribe(KEYS.logs, depth=8)
     outcomes = [b.send(0, actor="1.b", run_id="of another training")["outcome"] for _ in range(2500)]
     stale = outcomes.count("stale")
@@ -233,8 +226,7 @@ def test_floods_are_rejected_and_cost_the_others_nothing(bench, monkeypatch):
 
 
 def test_who_is_refused_again_and_again_is_put_off_and_counted(bench):
-    b = bench()
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0)
     b.peer.declare_alive(KEYS.alive("actor", "1.b", "01"))
     answers = [b.send(0, actor="1.b", steps=1) for _ in range(4)]
     assert [answer["outcome"] for answer in answers] == ["refused", "refused", "retry", "retry"]
@@ -251,8 +243,7 @@ def test_who_is_refused_again_and_again_is_put_off_and_counted(bench):
 
 def test_values_beyond_the_task_are_refused_with_the_range(bench):
     ranges = Ranges(np.array([1.0, 1.0, 1.0, 400.0, 2.0]), 65.0, 1e3, {"episode/success": (0.0, 1.0)})
-    b = bench(admission=Admission(lambda: ranges))
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, admission=Admission(lambda: ranges))
     fine = {
         "observation": np.tile(np.float16([-1, 1, 0, 400, 2]), (T, B, 1)),
         "reward": np.full((T, B), -65, np.float32),
@@ -300,29 +291,8 @@ def test_tokens_by_the_thousand_cost_the_others_nothing(bench):
     assert told == 64  # one for each that was listed
 
 
-def _sized(steps, worlds):
-    """A rollout that agrees with itself, of so many control steps of so many worlds."""
-    return Message(RolloutForm(steps, worlds, D, A, half=True).zeros(), {**rollout().meta, "steps": steps * worlds})
-
-
-@pytest.mark.parametrize(
-    ("steps", "worlds", "rule"),
-    [(T + 1, B, r"\(4, 2, 5\), not \(T=3, B=2"), (T, B + 1, r"\(3, 3, 5\), not \(T=3, B=2")],
-)
-def test_an_actor_of_another_configuration_is_refused_alone(bench, steps, worlds, rule):
-    """Batches are counted in rollouts, so one of another length or width would not fit beside the others."""
-    b = bench()
-    b.hub.publish_weights(bundle(0), 0)
-    reply = b.peer.query(KEYS.rollout("a"), _sized(steps, worlds), timeout=60).meta
-    assert reply["outcome"] == "refused" and re.search(rule, reply["why"])
-    assert b.send(0)["outcome"] == b.send(1)["outcome"] == "accepted"
-    batch = b.hub.next_batch(2, 1)
-    assert collate([message.arrays for message in batch], FORM.arrays)["reward"].shape == (T, 2 * B)
-
-
 def test_refusal_ends_the_ticket(bench):
-    b = bench()
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0)
     assert b.ticket("t")["granted"]
     assert b.send(0, ticket="t", steps=1)["outcome"] == "refused"
     assert b.ledger()["running"] == 0 and b.ledger()["redeemed"] == 1
@@ -359,8 +329,7 @@ def test_only_weights_of_this_run_are_published(bench):
 
 
 def test_status_names_everything(bench):
-    b = bench()
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0)
     b.peer.declare_alive(KEYS.alive("actor", "a", "01"))
     b.send(0)
     time.sleep(0.05)
@@ -381,8 +350,7 @@ def test_status_names_everything(bench):
 
 
 def test_finished_run_says_so(bench):
-    b = bench()
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0)
     notices = b.peer.subscribe(KEYS.announcement, depth=4)
     b.hub.finish()
     assert notices.receive(60)[1].meta["finished"]
@@ -392,8 +360,7 @@ def test_finished_run_says_so(bench):
 
 
 def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
-    b = bench(batch=3)
-    b.hub.publish_weights(bundle(3), 3)
+    b = bench(version=3, batch=3)
     for i in range(5):
         assert b.send(i, version=3)["outcome"] == "accepted"
     assert sequences(b.hub.next_batch(3, 1)) == [0, 1, 2]  # 3 and 4 wait
@@ -413,8 +380,7 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
     assert resumed.send(6, version=4)["outcome"] == "duplicate"
     ledger = resumed.ledger()
     assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["missing"]) == (5, 3, 2, 3)
-    again = bench(batch=3, durable=resumed.hub.durable())
-    again.hub.publish_weights(bundle(5), 5)
+    again = bench(version=5, batch=3, durable=resumed.hub.durable())
     assert again.send(8, version=5)["outcome"] == "accepted"
     assert again.ledger()["missing"] == 5 and again.ledger()["accepted"] == 4  # 6 and 7 were waiting as well
     with pytest.raises(CongraspError, match="run id e, not f"):
@@ -445,8 +411,7 @@ def test_deduplication_stays_small_whatever_is_missing():
 
 
 def test_made_up_sequence_numbers_do_not_blow_up_what_is_missing(bench):
-    b = bench(batch=100)
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, batch=100)
     assert b.send(0, version=0)["outcome"] == "accepted"
     made_up = [number * 10**12 for number in range(1, 71)]
     for sequence in made_up:
@@ -458,8 +423,7 @@ def test_made_up_sequence_numbers_do_not_blow_up_what_is_missing(bench):
 
 
 def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
-    b = bench(batch=2)
-    b.hub.publish_weights(bundle(5), 5)
+    b = bench(version=5, batch=2)
     assert b.send(0, version=0)["outcome"] == "stale"
     assert b.send(2, version=5)["outcome"] == b.send(3, version=5)["outcome"] == "accepted"
     assert sequences(b.hub.next_batch(2, 1)) == [2, 3]
@@ -468,8 +432,7 @@ def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
     durable = b.hub.durable()
     assert b.send(1, version=6)["outcome"] == "accepted"  # overtaken by 2 and 3, and lost with this learner
     assert b.ledger()["missing"] == 0
-    resumed = bench(batch=2, durable=durable)
-    resumed.hub.publish_weights(bundle(6), 6)
+    resumed = bench(version=6, batch=2, durable=durable)
     assert resumed.send(0, version=6)["outcome"] == "stale"  # as before
     assert resumed.send(4, version=6)["outcome"] == "accepted"
     ledger = resumed.ledger()
@@ -493,8 +456,7 @@ def on_disk(log):
 
 
 def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(bench, log):
-    b = bench(batch=2, log=log(), durable={**bench().hub.durable(), "version": 3})
-    b.hub.publish_weights(bundle(3), 3)
+    b = bench(version=3, batch=2, log=log(), durable={**bench().hub.durable(), "version": 3})
     for i, version in enumerate((3, 2, 3, 2)):
         assert b.send(i, version=version)["outcome"] == "accepted"
         assert on_disk(b.hub._log) == list(range(i + 1))  # before it is acknowledged
@@ -518,8 +480,7 @@ def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(
 
 
 def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
-    b = bench(batch=2, log=log())
-    b.hub.publish_weights(bundle(5), 5)
+    b = bench(version=5, batch=2, log=log())
     for i in range(3):
         assert b.send(i, version=5)["outcome"] == "accepted"
     assert on_disk(b.hub._log) == []  # there is no checkpoint from which these would be fresh
@@ -531,8 +492,7 @@ def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
     b.hub.note_saved()
     assert on_disk(b.hub._log) == [2, 3]
 
-    resumed = bench(batch=2, log=log(), durable=durable)
-    resumed.hub.publish_weights(bundle(6), 6)
+    resumed = bench(version=6, batch=2, log=log(), durable=durable)
     assert sequences(resumed.hub.next_batch(2, 1)) == [2, 3]
     resumed.hub.publish_weights(bundle(7), 7)
     resumed.hub.durable()
@@ -544,8 +504,7 @@ def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
 def test_nothing_is_acknowledged_before_it_is_written(bench, log):
     """Neither what is accepted, nor the same that is sent again meanwhile, nor after the end was noted."""
     written, slow = threading.Event(), log()
-    b = bench(log=slow)
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, log=slow)
     add = slow.add
     slow.add = lambda header, message: written.wait(10) and add(header, message)
     answers = []
@@ -562,8 +521,7 @@ def test_nothing_is_acknowledged_before_it_is_written(bench, log):
 
 
 def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, log):
-    b = bench(log=log())
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, log=log())
     for i in range(3):
         b.send(i)
     b.hub.discard(b.hub.next_batch(2, 1))
@@ -572,8 +530,7 @@ def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, lo
 
 def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     said = []
-    b = bench(log=log())
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, log=log())
     for i in range(4):
         assert b.send(i)["outcome"] == "accepted"
     folder = b.hub._log._folder
@@ -583,8 +540,7 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     (folder / f"000000000009~a~01~5.safetensors{PART}").write_bytes(b"torn, and so never acknowledged")
     os.mkfifo(folder / "000000000008~a~01~7.safetensors")  # which would keep a reader waiting for ever
     (folder / "notes.txt").write_text("not ours")
-    resumed = bench(log=log(), on_event=lambda *event: said.append(event))
-    resumed.hub.publish_weights(bundle(1), 1)
+    resumed = bench(version=1, log=log(), on_event=lambda *event: said.append(event))
     assert sequences(resumed.hub.next_batch(2, 1)) == [0, 3]
     assert ("error", "3 accepted rollouts are damaged on disk and were ignored.") in said
     kinds = sorted(path.suffix for path in folder.iterdir())
@@ -595,11 +551,9 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
 
 
 def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, log):
-    b = bench(log=log())
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, log=log())
     b.send(0)
-    resumed = bench(log=log(write=False))
-    resumed.hub.publish_weights(bundle(1), 1)
+    resumed = bench(version=1, log=log(write=False))
     assert resumed.send(1, version=1)["outcome"] == "accepted"
     assert on_disk(resumed.hub._log) == [0] and sequences(resumed.hub.next_batch(2, 1)) == [0, 1]
 
@@ -607,8 +561,7 @@ def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, l
 def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
     said = []
     (tmp_path / "file").touch()
-    b = bench(batch=3, log=WriteAheadLog(tmp_path / "file" / "log", 1, log_error=said.append))
-    b.hub.publish_weights(bundle(0), 0)
+    b = bench(version=0, batch=3, log=WriteAheadLog(tmp_path / "file" / "log", 1, log_error=said.append))
     assert [b.send(i)["outcome"] for i in range(3)] == ["accepted"] * 3
     assert len(said) == 1 and "they do not survive the learner" in said[0]
     (tmp_path / "file").unlink()

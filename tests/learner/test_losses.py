@@ -95,14 +95,6 @@ def test_fresh_data_reduce_it_to_plain_ppo(case):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), gradient, expected_gradient)
 
 
-def test_at_the_proximal_policy_nothing_is_clipped_and_there_is_no_divergence(case):
-    params, log_std, sample = case
-    _, terms = objective(params, LAYOUT, log_std, sample, losses.Coefficients(0.2, 0.0, 0.5))
-    assert terms.clip_fraction == 0.0
-    np.testing.assert_allclose(terms.kl, 0.0, atol=1e-6)
-    np.testing.assert_allclose(terms.policy_loss, -np.mean(sample.advantage), rtol=1e-4, atol=1e-6)
-
-
 def test_stale_data_do_not_use_up_the_trust_region(case):
     """The behaviour policy was far away: plain PPO clips such samples at once, the decoupled objective does not."""
     params, log_std, sample = case

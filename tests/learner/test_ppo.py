@@ -13,7 +13,7 @@ from congrasp.common.policy import network, normalizer
 from congrasp.learner.algorithms import ppo
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
-from tests.benchmarks import toy
+from tests.learner import toy
 
 ALGORITHM = PPO(toy.SPEC, toy.SETTINGS)
 step = ALGORITHM.update
@@ -125,79 +125,54 @@ def test_truncated_ends_have_the_td_errors_of_both_rules():
 
 
 @pytest.mark.parametrize(
-    ("kl", "rate"),
-    [(0.05, 2e-3 / 1.5), (0.004, 3e-3), (0.02, 2e-3), (0.006, 2e-3), (float("inf"), 2e-3 / 1.5)],
+    ("kl", "before", "limits", "rate"),
+    [
+        (0.05, 2e-3, (1e-5, 1.0), 2e-3 / 1.5),
+        (0.004, 2e-3, (1e-5, 1.0), 3e-3),
+        (0.02, 2e-3, (1e-5, 1.0), 2e-3),
+        (0.006, 2e-3, (1e-5, 1.0), 2e-3),
+        (float("inf"), 2e-3, (1e-5, 1.0), 2e-3 / 1.5),
+        (0.0, 2.5e-4, (1e-4, 3e-4), 3e-4),
+        (1.0, 1.2e-4, (1e-4, 3e-4), 1e-4),
+    ],
 )
-def test_learning_rate_follows_the_divergence(kl, rate):
-    hyper = {"kl_target": 0.012, "learning_rate_range": (1e-5, 1.0)}
-    np.testing.assert_allclose(ppo._adapt_rate(jnp.float32(2e-3), jnp.float32(kl), hyper), rate, rtol=1e-6)
+def test_learning_rate_follows_the_divergence_within_its_range(kl, before, limits, rate):
+    hyper = {"kl_target": 0.012, "learning_rate_range": limits}
+    np.testing.assert_allclose(ppo._adapt_rate(jnp.float32(before), jnp.float32(kl), hyper), rate, rtol=1e-6)
 
 
-def test_the_target_falls_to_a_tenth_over_the_last_updates():
+def test_divergence_and_noise_are_bounded_as_the_run_settles():
+    """Over the last updates the target falls to a tenth, the noise's ceiling geometrically; before, it has a floor."""
     settings = PPOConfig(kl_target=0.01, settling=0.2)
     targets = [settings.kl_target_at(version, 1000) for version in (0, 800, 900, 1000, 1200)]
     np.testing.assert_allclose(targets, [0.01, 0.01, 0.0055, 0.001, 0.001], rtol=1e-9)
-    assert PPOConfig(kl_target=0.01).kl_target_at(1000, 1000) == 0.01
-
-
-def test_the_ceiling_of_the_noise_falls_geometrically():
-    """From 0.8 to 0.1 in three updates: halves. What is below the ceiling stays, and nothing is capped before."""
-    settings = PPOConfig(settling=0.3, final_std=0.1)
+    settings = PPOConfig(settling=0.3, final_std=0.1, least_std=0.35)
     kept = [settings.noise_kept_at(version, 10) for version in (0, 6, 7, 8, 9, 10)]
     np.testing.assert_allclose(kept, [np.inf, np.inf, 2 / 3, 1 / 2, 0.0, 0.0])
-    assert PPOConfig(final_std=0.1).noise_kept_at(10, 10) == np.inf
-    assert PPOConfig(settling=0.3, final_std=0.0).noise_kept_at(9, 10) == np.inf
-    log_std, found = jnp.log(jnp.array([0.8, 0.8, 0.05])), []
-    for share in kept[1:5]:
-        # The update would raise the first and the last deviation by a half, and lower the second to 0.3.
-        risen = jnp.log(jnp.array([1.2, 0.3, 0.075])) if not found else log_std
-        hyper = {"final_std": 0.1, "noise_kept": share, "least_std": 0.0}
-        log_std = ppo._settle({"actor": {"log_std": risen}}, log_std, hyper)["actor"]["log_std"]
-        found.append(np.exp(log_std))
-        log_std = jnp.log(jnp.array([0.8, 0.3, 0.05])) if len(found) == 1 else log_std
-    np.testing.assert_allclose(found[0], [1.2, 0.3, 0.075], rtol=1e-5)
-    expected = [[0.4, 0.1 * 3 ** (2 / 3), 0.05], [0.2, 0.1 * 3 ** (1 / 3), 0.05], [0.1, 0.1, 0.05]]
-    np.testing.assert_allclose(found[1:], expected, rtol=1e-5)
-
-
-def test_the_last_update_of_a_run_that_settles_leaves_the_final_noise():
-    settings, batch = dataclasses.replace(toy.SETTINGS, settling=0.5, final_std=0.2), rollout(toy.bundle_of(fresh()), 0)
-    stds = {}
-    for version in (3, 4, 7):
-        moved, metrics = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
-        stds[version] = metrics["action_std"]
-        np.testing.assert_allclose(np.exp(moved.params["actor"]["log_std"]), metrics["action_std"], rtol=1e-6)
-    assert stds[3] > 0.5 and stds[7] == pytest.approx(0.2, rel=1e-5)
-    assert stds[4] <= 0.6 * (0.2 / 0.6) ** 0.25 * (1 + 1e-6)
-
-
-def test_the_noise_has_a_floor_until_the_run_settles():
-    settings = PPOConfig(settling=0.3, least_std=0.35)
     assert [settings.least_std_at(version, 10) for version in (0, 6, 7, 9, 10)] == [0.35, 0.35, 0.0, 0.0, 0.0]
-    assert PPOConfig(least_std=0.35).least_std_at(10, 10) == 0.35  # a run that never settles
-    hyper = {"final_std": 0.1, "noise_kept": np.inf, "least_std": 0.35}
-    log_std = jnp.log(jnp.array([0.2, 0.35, 0.6]))
-    moved = ppo._settle({"actor": {"log_std": log_std}}, log_std, hyper)
-    np.testing.assert_allclose(np.exp(moved["actor"]["log_std"]), [0.35, 0.35, 0.6], rtol=1e-6)
+    never = PPOConfig(kl_target=0.01, final_std=0.1, least_std=0.35)  # settles
+    assert (never.kl_target_at(9, 9), never.noise_kept_at(9, 9), never.least_std_at(9, 9)) == (0.01, np.inf, 0.35)
+    assert PPOConfig(settling=0.3, final_std=0.0).noise_kept_at(9, 10) == np.inf
 
 
-def test_an_update_raises_the_noise_to_its_floor_and_settling_lowers_it_again():
+@pytest.mark.parametrize("least", [0.0, 0.7])
+def test_an_update_raises_the_noise_to_its_floor_and_the_last_one_leaves_the_final_noise(least):
     """The deviations are 0.6 before each update; a floor of 0.7 is above what an update reaches."""
-    settings = dataclasses.replace(toy.SETTINGS, settling=0.5, final_std=0.2, least_std=0.7)
+    settings = dataclasses.replace(toy.SETTINGS, settling=0.5, final_std=0.2, least_std=least)
     batch, stds = rollout(toy.bundle_of(fresh()), 0), {}
     for version in (3, 4, 7):
         moved, metrics = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
         stds[version] = metrics["action_std"]
         np.testing.assert_allclose(np.exp(moved.params["actor"]["log_std"]), metrics["action_std"], rtol=1e-6)
-    np.testing.assert_allclose(stds[3], 0.7, rtol=1e-6)
-    assert stds[4] < 0.6 and stds[7] == pytest.approx(0.2, rel=1e-5)
+    assert stds[3] == pytest.approx(0.7, rel=1e-6) if least else stds[3] > 0.5
+    assert stds[4] <= 0.6 * (0.2 / 0.6) ** 0.25 * (1 + 1e-6) and stds[7] == pytest.approx(0.2, rel=1e-5)
 
 
 def test_a_run_that_settles_lowers_its_rate_in_its_last_update():
     """By the divergence that the rate of the first update suits."""
     batch = rollout(toy.bundle_of(fresh()), 0)
-    _, metrics = changed(epochs=1).update(fresh(), batch)
-    settings = dataclasses.replace(toy.SETTINGS, epochs=1, kl_target=metrics["kl"], settling=0.5)
+    _, metrics = changed(minibatches=1, epochs=2).update(fresh(), batch)
+    settings = dataclasses.replace(toy.SETTINGS, minibatches=1, epochs=2, kl_target=metrics["kl"], settling=0.5)
     rates = {}
     for version in (0, 8):
         moved, _ = PPO(toy.SPEC, settings, updates=8).update(fresh()._replace(version=version), batch)
@@ -229,12 +204,6 @@ def test_a_rate_that_is_too_large_for_a_settled_policy_does_not_break_it():
         assert metrics["kl"] < 3.0
         rates.append(metrics["learning_rate"])
     assert rates[-1] < rates[0] / 2
-
-
-def test_learning_rate_stays_in_its_range():
-    hyper = {"kl_target": 0.012, "learning_rate_range": (1e-4, 3e-4)}
-    assert ppo._adapt_rate(jnp.float32(2.5e-4), jnp.float32(0.0), hyper) == jnp.float32(3e-4)
-    assert ppo._adapt_rate(jnp.float32(1.2e-4), jnp.float32(1.0), hyper) == jnp.float32(1e-4)
 
 
 @pytest.mark.parametrize("field", ["observation", "last_observation", "action", "log_probability", "reward"])

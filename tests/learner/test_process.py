@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import pathlib
 import threading
 import time
 
@@ -22,7 +21,6 @@ from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run, open_run
 from tests.learner.made_up_actor import MadeUpActor
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 CONFIG = RunConfig(
     name="t",
     environments=2,
@@ -39,15 +37,30 @@ def hub() -> MemoryHub:
     return MemoryHub()
 
 
+@pytest.fixture
+def act(hub):
+    """A function that starts made-up actors, which end with the test."""
+    made = []
+
+    def make(*arguments, **options) -> MadeUpActor:
+        made.append(MadeUpActor(MemoryTransport(hub), *arguments, **options))
+        return made[-1]
+
+    yield make
+    for actor in made:
+        actor.stop.set()
+        actor.join(10.0)
+
+
 def learn(run_dir, hub, config=CONFIG, stop_event=None, **options) -> PolicyBundle:
     with MemoryTransport(hub) as transport:
         return run_learner(run_dir, config, transport, stop_event=stop_event or threading.Event(), **options)
 
 
-def test_a_run_from_beginning_to_end(tmp_path, hub):
+def test_a_run_from_beginning_to_end(tmp_path, hub, act):
     create_run(tmp_path, CONFIG)
     logs = MemoryTransport(hub).subscribe(Keys("t").logs, depth=1000)
-    actors = [MadeUpActor(MemoryTransport(hub), name) for name in "ab"]
+    actors = [act(name) for name in "ab"]
     entered = []
 
     @contextlib.contextmanager
@@ -80,9 +93,9 @@ def test_a_run_from_beginning_to_end(tmp_path, hub):
     assert any("complete after 3 updates" in meta["text"] for meta in kinds["event"])
 
 
-def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
+def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub, act):
     create_run(tmp_path, CONFIG)
-    actor = MadeUpActor(MemoryTransport(hub))
+    actor = act()
     stop = threading.Event()
     forever = dataclasses.replace(CONFIG, updates=10**6)
     first = learn(tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 3 and stop.set())
@@ -98,18 +111,18 @@ def test_a_stopped_run_is_resumed_with_the_same_actor(tmp_path, hub):
     assert actor.versions == sorted(actor.versions)
 
 
-def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub):
+def test_a_learner_without_journals_writes_nothing_of_rollouts(tmp_path, hub, act):
     """As where they stay on a device: `audit=False`."""
     create_run(tmp_path, CONFIG)
-    MadeUpActor(MemoryTransport(hub))
+    act()
     assert learn(tmp_path, hub, audit=False).version == 3
     assert not (tmp_path / "accepted").exists() and not (tmp_path / "audit").exists()
 
 
-def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(tmp_path, hub):
+def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(tmp_path, hub, act):
     """The newest checkpoint is damaged, the link gone and the version zeroed: it goes on from the one before."""
     create_run(tmp_path, CONFIG)
-    actor = MadeUpActor(MemoryTransport(hub))
+    act()
     stop = threading.Event()
     forever = dataclasses.replace(CONFIG, updates=10**6)
     learn(tmp_path, hub, forever, stop, on_update=lambda values: values["update"] == 5 and stop.set())
@@ -126,8 +139,6 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
         on_update=lambda values: seen.append((values["update"], values["version"])),
         on_event=lambda level, text: said.append(text),
     )  # fmt: skip
-    actor.stop.set()
-    actor.join(10.0)
     assert seen == [(5, 7), (6, 8), (7, 9)]  # versions up to 5 are out, and 6 is what the resume begins with
     assert f"Resuming from the checkpoint {kept}/checkpoint_000000004.safetensors." in said
     assert any("000000005.safetensors is damaged" in text for text in said)
@@ -135,15 +146,13 @@ def test_a_resume_without_link_and_version_file_goes_on_and_overwrites_nothing(t
     assert (tmp_path / "policy.safetensors.aside").read_bytes() == policy
 
 
-def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a_row(tmp_path, hub, monkeypatch):
+def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a_row(tmp_path, hub, act, monkeypatch):
     config = dataclasses.replace(CONFIG, updates=20)
     create_run(tmp_path, config)
     monkeypatch.setattr(Admission, "check", lambda self, message: None)  # what is within the ranges breaks nothing
-    actor = MadeUpActor(MemoryTransport(hub), reward=1e37)
+    act(reward=1e37)
     with pytest.raises(PhysicsError, match=r"update 5: .* 5th such batch in a row.*failure") as caught:
         learn(tmp_path, hub, config)
-    actor.stop.set()
-    actor.join(10.0)
     assert "\n" not in str(caught.value)
     assert {path.name for path in (tmp_path / "failure").iterdir()} == {"state.safetensors", "batch.safetensors"}
     # What waited is taken up by a resume, the batch itself is not.
@@ -151,11 +160,11 @@ def test_batches_that_break_the_update_are_dropped_until_there_are_too_many_in_a
     assert not kept & {0, 1}
 
 
-def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(tmp_path, hub, monkeypatch):
+def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(tmp_path, hub, act, monkeypatch):
     config = dataclasses.replace(CONFIG, updates=8)
     create_run(tmp_path, config)
     monkeypatch.setattr(Admission, "check", lambda self, message: None)
-    actor, said, seen = MadeUpActor(MemoryTransport(hub), reward=1e37), [], []
+    actor, said, seen = act(reward=1e37), [], []
 
     def on_event(level, text):
         if "The batch was dropped" in text:
@@ -163,8 +172,6 @@ def test_a_batch_that_breaks_the_update_is_dropped_and_the_run_goes_on(tmp_path,
             actor.reward = 1.0
 
     last = learn(tmp_path, hub, config, on_event=on_event, on_update=seen.append)
-    actor.stop.set()
-    actor.join(10.0)
     dropped = [values["batches_dropped"] for values in seen]
     assert 1 <= len(said) == dropped[-1] < 5 and said[0][0] == "error"
     assert [values["update"] for values in seen] == list(range(1, 9)) and last.version == 8
@@ -194,15 +201,13 @@ def _started(thread: threading.Thread):
     yield
 
 
-def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub):
+def test_a_collapse_ends_the_run_and_is_said(tmp_path, hub, act):
     config = dataclasses.replace(CONFIG, updates=20, collapse_patience=3)
     create_run(tmp_path, config)
-    actor = MadeUpActor(MemoryTransport(hub), links=0.0)
+    act(links=0.0)
     events = []
     with pytest.raises(CongraspError, match="Training collapsed: for 3 updates the hand has hardly touched"):
         learn(tmp_path, hub, config, on_event=lambda level, text: events.append((level, text)))
-    actor.stop.set()
-    actor.join(10.0)
     assert events[-1][0] == "fatal" and (tmp_path / "checkpoints" / "latest").exists()
 
 

@@ -21,16 +21,13 @@ RANGES = task_ranges(TASK, CurriculumConfig())
 
 
 def _rollouts(*spreads):
-    """Rollouts of the native engine, of whole episodes, whose actions have these standard deviations.
-
-    The privileged inputs are those of every fifth step: recording them would take other programs than the suite's.
-    """
+    """Rollouts of one step each of the native engine, of whole episodes, whose actions have these deviations."""
     worker, masses = suite.worker(), np.array([obj.mass for obj in suite.OBJECTS], np.float32)
     privileged = jax.jit(worker.env.critic_inputs)
     for spread in spreads:
         each = 0.5 * np.log(2 * np.pi) + np.log(spread)  # of one entry of an action, in nats
-        for _ in range(25):
-            rollout = worker.collect(suite.command(noise=spread), 5)
+        for _ in range(suite.TASK.approach_steps + suite.TASK.hold_steps):
+            rollout = worker.collect(suite.command(noise=spread), 1)
             arrays = {name: np.asarray(getattr(rollout, name)) for name in RECORDED}
             arrays["log_probability"] = arrays["log_probability"] - np.float32(each * rollout.action.shape[-1])
             arrays["privileged"] = np.asarray(privileged(worker.state, masses))[None]

@@ -21,10 +21,9 @@ from congrasp.learner.distributed import ranks as ranks_module
 from congrasp.learner.distributed.ranks import Ranks, ended_by
 from congrasp.learner.distributed.relay import relay
 from congrasp.learner.run_directory import create_run
+from tests.conftest import ROOT
 from tests.learner.rank_process import CONFIG
 from tests.waits import eventually
-
-ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 
 class Party:

@@ -59,39 +59,6 @@ def test_a_resumed_learner_measures_from_its_checkpoint():
     assert staleness.lag(3) == 2
 
 
-def test_asking_twice_is_asking_once():
-    staleness = manager()
-    assert staleness.grant(A, "x") is staleness.grant(A, "x")
-    assert staleness.running == 1
-    assert staleness.grant(B, "x").owner == B
-    assert staleness.running == 2
-
-
-def test_nobody_takes_all_tickets():
-    staleness = manager(batch=10, tickets_per_owner=3)
-    assert [bool(staleness.grant(A, str(i))) for i in range(5)] == [True, True, True, False, False]
-    assert staleness.grant(B, "0")
-
-
-def test_tickets_return():
-    now = [0.0]
-    staleness = manager(ticket_seconds=10, clock=lambda: now[0])
-    for owner in (A, B):
-        for i in "xy":
-            staleness.grant(owner, i)
-    assert staleness.forget(A) == 2 and staleness.capacity == 2
-    staleness.give_back(B, "x")
-    staleness.give_back(B, "x")
-    staleness.give_back(B, "unknown")
-    assert staleness.capacity == 3
-    now[0] = 9.9
-    assert staleness.capacity == 3
-    now[0] = 10.0
-    assert staleness.capacity == 4 and staleness.running == 0
-    counters = staleness.counters()
-    assert (counters["granted"], counters["returned"], counters["expired"]) == (4, 3, 1)
-
-
 def test_a_rollout_of_an_earlier_session_comes_in_under_a_present_ticket_of_its_owner():
     """An actor with one upload at a time would wait for the very place that its next ticket holds."""
     staleness = manager(batch=1, max_staleness=0)  # room for 1
@@ -162,6 +129,19 @@ class Admission(RuleBasedStateMachine):
             self.tickets[owner, ticket.id] = ticket.version
             self.deadlines[owner, ticket.id] = ticket.deadline
             self.granted[owner, ticket.id] = self.now
+            assert self.staleness.grant(owner, ticket.id) is ticket  # sent again, it is the same request
+
+    @precondition(lambda self: self.tickets)
+    @rule(data=st.data())
+    def give_back(self, data):
+        """Twice, and by others, which changes nothing."""
+        owner, ticket = key = data.draw(st.sampled_from(sorted(self.tickets)))
+        self.staleness.give_back(("d", "1"), ticket)
+        self.staleness.give_back((owner[0], "other"), ticket)
+        assert self.staleness.running == len(self.tickets)
+        for _ in range(2):
+            self.staleness.give_back(*key)
+        del self.tickets[key]
 
     @precondition(lambda self: self.tickets)
     @rule(data=st.data())

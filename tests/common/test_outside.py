@@ -1,7 +1,7 @@
-"""A constraint that only this file knows: all that the project makes of a constraint, it makes of this one.
+"""A constraint and a reward term that only this file knows: the project makes of them all that it makes of its own.
 
-Options, weights and probabilities are made of the constraints when their modules are imported. So the test runs this
-file as a program, which adds the constraint before it imports anything else.
+Options, weights and probabilities are made of constraints and terms when their modules are imported. So the test runs
+this file as a program, which adds its own before it imports anything else.
 """
 
 import dataclasses
@@ -18,8 +18,7 @@ import numpy as np
 from congrasp.common import rotations
 from congrasp.common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Weight
 from congrasp.common.task.constraints.markers import Polyline
-
-ROOT = pathlib.Path(__file__).parents[2]
+from tests.conftest import ROOT
 
 
 class LevelGoal(NamedTuple):
@@ -80,13 +79,18 @@ class Level(Constraint):
         return jnp.where(wrist, features.wrist_position[:, 2], center[:, 2]) - scene.state.object_position[:, 2]
 
 
+def height(scene, earning):
+    rise = scene.state.object_position[:, 2] - scene.state.object_position_initial[:, 2]
+    return jnp.clip(rise, 0.0, 0.2)
+
+
 def test_nothing_else_must_be_changed():
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "tests.common.test_outside_constraint"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "tests.common.test_outside"]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=220)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines() == [
-        *("episodes", "tables", "server", "command line", "file", "marker", "studio", "ONNX")
+        *("episodes", "tables", "server", "command line", "file", "marker", "studio", "ONNX", "term")
     ]
 
 
@@ -127,9 +131,8 @@ def episodes(task):
     paid = np.where(active & wrist, 0.7 * np.abs(height).sum(0), 0.0)
     np.testing.assert_allclose(-found["term/level_height"][wrist], paid[wrist], atol=1e-4)
     assert (found["term/level_height"][active] < 0).all() and not found["term/level_height"][~active].any()
-    sizes = dict(layout(hand, task))
-    assert sizes["level"] == 2 and sizes["mask"] == 5 and [name for name in sizes][-2:] == ["level", "mask"]
-    block = np.asarray(rollout.observation)[..., -7:-5]
+    assert layout(hand, task)[-2:] == (("level", 2), ("mask", 1))
+    block = np.asarray(rollout.observation)[..., -3:-1]
     np.testing.assert_array_equal(block[0, :, 0], active & wrist)
     np.testing.assert_allclose(block[1, :, 1][active & wrist], height[0][active & wrist], atol=1e-5)
     assert not block[:, ~active].any()
@@ -141,9 +144,7 @@ def tables(task, values):
     from congrasp.services.evaluate import cells, scores
 
     assert scores.TABLES["single"][-1] == "level" and scores.ERRORS["level"] == {"level_m": "level_m"}
-    others = ("trajectory", "pose_finger", "affordance")
-    alone = (values["mask_level"] > 0) & ~np.any([values[f"mask_{name}"] for name in others], 0)
-    assert alone.any()
+    alone = values["mask_level"] > 0
     plan = {"identity": np.arange(len(alone)), "mass_kg": np.full(len(alone), 0.2)}
     some = {name: column[alone] for name, column in {**values, **plan, "success": np.ones(len(alone))}.items()}
     nothing = np.zeros((0, 1, 1))
@@ -161,7 +162,7 @@ def server(task):
     from congrasp.services.serve.requests import Layout
 
     layout = Layout(get_hand("human"), task)
-    assert layout.shapes["level_wrist"] == (1,) and layout.shapes["asked"] == (5,)
+    assert layout.shapes["level_wrist"] == (1,) and layout.shapes["asked"] == (2,)
     assert layout.description()["fields"]["level_wrist"] == [layout.offsets["level_wrist"], 1]
 
 
@@ -176,12 +177,13 @@ def command_line():
     from congrasp.services.cli import main
     from congrasp.services.grasp.parse import read_request
 
-    for command, options in {"grasp": ["--level"], "train": ["--task.p-level", "--task.reward.level-height"]}.items():
+    train = ["--task.p-level", "--task.reward.level-height", "--task.reward.height", "Per metre of rise."]
+    for command, words in {"grasp": ["--level"], "train": train}.items():
         said = io.StringIO()
         with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
             main.load(command)(["--help"])
-        for option in options:
-            assert option in said.getvalue(), option
+        for word in words:
+            assert word in said.getvalue(), word
     parsed = main._parsed("grasp", main.load("grasp"), ["can.obj", "--level", "wrist"])
     assert "level='wrist'" in repr(parsed)
     request = read_request(procedural.generate(0, "box"), get_hand("human"), 15, level="wrist")
@@ -248,16 +250,34 @@ def onnx(task):
     ]
 
 
+def term():
+    """The reward term: paid with its weight, which a run keeps."""
+    from congrasp.common.config import RunConfig, run_config_from_json, to_json
+    from congrasp.common.task.config import RewardWeights, TaskConfig
+    from congrasp.common.task.reward import reward_terms, terms
+    from tests.scenes import evaluated, scene, scene_of
+
+    task, (state, surface, goal) = TaskConfig(constraints=("heading",)), scene(0, batch=3)
+    start = state.object_position_initial * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.1]
+    risen = start + np.array([[0.0, 0.0, 0.05], [0.0, 0.0, -0.05], [0.0, 0.0, 0.8]])
+    state = state._replace(object_position=risen, object_position_initial=start)
+    weights = dataclasses.replace(RewardWeights(), height=3.0)
+    paid = evaluated(reward_terms, scene_of(task, state, surface, goal), weights)
+    np.testing.assert_allclose(paid["height"], [3.0 * 0.05, 0.0, 3.0 * 0.2], rtol=1e-5)
+    assert set(paid) == set(terms(task)) and "height" in terms(task) and RewardWeights().height == 2.0
+    config = RunConfig(task=TaskConfig(reward=RewardWeights(height=0.5)))
+    assert run_config_from_json(to_json(config)) == config
+
+
 if __name__ == "__main__":
-    from congrasp.common.task import constraints
+    from congrasp.common.task import constraints, reward
 
     constraints.CONSTRAINTS = (*constraints.CONSTRAINTS, Level())
+    reward.GRASP = (*reward.GRASP, reward.Term("height", 2.0, "Per metre of rise.", height))
 
     from congrasp.common.task.config import TaskConfig
 
-    TASK = dataclasses.replace(
-        TaskConfig(constraints=(*constraints.PAPER, "level")), approach_steps=2, hold_steps=1, hold_steps_max=1
-    )
+    TASK = TaskConfig(constraints=("heading", "level"), approach_steps=2, hold_steps=1, hold_steps_max=1)
     metrics = episodes(TASK)
     print("episodes")
     tables(TASK, metrics)
@@ -274,3 +294,5 @@ if __name__ == "__main__":
     print("studio")
     onnx(TASK)
     print("ONNX")
+    term()
+    print("term")
