@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from typing_extensions import Doc
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.arm.options import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
@@ -118,6 +118,8 @@ def grasp(
     at_most(120.0, "frames a second", fps=fps)
     if out.exists() and not out.is_dir():
         raise CongraspError(f"--out is the file {out}.", "Pass a folder; it is created if it does not exist.")
+    if video:
+        need_package("--video", "imageio_ffmpeg")
     right, left = right_name(hand)
     if left and arm.arm:
         raise CongraspError("An arm carries right hands alone.", "Leave out --arm or :left.")
