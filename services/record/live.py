@@ -180,7 +180,7 @@ class _Gate:
 
     def _run(self) -> None:
         """Runs until it is closed."""
-        loop = self._loop
+        asyncio.set_event_loop(loop := self._loop)
         loop.run_until_complete(asyncio.start_server(self._admit, sock=self._outside, limit=_HEAD))
         loop.run_forever()
         tasks = asyncio.all_tasks(loop)
