@@ -23,7 +23,11 @@ _SMALL = 1e-6  # samples: a triangle of a smaller area covers nothing
 def _compiled(function: Function) -> Function:
     """Compiles a function; machine code is cached in the user's cache, unless that cannot be written."""
     folder = cache_folder("kernels")
-    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "afn", "reassoc"}}
+    options: dict[str, Any] = {
+        "nogil": True,
+        "error_model": "numpy",
+        "fastmath": {"contract", "arcp", "nsz", "afn", "reassoc"},
+    }
     config: Any = numba.config
     others, config.CACHE_DIR = config.CACHE_DIR, str(folder)
     try:
