@@ -116,6 +116,8 @@ def _said_of(error: OSError) -> str:
         return str(
             CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its permissions.")
         )
+    if error.errno == errno.ENOENT and "temporary directory" in str(error):
+        return "There is no folder for temporary files that can be written. Set TMPDIR to one."
     if error.errno == errno.EIO:
         return "A file could not be read or written, because its disk failed. Try another path."
     raise error

@@ -29,6 +29,7 @@ _TYPES = {
 _POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
 _ROUTES = "/api/"
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_OWN = re.compile("/(api|static)/[^/]*$")
 _TOKEN = re.compile("[0-9a-f]{32}")
 _TIMEOUT = 30.0  # seconds that a request may take to arrive
 _DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes read of a refused body, so that the answer arrives before the close
@@ -216,12 +217,14 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Logs nothing."""
 
     def _route(self) -> tuple[str, dict[str, str]]:
-        """Path and query parameters of the request; an empty path for a malformed URL."""
+        """Path, without the prefix of a proxy, and query parameters; an empty path for a malformed URL."""
         try:
             parts = urllib.parse.urlsplit(self.path)
         except ValueError:
             return "", {}
-        return parts.path, dict(urllib.parse.parse_qsl(parts.query))
+        own = _OWN.search(parts.path)
+        path = own[0] if own else "/" if parts.path.endswith("/") else parts.path
+        return path, dict(urllib.parse.parse_qsl(parts.query))
 
     def _refused(self, fault: str = "") -> bool:
         """Sends a refusal if the request is not allowed, or has another fault; returns True if it did."""

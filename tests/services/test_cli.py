@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from unittest import mock
 
@@ -121,6 +122,10 @@ def test_libraries_add_nothing_to_the_line(arguments, words):
             OSError(errno.EIO, os.strerror(errno.EIO)),
             "A file could not be read or written, because its disk failed. Try another path.",
         ),
+        (
+            FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"),
+            "There is no folder for temporary files that can be written. Set TMPDIR to one.",
+        ),
     ],
 )
 def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(error, line, monkeypatch, capsys):
@@ -179,6 +184,16 @@ main()
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0 and "allegro" in done.stdout, done.stderr
     assert done.stdout.endswith("shut down\n") is not late
+
+
+def test_a_command_runs_in_any_thread_of_a_program(capsys):
+    """Python signals the main thread alone."""
+    codes: list[int] = []
+    with mock.patch.dict(os.environ):
+        thread = threading.Thread(target=lambda: codes.append(cli.run(["hands", "list"])))
+        thread.start()
+        thread.join(60.0)
+    assert codes == [0] and "allegro" in capsys.readouterr().out
 
 
 def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path):

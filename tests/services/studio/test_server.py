@@ -165,6 +165,7 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         assert code(Host="hub.example.org", Origin="https://evil.example") == 403
         refused = page.ask("GET", "/", Host="other.example.org")
         assert refused[0] == 403 and "--allow-host 'other.example.org'" in json.loads(refused[1])["error"]
+        assert page.ask("GET", "/user/me/proxy/7480/api/state")[0] == page.ask("GET", "/user/me/")[0] == 200
         for file in STATIC.iterdir():  # a proxy offers the page below a prefix
             assert not re.search(r"[\"'`]/(api|static)/", file.read_text())
     finally:
