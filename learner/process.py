@@ -419,7 +419,7 @@ class _Learner:
             lost = self._state.version - self._saved
             loss = f"A kill now would lose {lost} update(s), those since update {self._saved}."
             self._hub.trouble = f"No checkpoint can be written: {error} {loss}"
-            if not self._unsaved or lost >= 2 * self._unsaved:  # again whenever the loss has doubled
+            if not self._unsaved or lost >= 4 * self._unsaved:  # again when there is much more to lose
                 self._unsaved = max(1, lost)
                 self._event("error", f"{error} Training continues and retries after every update. {loss}")
             return False
