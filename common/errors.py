@@ -1,5 +1,6 @@
 """Errors that a user can act on: one line that names the input and the remedy."""
 
+import importlib.util
 import re
 
 _LONGEST = 2000  # characters: a line may quote input from elsewhere
@@ -44,6 +45,12 @@ class MissingPackageError(CongraspError):
         """
         extra = _EXTRAS.get(package, "train")
         super().__init__(f"{what} needs the package '{package}'.", f"Run: pip install 'congrasp[{extra}]'")
+
+
+def need_package(what: str, package: str) -> None:
+    """Raises a `MissingPackageError` if a package that `what` needs is not installed; call it before the work."""
+    if importlib.util.find_spec(package) is None:
+        raise MissingPackageError(what, package)
 
 
 class TooWideError(CongraspError):

@@ -16,6 +16,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    __version__: str
     from congrasp.common.errors import (
         CongraspError,
         ContradictionError,
@@ -92,7 +93,13 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported (PEP 562)."""
+    """A public name, imported (PEP 562), or the version of the installed distribution."""
+    if name == "__version__":
+        metadata = importlib.import_module("importlib.metadata")
+        try:
+            return metadata.version("congrasp")
+        except metadata.PackageNotFoundError:
+            return "not installed"
     if name not in __all__:
         raise AttributeError(f"module 'congrasp' has no attribute '{name}'")
     errors = importlib.import_module("congrasp.common.errors")

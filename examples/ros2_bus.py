@@ -10,8 +10,15 @@ import numpy as np
 import congrasp
 
 JOINTS, POSE, FRAMES = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
-CLOUD = "sensor_msgs/msg/PointCloud2"
-INPUTS = {"joint_states": JOINTS, "wrist_pose": POSE, "object_pose": POSE, "tf": FRAMES, "tf_static": FRAMES}
+CLOUD, CLOCK = "sensor_msgs/msg/PointCloud2", "rosgraph_msgs/msg/Clock"
+INPUTS = {
+    "joint_states": JOINTS,
+    "wrist_pose": POSE,
+    "object_pose": POSE,
+    "tf": FRAMES,
+    "tf_static": FRAMES,
+    "clock": CLOCK,
+}
 OUTPUTS = {"joint_command": JOINTS, "wrist_command": POSE}
 _MOST = 64
 """Maximum number of waiting messages of a topic."""
@@ -61,7 +68,7 @@ class RosBus:
         for topic, kind in inputs.items():
             # Takes reliable publishers, too. Static transforms are published once and kept for later subscribers.
             lasting = {"durability": qos.DurabilityPolicy.TRANSIENT_LOCAL} if topic == "tf_static" else {}
-            depth = 1 if kind in (POSE, CLOUD) else _MOST  # several nodes publish joints and frames
+            depth = 1 if kind in (POSE, CLOUD, CLOCK) else _MOST  # several nodes publish joints and frames
             profile = qos.QoSProfile(depth=depth, reliability=qos.ReliabilityPolicy.BEST_EFFORT, **lasting)
             self._node.create_subscription(self._type(kind), topic, self._keep(topic), profile)
         self._publishers = {t: self._node.create_publisher(self._type(k), t, 1) for t, k in OUTPUTS.items()}
@@ -134,7 +141,7 @@ class ZenohBus:
             ) from None
         self._subscribers = {
             topic: self._session.declare_subscriber(
-                topic.strip("/"), RingChannel(1 if kind in (POSE, CLOUD) else _MOST)
+                topic.strip("/"), RingChannel(1 if kind in (POSE, CLOUD, CLOCK) else _MOST)
             )
             for topic, kind in inputs.items()
         }

@@ -11,6 +11,7 @@
 | in: `object_pose` | geometry_msgs/PoseStamped | the frame of the object's file |
 | in: `--cloud-topic` | sensor_msgs/PointCloud2 | instead of `object_pose`, for a policy with a camera |
 | in: `tf`, `tf_static` | tf2_msgs/TFMessage | the frames of these poses in `--world`: z up, the table at z = 0 |
+| in: `clock` | rosgraph_msgs/Clock | a simulator's time, to which all stamps then refer; the time of day otherwise |
 | out: `joint_command` | sensor_msgs/JointState | finger targets (`position`) and torques (`effort`) |
 | out: `wrist_command` | geometry_msgs/PoseStamped | where what carries the hand should be, in `--world` |
 
@@ -240,7 +241,8 @@ class PolicyNode:
     def _publish(self, command: congrasp.Command, down: Pose) -> None:
         """Sends the targets."""
         assert self._base is not None
-        make, stamp = self._bus.make, time.time_ns()
+        make, clock = self._bus.make, self._sensors.clock
+        stamp = time.time_ns() if clock is None else round(1e9 * clock)
         now = make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
         header = make("std_msgs/msg/Header", stamp=now, frame_id=self._plan.world)
         position, effort = command.q_target.tolist(), command.q_torque.tolist()

@@ -1,6 +1,7 @@
 """Joints, and poses in the world frame, from the inputs of `ros2_node.py`."""
 
 import dataclasses
+import sys
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,10 @@ import congrasp
 
 if TYPE_CHECKING:
     from ros2_node import Arguments
+
+
+_EPOCH = 1e9
+"""Stamps before this, s, are not the time of day (2001), but that since the start of a simulator."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +61,9 @@ class Sensors:
         """The topic that shows the object."""
         self.unseen = ""
         """Reason that no object was found in that topic's messages; empty if one was."""
+        self.clock: float | None = None
+        """Simulated time, s; None where no simulator publishes `clock`."""
+        self._unsynchronised = False
         self._world, self._ages = arguments.world, dict.fromkeys(INPUTS, arguments.robot_age)
         self._ages[self.eyes] = object_age
         self._joints: dict[str, tuple[float, float, float]] = {}
@@ -64,19 +72,21 @@ class Sensors:
 
     def take(self, received: list[tuple[str, Any]]) -> None:
         """Stores received messages."""
-        for topic, message in received:
-            if topic == "joint_states":
+        for topic, message in sorted(received, key=lambda pair: pair[0] != "clock"):
+            if topic == "clock":
+                self.clock = seconds(message.clock)
+            elif topic == "joint_states":
                 velocity = (
                     message.velocity if len(message.velocity) == len(message.name) else [np.nan] * len(message.name)
                 )
                 rows = zip(message.name, message.position, velocity, strict=False)
-                self._joints |= {name: (q, v, stamped(message.header)) for name, q, v in rows}
+                self._joints |= {name: (q, v, self._when(topic, message.header)) for name, q, v in rows}
             elif INPUTS.get(topic) != FRAMES:
-                self._newest[topic] = message, stamped(message.header)
+                self._newest[topic] = message, self._when(topic, message.header)
             else:
                 for part in message.transforms:
                     pose = read_pose(part.transform.translation, part.transform.rotation)
-                    when = np.inf if topic == "tf_static" else stamped(part.header)
+                    when = np.inf if topic == "tf_static" else self._when(topic, part.header)
                     if pose is not None:
                         self._frames[part.child_frame_id] = part.header.frame_id, pose, when
 
@@ -115,6 +125,16 @@ class Sensors:
                 lacking.append(f"{topic}: {self.unseen}")
         return "; ".join(lacking)
 
+    def _when(self, topic: str, header: Any) -> float:
+        """See `stamped`; reports the first stamp of a simulator that publishes no clock."""
+        if self.clock is None and 0 < seconds(header.stamp) < _EPOCH and not self._unsynchronised:
+            self._unsynchronised = True
+            print(
+                f"{topic}: its stamps are a simulator's, which publishes no clock: messages count from their arrival.",
+                file=sys.stderr,
+            )
+        return stamped(header, self.clock)
+
     def _framed(self, topic: str) -> tuple[Any, Pose | None]:
         """A topic's newest message, and the pose of its frame in the world; no pose if it is too old."""
         message, when = self._newest.get(topic, (None, -np.inf))
@@ -134,10 +154,23 @@ class Sensors:
         return None
 
 
-def stamped(header: Any) -> float:
-    """Time of a message's stamp on the clock of `time.monotonic`; now if it has no stamp, or one in the future."""
-    stamp = header.stamp.sec + 1e-9 * header.stamp.nanosec
-    return time.monotonic() - (max(time.time() - stamp, 0.0) if stamp else 0.0)
+def seconds(stamp: Any) -> float:
+    """A message's time in s."""
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+def stamped(header: Any, clock: float | None = None) -> float:
+    """Time of a message's stamp on the clock of `time.monotonic`; now if it has no stamp, or one in the future.
+
+    Args:
+      header: the message's.
+      clock: simulated time, s, to which stamps refer. Without it they refer to the time of day; those of a simulator
+        then count as now.
+    """
+    stamp = seconds(header.stamp)
+    now = time.time() if clock is None else clock
+    timed = stamp > 0 if clock is not None else stamp > _EPOCH
+    return time.monotonic() - (max(now - stamp, 0.0) if timed else 0.0)
 
 
 def read_pose(place: Any, turn: Any) -> Pose | None:

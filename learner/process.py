@@ -102,14 +102,15 @@ def run_learner(
       PhysicsError: several batches in a row had values that were not finite; state and last batch are in `failure/`.
     """
     ranks = ranks or Ranks()
+    check_lock: Callable[[], None] = lambda: None  # noqa: E731  of other ranks
     try:
         with contextlib.ExitStack() as stack:
             if ranks.rank == 0:
                 open_run(run_dir)
-                stack.enter_context(exclusive(run_dir, functools.partial(on_event, "warning")))
+                check_lock = stack.enter_context(exclusive(run_dir, functools.partial(on_event, "warning")))
             deaths = stack.enter_context(_watch_threads())
             stack.enter_context(recorder or contextlib.nullcontext())
-            learner = _Learner(run_dir, config, transport, ranks, resume, audit, on_event)
+            learner = _Learner(run_dir, config, transport, ranks, resume, audit, on_event, check_lock)
             try:
                 learner.train(stop_event, deaths, on_update)
             finally:
@@ -150,7 +151,9 @@ class _Learner:
         resume: bool,
         audit: bool,
         on_event: Notify,
+        check_lock: Callable[[], None],
     ):
+        self._check_lock = check_lock
         self._run_dir, self._config, self._transport, self._ranks = run_dir, config, transport, ranks
         self._keys = Keys(config.name)
 
@@ -165,7 +168,7 @@ class _Learner:
         self._checkpoints = Checkpoints(run_dir / CHECKPOINTS)
         self._state, meta = self._first_state(resume)
         self._dropped = self._dropped_in_a_row = 0
-        self._saved, self._unsaved = self._state.version, False
+        self._saved, self._unsaved = self._state.version, 0
         self._run_id, self._skipped, hubs = meta["run_id"], meta["skipped"], meta["hubs"]
         if ranks.count > 1:
             # Before the hub exists, and so before an actor in this process captures its engine's graphs.
@@ -354,6 +357,7 @@ class _Learner:
 
     def _publish(self) -> None:
         if self._ranks.rank == 0:
+            self._check_lock()
             try:
                 note_version(self._run_dir, self.version)
             except CongraspError as error:
@@ -412,15 +416,16 @@ class _Learner:
         except ReplicasDiffer:
             raise
         except CongraspError as error:
-            if not self._unsaved:
-                at_stake = f"the {self._state.version - self._saved} update(s) since update {self._saved}"
-                text = f"{error} Training continues and retries after every update. Until then, a kill loses {at_stake}"
-                self._event("error", f"{text} and all later ones.")
-            self._unsaved = True
+            lost = self._state.version - self._saved
+            loss = f"A kill now would lose {lost} update(s), those since update {self._saved}."
+            self._hub.trouble = f"No checkpoint can be written: {error} {loss}"
+            if not self._unsaved or lost >= 4 * self._unsaved:  # again when there is much more to lose
+                self._unsaved = max(1, lost)
+                self._event("error", f"{error} Training continues and retries after every update. {loss}")
             return False
         if self._unsaved:
             self._event("info", f"Checkpoints can be written again; the newest is of update {self._state.version}.")
-        self._unsaved = False
+        self._unsaved, self._hub.trouble = 0, ""
         return True
 
     def _shut_actors_down(self) -> None:

@@ -15,6 +15,7 @@ import fcntl
 import os
 import pathlib
 from collections.abc import Callable, Iterator
+from typing import BinaryIO
 
 from congrasp.common.config import RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
@@ -83,35 +84,58 @@ def open_run(run_dir: pathlib.Path) -> RunConfig:
 
 
 @contextlib.contextmanager
-def exclusive(run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text: None) -> Iterator[None]:
+def exclusive(run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text: None) -> Iterator[Callable[[], None]]:
     """Context that locks a run directory; the lock ends with the process.
 
     Args:
       run_dir: directory of the run.
       notify: called if the file system has no locks.
 
+    Yields:
+      A function that locks the directory again if the lock's file was removed; it raises a CongraspError if another
+      process has taken the directory since.
+
     Raises:
       CongraspError: another process holds the lock.
     """
+    path = run_dir / _LOCK_FILE
+    with contextlib.ExitStack() as stack:
+        held = stack.enter_context(_locked(run_dir, notify))
+
+        def check() -> None:
+            nonlocal held
+            try:
+                intact = os.path.samestat(os.fstat(held.fileno()), path.stat())
+            except FileNotFoundError:
+                intact = False
+            if not intact:
+                held = stack.enter_context(_locked(run_dir, notify))
+
+        yield check
+
+
+def _locked(run_dir: pathlib.Path, notify: Callable[[str], None]) -> BinaryIO:
+    """The locked file of a run directory, see `exclusive`."""
     # A lock by `lockf` belongs to the process: forked children do not inherit it.
-    with open(run_dir / _LOCK_FILE, "a+b", 0) as file:
-        try:
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in (errno.EACCES, errno.EAGAIN):
-                file.seek(0)
-                holder = f"process {file.read(32).decode(errors='replace')}"
-                url = learner_url(run_dir)
-                raise CongraspError(
-                    f"{run_dir} is in use by {holder}{f', which listens at {url}' if url else ''}.",
-                    "Stop it first, or choose another --run-dir.",
-                ) from None
-            notify(f"{run_dir} is on a file system without locks: a second learner would not be detected.")
-        else:
-            with contextlib.suppress(OSError):  # a full disk only removes the number from another process's error
-                file.truncate(0)
-                file.write(f"{os.getpid()}".encode())
-        yield
+    file = open(run_dir / _LOCK_FILE, "a+b", 0)  # noqa: SIM115  the lock ends when it closes
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            file.seek(0)
+            holder = f"process {file.read(32).decode(errors='replace')}"
+            file.close()
+            url = learner_url(run_dir)
+            raise CongraspError(
+                f"{run_dir} is in use by {holder}{f', which listens at {url}' if url else ''}.",
+                "Stop it first, or choose another --run-dir.",
+            ) from None
+        notify(f"{run_dir} is on a file system without locks: a second learner would not be detected.")
+    else:
+        with contextlib.suppress(OSError):  # a full disk only removes the number from another process's error
+            file.truncate(0)
+            file.write(f"{os.getpid()}".encode())
+    return file
 
 
 @contextlib.contextmanager

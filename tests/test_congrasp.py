@@ -1,5 +1,6 @@
 """The public face: every name is there, is imported when it is used, and the client needs numpy and zenoh alone."""
 
+import importlib.metadata
 import inspect
 import re
 import textwrap
@@ -52,6 +53,12 @@ def test_every_public_name_is_there_and_documented():
         assert found.__name__ == name and inspect.getdoc(found)
     with pytest.raises(AttributeError, match="no attribute 'grab'"):
         congrasp.grab  # noqa: B018
+
+
+def test_a_source_tree_without_an_installed_distribution_has_a_version_too(monkeypatch):
+    assert congrasp.__version__ == importlib.metadata.version("congrasp")
+    monkeypatch.setattr(importlib.metadata.Distribution, "discover", lambda **context: iter(()))
+    assert congrasp.__version__ == "not installed"
 
 
 def test_client_guard_and_errors_need_numpy_and_zenoh_alone():

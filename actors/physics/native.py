@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import psutil
 
 from congrasp.actors.physics.engine import PhysicsState, ResetState
 from congrasp.actors.physics.physics_state import has_diverged, physics_state
@@ -17,6 +16,7 @@ from congrasp.actors.physics.scene import GAINS, MASS_POWERS, TABLE_AWAY, addres
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.parallel import memory
 from congrasp.common.task.config import TaskConfig
 
 _ENVIRONMENT = 860_000  # bytes of a stepped environment: model, data and their stack
@@ -87,7 +87,7 @@ class NativePhysics:
           CongraspError: they would not fit into free memory.
         """
         batch = len(np.asarray(reset_state.object_index))
-        if (free := psutil.virtual_memory().available) < batch * _ENVIRONMENT:
+        if (free := memory()) < batch * _ENVIRONMENT:
             raise CongraspError(
                 f"{batch:,} environments of MuJoCo C need {batch * _ENVIRONMENT / 1e9:.0f} GB of memory, but "
                 f"{free / 1e9:.0f} GB are free.",

@@ -11,6 +11,7 @@ from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.left import left_hand, right_name
 from congrasp.common.hands.mano import own_mano_hand
 from congrasp.common.hands.spec import Hand
+from congrasp.common.io.files import user_folder
 from congrasp.common.io.inputs import LONGEST_NAME
 
 HANDS: dict[str, Callable[[], Hand]] = {
@@ -32,8 +33,7 @@ def own_hands() -> dict[str, pathlib.Path]:
 
 def hands_folder() -> pathlib.Path:
     """Folder of the user's custom hands: `CONGRASP_HANDS`, or congrasp/hands in the user's configuration."""
-    config = os.environ.get("XDG_CONFIG_HOME") or pathlib.Path.home() / ".config"
-    return pathlib.Path(os.environ.get(VARIABLE) or pathlib.Path(config, "congrasp", "hands"))
+    return pathlib.Path(os.environ.get(VARIABLE) or user_folder("XDG_CONFIG_HOME", ".config") / "congrasp" / "hands")
 
 
 def check_reference(reference: object) -> str:

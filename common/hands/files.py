@@ -149,7 +149,7 @@ def faults(hand: Hand) -> list[str]:
         return found
     for motor in hand.motors:
         if min(motor.kp, motor.torque_limit) <= 0 or motor.kv < 0:
-            found.append(f"gains and torque limit of '{motor.name}' must be above zero")
+            found.append(f"kp and torque limit of '{motor.name}' must be above zero, and kv at least zero")
     for pose, named, q in (("open", hand.open_pose, hand.q_open), ("closed", hand.closed_pose, hand.q_closed)):
         found += [f"the {pose} pose names '{name}', which is not a joint" for name in sorted({*named} - {*joints})]
         for joint, angle in zip(hand.joints, q, strict=True):

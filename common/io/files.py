@@ -1,10 +1,14 @@
 """Atomic file writes: a reader finds the old content or the new one."""
 
 import contextlib
+import functools
+import logging
 import os
 import pathlib
 
 from congrasp.common.errors import CongraspError
+
+_log = logging.getLogger(__name__)
 
 
 def write_atomically(path: pathlib.Path, data: bytes) -> None:
@@ -37,9 +41,46 @@ def check_free(path: pathlib.Path, *, force: bool = False) -> None:
         raise CongraspError(f"{path} exists already.", "Pass another path with --out, or --force to replace it.")
 
 
+def check_output(option: str, path: pathlib.Path) -> None:
+    """Raises a CongraspError if neither a file nor a folder can be created at a path, before the work for it."""
+    parent = path if path.is_dir() else next(folder for folder in path.absolute().parents if folder.exists())
+    if not parent.is_dir():
+        raise CongraspError(f"{option} is {path}, but {parent} is a file.", "Pass another path.")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise CongraspError(f"{option} is {path}, but {parent} cannot be written.", "Pass a path in another folder.")
+
+
+def user_folder(variable: str, default: str) -> pathlib.Path:
+    """Returns a folder of the user, named by a variable of the XDG specification, or else the default in the home.
+
+    Without a home, as for a user id without an entry, it is a folder that does not exist and cannot be created.
+    """
+    try:
+        return pathlib.Path(os.environ.get(variable) or pathlib.Path.home() / default)
+    except RuntimeError:
+        return pathlib.Path(os.devnull, default)
+
+
 def cache_folder(name: str) -> pathlib.Path:
-    """Returns the user's cache folder for one subject; `XDG_CACHE_HOME` overrides the parent folder."""
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "congrasp" / name
+    """Returns the user's cache folder for one subject; `XDG_CACHE_HOME` overrides the parent folder.
+
+    It may be read-only or absent: the first call then logs that, and writers must ignore it.
+    """
+    folder = user_folder("XDG_CACHE_HOME", ".cache") / "congrasp"
+    can_cache(folder, "XDG_CACHE_HOME")
+    return folder / name
+
+
+@functools.cache
+def can_cache(folder: pathlib.Path, setting: str) -> bool:
+    """True if files can be written to a cache; otherwise the first call logs why, and the setting that moves it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        check_output("the cache", folder)
+    except (OSError, CongraspError):
+        _log.warning("Nothing can be cached in %s, so that it is computed again each time. Set %s.", folder, setting)
+        return False
+    return True
 
 
 def sync_directory(path: pathlib.Path) -> None:

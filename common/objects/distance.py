@@ -25,6 +25,7 @@ from congrasp.common.io.caches import keep, read_kept
 from congrasp.common.io.files import cache_folder
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
+from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import Message
 
@@ -219,7 +220,7 @@ def _mesh_distance(obj: GraspObject, origin: np.ndarray, cell: float, shape: np.
     samples, face = trimesh.sample.sample_surface(mesh, count, seed=0)
     # Triangles too small to be sampled contribute their centres.
     samples, face = np.concatenate([samples, triangles.mean(1)]), np.concatenate([face, np.arange(len(triangles))])
-    distance, nearest = cKDTree(samples).query(points, workers=-1)
+    distance, nearest = cKDTree(samples).query(points, workers=cores())
     on_triangle = trimesh.triangles.closest_point(triangles[face[nearest]], points)
     distance = np.minimum(distance, np.linalg.norm(points - on_triangle, axis=-1))
     free = (distance > 0.5 * math.sqrt(3.0) * cell).reshape(shape)

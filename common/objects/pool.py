@@ -53,7 +53,8 @@ def scale_objects(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) 
 
 
 def first_seed(config: ObjectsConfig, shift: int) -> int:
-    """First seed of actor number `shift`: ranges of consecutive actors are disjoint, and stay below held-out seeds."""
+    """First seed of actor number `shift`: ranges of actors are disjoint while all fit below the held-out seeds."""
     if config.seed >= HELD_OUT_SEED:
         return config.seed
-    return (config.seed + shift * config.count) % max(1, HELD_OUT_SEED - config.count + 1)
+    number, offset = divmod(config.seed, config.count)
+    return offset + (number + shift) % max(1, (HELD_OUT_SEED - offset) // config.count) * config.count

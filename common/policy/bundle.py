@@ -35,6 +35,11 @@ from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 FORMAT = 2
 _SCHEMA = 1
+_MOST_COUNT = 1 << 53
+"""Limit of versions and environment steps, which JSON keeps exactly."""
+_LARGEST, _LARGEST_STATISTIC, _LARGEST_LOG_STD = 1e4, 1e30, 10.0
+"""Limits of the magnitude of weights, statistics, and logarithms of standard deviations: beyond them, inference in
+float32 overflows."""
 _MALFORMED = (LookupError, AttributeError, TypeError, ValueError, OverflowError)
 _REMEDY = "Use a bundle from 'congrasp train' of this version."
 
@@ -166,7 +171,7 @@ class PolicyBundle:
           source: name of the bundle in errors.
 
         Raises:
-          CongraspError: an entry is missing, has the wrong shape, or is not finite; the message names the first.
+          CongraspError: an entry is missing, has the wrong shape, or is out of range; the message names the first.
         """
         meta = message.meta
         if meta.get("format") != FORMAT:
@@ -181,6 +186,9 @@ class PolicyBundle:
             )
             task = _dataclass(TaskConfig, meta["task"])
             version, run_id, transitions = int(meta["version"]), str(meta["run_id"]), int(meta["transitions"])
+            for name, number in (("version", version), ("transitions", transitions)):
+                if not 0 <= number <= _MOST_COUNT:
+                    raise ValueError(f"its {name} is {number:.4g}")
             inputs = (*spec.layout, *spec.privileged)
             for fault in (*network_faults(spec.network, inputs, spec.action_size), *task_faults(task)):
                 raise ValueError(fault)
@@ -278,13 +286,17 @@ def _shapes(spec: PolicySpec) -> dict[str, tuple[int, ...]]:
 
 
 def _check_arrays(arrays: Mapping[str, Array], expected: Mapping[str, tuple[int, ...]], source: str) -> None:
-    """Raises a `CongraspError` unless the arrays have these names and shapes, and finite values."""
+    """Raises a `CongraspError` unless the arrays have these names and shapes, and values with which one can act."""
     if odd := sorted(expected.keys() ^ arrays.keys()):
         raise CongraspError(f"The policy {source} lacks '{odd[0]}', or should not have it.", _REMEDY)
     for name, shape in expected.items():
-        array = arrays[name]
+        array, last = arrays[name], name.rpartition("/")[2]
+        high = _LARGEST_LOG_STD if last == "log_std" else _LARGEST_STATISTIC if last in Statistics._fields else _LARGEST
+        low = 0.0 if last in ("count", "m2") else -high
         if tuple(array.shape) != shape:
             raise CongraspError(f"The policy {source} has '{name}' of shape {array.shape}, not {shape}.", _REMEDY)
         # Arrays on a device never left this process; those from a file or the wire are NumPy arrays.
         if isinstance(array, np.ndarray) and not (array.dtype.kind == "f" and np.isfinite(array).all()):
             raise CongraspError(f"The policy {source} has values in '{name}' that are not finite numbers.", _REMEDY)
+        if isinstance(array, np.ndarray) and not (low <= array.min(initial=0) and array.max(initial=0) <= high):
+            raise CongraspError(f"The policy {source} has values in '{name}' out of range.", _REMEDY)

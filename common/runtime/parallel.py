@@ -1,32 +1,76 @@
-"""Distributes work among processes if there is enough of it to pay for starting them."""
+"""Cores and memory available to this process, and work distributed among processes if that pays for starting them."""
 
-import multiprocessing
-import multiprocessing.context
+import concurrent.futures
+import contextlib
+import importlib
+import math
+import multiprocessing.connection
+import multiprocessing.spawn
 import os
+import pathlib
+import pickle
+import select
+import signal
+import subprocess
+import sys
 import threading
-from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import forkserver
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
+
+import psutil
 
 Result = TypeVar("Result")
 _WORTH_IT = 64  # calls; below this, starting processes takes longer than it saves
 _MOST_WORKERS = 16
-_PRELOADED = [
-    "congrasp.common.runtime.one_thread",
-    "congrasp.common.objects.procedural",
-    "congrasp.common.task.constraints",
-]
-"""Modules imported once, in this order, by the fork server; workers import anything else their functions need."""
+_PRELOADED = ("congrasp.common.objects.procedural", "congrasp.common.task.constraints")
+"""Modules imported once, before the workers fork; workers import anything else their functions need."""
+_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1")
+"""Environment of processes that share the cores: each would otherwise start a thread for every core, for products so
+small that the threads cost several times the work."""
+_GROUPS = pathlib.Path("/sys/fs/cgroup")
+_MEMBERSHIP = pathlib.Path("/proc/self/cgroup")
 
 
 def cores() -> int:
-    """Number of processor cores available to this process."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Number of cores available to this process, by its affinity and the quotas of its control groups, rounded up."""
+    affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quotas = (text.split() for text in _limits("cpu", "cpu.max", "cpu.cfs_quota_us", "cpu.cfs_period_us"))
+    shares = [int(quota) / int(period) for quota, period in quotas if quota not in ("max", "-1")]
+    return max(1, math.ceil(min([affinity, *shares])))
+
+
+def memory() -> int:
+    """Bytes of memory available to this process: free ones, and what the limits of its control groups leave."""
+    limits = _limits("memory", "memory.max", "memory.limit_in_bytes")
+    used = psutil.Process().memory_info().rss
+    return max(0, min([psutil.virtual_memory().available, *(int(text) - used for text in limits if text != "max")]))
+
+
+def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:
+    """Yields the limits of this process's control group and of the groups above it.
+
+    Args:
+      controller: name of the controller.
+      unified: file of the limit in cgroup version 2.
+      separate: its files in version 1, whose texts are joined.
+    """
+    with contextlib.suppress(OSError):
+        for line in _MEMBERSHIP.read_text().splitlines():
+            _, controllers, group = line.split(":", 2)
+            if controllers and controller not in controllers.split(","):
+                continue
+            mount, files = (_GROUPS / controller, separate) if controllers else (_GROUPS, (unified,))
+            path = pathlib.PurePath(group.lstrip("/"))
+            for folder in (path, *path.parents):
+                with contextlib.suppress(OSError):
+                    yield " ".join((mount / folder / file).read_text().strip() for file in files)
 
 
 def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> list[Result]:
     """`map` over processes, in order; runs in this process if there are few calls or few cores.
+
+    The workers are children of a helper process that imports congrasp alone: they never run the caller's `__main__`.
+    What fails there, for instance for something that only this process has registered, runs in this process.
 
     Args:
       function: a top-level function of a module; it must not use an accelerator.
@@ -34,18 +78,16 @@ def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> li
     """
     rows = list(zip(*columns, strict=True))
     workers = _workers(len(rows))
-    if not workers:
-        return [function(*row) for row in rows]
-    context = _context()
-    with ProcessPoolExecutor(workers, context, initializer=_prepare_worker) as pool:
-        return list(pool.map(function, *zip(*rows, strict=True), chunksize=4))
+    results = _helper().results(workers, function, rows) if workers else [None] * len(rows)
+    return [
+        function(*row) if result is None else pickle.loads(result) for row, result in zip(rows, results, strict=True)
+    ]
 
 
 def prepare_workers(calls: int) -> None:
-    """Starts the fork server if `calls` calls will need workers: its imports take seconds."""
+    """Starts the helper process if `calls` calls will need workers: its imports take seconds."""
     if _workers(calls):
-        _context()
-        forkserver.ensure_running()
+        _helper().start()
 
 
 def _workers(calls: int) -> int:
@@ -54,22 +96,118 @@ def _workers(calls: int) -> int:
     return workers if calls >= _WORTH_IT and workers > 1 else 0
 
 
-def _context() -> multiprocessing.context.ForkServerContext:
-    """Context of the workers: a fork server, since forking this process could deadlock if it has started JAX."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(_PRELOADED)
-    return context
+class _Helper:
+    """A process that forks workers, since forking this one could deadlock if it has started JAX.
+
+    Python's fork server would import the caller's `__main__` in each worker, and is shared with the caller's own use.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._running: tuple[subprocess.Popen[bytes], multiprocessing.connection.Connection] | None = None
+
+    def start(self) -> None:
+        """Starts the process if it is not running."""
+        with self._lock:
+            self._connected()
+
+    def results(self, workers: int, function: Callable[..., Any], rows: list[Any]) -> list[bytes | None]:
+        """Returns the pickled result of each call, None for those that failed."""
+        with self._lock:
+            try:
+                connection = self._connected()
+                connection.send((os.getcwd(), workers, function, rows))
+                return connection.recv() or [None] * len(rows)
+            except (OSError, EOFError):  # it cannot start here, or was killed
+                self._stop()
+                return [None] * len(rows)
+            except BaseException:
+                self._stop()
+                raise
+
+    def _connected(self) -> multiprocessing.connection.Connection:
+        """The connection to the process, which starts if necessary."""
+        if self._running is None:
+            here, there = multiprocessing.connection.Pipe()
+            paths, number = [str(path) for path in sys.path], there.fileno()
+            with there:
+                process = subprocess.Popen(
+                    [
+                        multiprocessing.spawn.get_executable(),
+                        "-c",
+                        f"import sys; sys.path[:] = {paths}; from {__name__} import serve; serve({number})",
+                    ],
+                    stdin=subprocess.DEVNULL,
+                    pass_fds=[number],
+                    env={**_ONE_THREAD, **os.environ, "JAX_PLATFORMS": "cpu"},
+                )
+            self._running = process, here
+        return self._running[1]
+
+    def _stop(self) -> None:
+        """Ends the process; its workers end because the connection closes."""
+        if self._running:
+            process, connection = self._running
+            self._running = None
+            connection.close()
+            process.kill()
+            process.wait()
 
 
-def _prepare_worker() -> None:
-    """Keeps this process off the accelerators, and ends it whenever its parent ends."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
+_helpers: dict[int, _Helper] = {}
+
+
+def _helper() -> _Helper:
+    """The helper of this process; a fork of it has another."""
+    return _helpers.setdefault(os.getpid(), _Helper())
+
+
+def serve(descriptor: int) -> None:
+    """Makes the calls of the process at the other end of a socket, until that ends.
+
+    Args:
+      descriptor: file descriptor of the socket.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for module in _PRELOADED:
+        importlib.import_module(module)
+    connection = multiprocessing.connection.Connection(descriptor)
+    while True:
+        try:
+            connection.send(_results(descriptor, *connection.recv()))
+        except (EOFError, OSError):
+            return
+        except Exception:  # for instance, a class of the caller's `__main__`
+            connection.send([])
+
+
+def _results(
+    descriptor: int, folder: str, workers: int, function: Callable[..., Any], rows: list[Any]
+) -> list[bytes | None]:
+    """The pickled result of each call, None for those that failed, by workers that end with the socket."""
+    os.chdir(folder)
+    context = multiprocessing.get_context("fork")
+    with concurrent.futures.ProcessPoolExecutor(workers, context, _end_with, (descriptor,)) as pool:
+        return list(pool.map(_call, [(function, row) for row in rows], chunksize=4))
+
+
+def _call(call: tuple[Callable[..., Any], tuple[Any, ...]]) -> bytes | None:
+    """The pickled result of a call; None if it fails."""
+    function, row = call
+    try:
+        return pickle.dumps(function(*row))
+    except Exception:
+        return None
+
+
+def _end_with(descriptor: int) -> None:
+    """Ends this process as soon as the other end of the socket closes."""
+    poll = select.poll()
+    poll.register(descriptor, 0)  # a hang-up alone
 
     def wait() -> None:
-        """Waits for the parent's end, then ends this process."""
-        parent.join()
+        """Waits for the end of the process that this one works for."""
+        poll.poll()
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
-    os.environ["JAX_PLATFORMS"] = "cpu"

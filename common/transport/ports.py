@@ -62,7 +62,7 @@ def free_port(count: int = len(FLOWS)) -> int:
     While this process lives, none of them is returned again, neither here nor in another process of this user.
 
     Raises:
-      OSError: no such ports are free, or reservations cannot be stored in the folder for temporary files.
+      OSError: no such ports are free.
     """
     file = _reservations()
     for _ in range(_ATTEMPTS):
@@ -90,6 +90,16 @@ def _reserve(file: int, ports: range) -> None:
 
 @functools.cache
 def _reservations() -> int:
-    """Descriptor of this user's lock file, open until the process ends: closing it would release every lock."""
-    path = pathlib.Path(tempfile.gettempdir()) / f"congrasp-ports-{os.getuid()}"
-    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    """Descriptor of this user's lock file, open until the process ends: closing it would release every lock.
+
+    Where no such file can be opened, that of a file of this process alone.
+    """
+    for folder in filter(None, (os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir())):
+        path = pathlib.Path(folder) / f"congrasp-ports-{os.getuid()}"
+        with contextlib.suppress(OSError):
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            if os.fstat(file).st_uid == os.getuid():
+                return file
+            os.close(file)  # of another user, who could lock all of it
+    with tempfile.TemporaryFile() as own:
+        return os.dup(own.fileno())

@@ -99,6 +99,8 @@ class LearnerHub:
         self._arrivals: collections.deque[tuple[float, Owner, int]] = collections.deque()
         self._last_event: dict[str, float] = {}
         self._finished = self._closed = False
+        self.trouble = ""
+        """Reason why the run cannot be saved, and what its end would cost; part of the status."""
         self._audit, self._log = audit, log
         self._rate_limit, self._pull_limit = RateLimit(), RateLimit(per_second=_PIECES, most=4 * _PIECES)
         if durable is not None:
@@ -197,6 +199,7 @@ class LearnerHub:
                 "schema": self._schema,
                 "roles": roles,
                 "unlisted": self._members.unlisted,
+                "trouble": self.trouble,
                 "rates": _rates([steps for *_, steps in self._arrivals], span),
                 "queue": {"length": len(self._queue), "limit": self._limit},
                 "counters": self._staleness.counters()
@@ -291,8 +294,9 @@ class LearnerHub:
             self._staleness.give_back(owner, ticket_id)
             return Message(meta=self._state())
         may = self._bundle is not None and not self._finished
+        repeated = self._staleness.holds(owner, ticket_id)
         ticket = self._staleness.grant(owner, ticket_id) if may else None
-        if ticket is not None:
+        if ticket is not None and not repeated:
             with self._changed:
                 self._sequences.of(owner).granted += 1
         return Message(meta={**self._state(), "granted": ticket is not None, "retry_after": _RETRY_SECONDS})

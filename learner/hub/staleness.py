@@ -163,6 +163,12 @@ class StalenessManager:
             self._counters.granted += 1
             return ticket
 
+    def holds(self, owner: Owner, ticket_id: str) -> bool:
+        """True if a ticket of this id is outstanding."""
+        with self._lock:
+            self._expire()
+            return (owner, ticket_id) in self._tickets
+
     def give_back(self, owner: Owner, ticket_id: str) -> None:
         """Ends a ticket that its owner does not need; an unknown one is ignored."""
         with self._lock:

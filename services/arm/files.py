@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
-from congrasp.services.export.motion_file import GraspMotion, robot_joints
+from congrasp.services.export.motion_file import GraspMotion, joint_trajectory, robot_joints
 from congrasp.services.record.moved_arm import MovedArm
 from congrasp.services.viz.episode import episode_shapes
 from congrasp.services.viz.raster import render_scene
@@ -30,19 +30,17 @@ def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) 
     """Writes the joints of arm and hand at every control step: `arm.csv` and `arm_trajectory.json`.
 
     Angles are in rad, slides in m, times in s. Finger joints are the targets of their servos, which hold the object.
-    The JSON has the fields of trajectory_msgs/JointTrajectory, and is YAML that `ros2 topic pub` takes.
+    The JSON has the fields of trajectory_msgs/JointTrajectory, and is YAML that `ros2 topic pub` takes; its points are
+    those of `joint_trajectory`.
 
     Raises:
       CongraspError: a file cannot be written.
     """
-    names, joints = robot_joints(motion), motion.joint_target
-    joints = np.clip(joints, motion.joint_limits[:, 0], motion.joint_limits[:, 1])
-    joints = np.concatenate([arm.joint_position, joints], 1)
+    targets = np.clip(motion.joint_target, motion.joint_limits[:, 0], motion.joint_limits[:, 1])
+    names, (joints, velocities, since) = robot_joints(motion), joint_trajectory(motion, targets)
     lines = [",".join(["time", *names])]
     lines += [",".join(f"{x:.6f}" for x in (time, *row)) for time, row in zip(motion.time, joints, strict=True)]
     write_atomically(folder / CSV, ("\n".join(lines) + "\n").encode())
-    velocities = np.gradient(joints, motion.control_dt, axis=0)
-    since = (1e9 * motion.time).round().astype(int).tolist()
     points = [
         {
             "positions": position.round(6).tolist(),

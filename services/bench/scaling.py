@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import pathlib
 import platform
 import shutil
@@ -62,7 +63,7 @@ class _Meter:
         """Stores the newest metrics, if there are any."""
         now = time.monotonic()
         if "values" in status:
-            if not self.metrics and status["update"] == 1:
+            if math.isnan(self.start_seconds) and status["update"] >= 1:
                 self.start_seconds = now - self._began
             if status["update"] >= _WARM_UPDATES:
                 self.metrics.append(status)

@@ -45,7 +45,7 @@ def actor(
     from congrasp.common.runtime.parallel import cores
     from congrasp.common.transport import urls
     from congrasp.common.transport.keys import process_name
-    from congrasp.services.ops.logs import log
+    from congrasp.services.ops.logs import announced, log
     from congrasp.services.ops.metrics import ActorMetrics
     from congrasp.services.ops.shutdown import on_signal
 
@@ -56,24 +56,23 @@ def actor(
         metrics.rollout(values)
         log("info", f"Rollout {values['rollouts']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
 
-    with (
-        watch.watched("actor", name, run, metrics),
-        on_signal() as stop,
-        urls.connect(connect, "actor", certs=certs, wait=patience, run=run) as transport,
-    ):
-        log("info", f"Connected to the learner at {connect}.")
-        run_actor(
-            transport,
-            run=run,
-            actor=name,
-            stop=stop,
-            physics=physics,
-            threads=threads or cores(),
-            patience=patience,
-            on_rollout=report,
-            journal=Journal(audit, lambda text: log("error", text)) if audit else None,
-            references=references,
-        )
+    with watch.watched("actor", name, run, metrics), on_signal() as stop:
+        with announced(f"Waiting up to {patience:g} s for the learner at {connect}"):
+            transport = urls.connect(connect, "actor", certs=certs, wait=patience, run=run)
+        with transport:
+            log("info", f"Connected to the learner at {connect}.")
+            run_actor(
+                transport,
+                run=run,
+                actor=name,
+                stop=stop,
+                physics=physics,
+                threads=threads or cores(),
+                patience=patience,
+                on_rollout=report,
+                journal=Journal(audit, lambda text: log("error", text)) if audit else None,
+                references=references,
+            )
         return stop.exit_code
 
 

@@ -10,7 +10,7 @@ import tyro
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.config import Split
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.runtime.engines import engine_title
 
 if TYPE_CHECKING:
@@ -103,6 +103,8 @@ def evaluate(
     at_least(0, pool=pool, batch=batch)
     _check_friction(friction)
     lineup = line_up(table, read_entrants(policy, method), hand, method)
+    if pictures is not None and {"noise", "all"} & set(table):
+        need_package("--pictures", "matplotlib")
     engine = resolve_physics(physics)
     settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
     setup = Setup(episodes, exam=exam, pool=pool, folder=objects, **settings)

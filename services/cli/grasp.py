@@ -10,13 +10,14 @@ from rich.console import Console
 from rich.markup import escape
 from typing_extensions import Doc
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.arm.options import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
 
 if TYPE_CHECKING:
     from congrasp.services.grasp.jobs import Result
+    from congrasp.services.viz.render import Film
 
 NOT_HELD, BAD_INPUT = 1, 2
 _MOST_ATTEMPTS = 1024
@@ -105,7 +106,6 @@ def grasp(
     from congrasp.services.cli.console import at_least, at_most, bars
     from congrasp.services.grasp.grasper import Grasper
     from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
-    from congrasp.services.viz.render import Film
     from congrasp.services.viz.views import view_of
 
     if not objects:
@@ -124,7 +124,7 @@ def grasp(
     file = policy_file(policy, right)
     bundle = bundles.load(file)
     found, results = find_objects(objects, folder)
-    film = Film(_pixels(size), fps, overlays) if video else None
+    film = _film(size, fps, overlays) if video else None
     identity: tuple[Any, ...] = (bundles.content_hash(file.read_bytes()), attempts, seed, approach, lift)
     if left:
         identity = (*identity, "left")
@@ -184,6 +184,14 @@ def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
 
 
 COMMAND = grasp
+
+
+def _film(size: str, fps: float, overlays: bool) -> "Film":
+    """Style of the video."""
+    from congrasp.services.viz.render import Film
+
+    need_package("--video", "imageio_ffmpeg")
+    return Film(_pixels(size), fps, overlays)
 
 
 def _pixels(text: str) -> tuple[int, int]:

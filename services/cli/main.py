@@ -13,11 +13,13 @@ import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
+import congrasp
 from congrasp.common.errors import CongraspError, MissingPackageError
-from congrasp.common.io.files import cache_folder
+from congrasp.common.io.files import cache_folder, can_cache, check_output
 from congrasp.services.ops.logs import announced, log_error
 from congrasp.services.ops.shutdown import SIGNALS, follow_parent, on_signal
 
@@ -53,6 +55,8 @@ _READ = {".obj", ".stl", ".ply", ".glb", ".npz", ".csv", ".bvh", ".mcap", ".safe
 """Suffixes of files that commands read."""
 _WRITTEN = ("--out", "--json", "--png", "--video", "--pictures", "--references")
 """Options for files and folders that a command writes, or creates if they are absent."""
+_OUTPUTS = ("out", "json", "png", "pictures", "video")
+"""Parameters of commands with a file or a folder that they write."""
 USAGE_ERROR = 2
 UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
@@ -112,6 +116,8 @@ def _said_of(error: OSError) -> str:
         return str(
             CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its permissions.")
         )
+    if error.errno == errno.ENOENT and "temporary directory" in str(error):
+        return "There is no folder for temporary files that can be written. Set TMPDIR to one."
     if error.errno == errno.EIO:
         return "A file could not be read or written, because its disk failed. Try another path."
     raise error
@@ -124,9 +130,7 @@ def run(arguments: list[str]) -> int:
         return 0
     name, *rest = arguments
     if name == "--version":
-        import importlib.metadata
-
-        print(importlib.metadata.version("congrasp"))
+        print(congrasp.__version__)
         return 0
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, 1)
@@ -138,6 +142,7 @@ def run(arguments: list[str]) -> int:
         try:
             with announced(f"Loading 'congrasp {name}'"):
                 call = _parsed(name, load(name), rest)
+            _check_outputs(call)
             result = call()
         except KeyboardInterrupt:
             result = None
@@ -165,6 +170,13 @@ def _check_files(arguments: Sequence[str]) -> None:
         near = difflib.get_close_matches(path.name, siblings, 1)
         remedy = f"Did you mean {path.parent / near[0]}?" if near else "Check the path."
         raise CongraspError(f"{named} is no file {path}.", remedy)
+
+
+def _check_outputs(call: Callable[[], Any]) -> None:
+    """Raises a CongraspError for an output that cannot be written, before the work for it."""
+    for name, path in getattr(call, "keywords", {}).items():
+        if name in _OUTPUTS and isinstance(path, pathlib.Path):
+            check_output(f"--{name.replace('_', '-')}", path)
 
 
 def _is_there(path: pathlib.Path) -> bool:
@@ -224,7 +236,11 @@ def _prepare_environment() -> None:
 
     Variables set by the user are kept.
     """
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder("jax")))
+    folder = cache_folder("jax")
+    if not can_cache(folder.parent, "XDG_CACHE_HOME"):
+        warnings.filterwarnings("ignore", "Error writing persistent compilation cache")
+    if folder.is_dir() or can_cache(folder.parent, "XDG_CACHE_HOME"):
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("MUJOCO_GL", "disable")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

@@ -8,7 +8,7 @@ from congrasp.services.ops.logs import LogFormat
 
 def record(
     connect: str = LEARNER_URL,
-    run: str = "run",
+    run: str = "quickstart",
     out: pathlib.Path = pathlib.Path("recordings"),
     live: int | None = None,
     duration: float | None = None,

@@ -21,7 +21,7 @@ def status(
 ) -> int:
     """Show the processes and the state of a run: versions, lag, rates, and the outcomes of tickets and rollouts.
 
-    The exit code is 1 if counters are inconsistent.
+    The exit code is 1 if there are warnings: counters are inconsistent, or no checkpoint can be written.
 
     Args:
       run_dir: Folder of a run whose learner runs on this machine, in place of --connect and --run.

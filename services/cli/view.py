@@ -17,6 +17,7 @@ def view(
     recordings: pathlib.Path | None = None,
     host: str = "127.0.0.1",
     port: int = 7480,
+    allow_host: tuple[str, ...] = (),
     insecure: bool = False,
     certs: pathlib.Path | None = None,
 ) -> int:
@@ -36,6 +37,7 @@ def view(
       recordings: Folder of the recordings (*.mcap) of a live or finished run.
       host: Interface of the page. There is no password: every client that reaches it can use it.
       port: Port of the page; 0 takes a free one.
+      allow_host: Names under which a proxy on this machine offers the page, such as hub.example.org.
       insecure: Offer the page beyond loopback.
       certs: Folder of certificates (congrasp certs), for --connect: an observer's, and a server's to grasp with the
         weights of the run.
@@ -72,6 +74,7 @@ def view(
             recordings=recordings,
             host=host,
             port=port,
+            names=allow_host,
             insecure=insecure,
             certs=certs,
         ) as url,

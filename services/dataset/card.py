@@ -36,6 +36,7 @@ def write_card(shards: Shards, about: Mapping[str, Any], facts: Mapping[str, Any
         "shards": {"finished": len(found), "of": shards.total},
         "left_out": sorted(name for said in found.values() for name in said["left_out"]),
         "counts": counts,
+        "sha256": {name: value for said in found.values() for name, value in said["sha256"].items()},
         "columns": {kind: _columns(shards, kind, found) for kind in ("grasps", "objects")},
     }
     write_atomically(shards.folder / CARD, (json.dumps(card, indent=1) + "\n").encode())

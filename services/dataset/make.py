@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import importlib.metadata
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
@@ -93,7 +93,7 @@ class Recipe:
         )
         return {
             "format": FORMAT,
-            "version": importlib.metadata.version("congrasp"),
+            "version": congrasp.__version__,
             "hand": self.policy.spec.hand_name,
             "policy_sha256": self.policy_sha256,
             "objects_sha256": hashlib.sha256(contents.encode()).hexdigest(),

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.noise import LEVELS
@@ -35,7 +34,7 @@ def draw_noise(evaluator: Evaluator, rows: Sequence[Row], folder: pathlib.Path, 
       title: title of the curves.
 
     Raises:
-      CongraspError: matplotlib is not installed, or a file cannot be written.
+      CongraspError: a file cannot be written.
     """
     draw_curves(rows, folder / "noise.png", title)
     images: list[np.ndarray] = []
@@ -64,12 +63,10 @@ def draw_curves(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
       title: title of the figure.
 
     Raises:
-      CongraspError: matplotlib is not installed, or the file cannot be written.
+      CongraspError: the file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise CongraspError("Figures need the package 'matplotlib'.", "Run: pip install 'congrasp[viz]'") from None
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(4.0 * len(_TITLES), 5.6), layout="constrained", facecolor="white")
     figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold")
     grid = figure.subplots(2, len(_TITLES), sharex="col")

@@ -8,7 +8,7 @@ import pathlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import need_package
 from congrasp.common.io.files import write_atomically
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.wire.codec import encode
@@ -105,10 +105,9 @@ def write_report(
 @functools.cache
 def template(path: pathlib.Path = _REPORT) -> Any:
     """Returns a page template, which may extend `base.html`; raises a CongraspError if jinja2 is not installed."""
-    try:
-        import jinja2
-    except ImportError:
-        raise CongraspError("Reports need the package 'jinja2'.", "Run: pip install 'congrasp[viz]'") from None
+    need_package("A report", "jinja2")
+    import jinja2
+
     loader = jinja2.FileSystemLoader([path.parent, _REPORT.parent])
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, loader=loader)
     return environment.get_template(path.name)

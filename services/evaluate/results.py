@@ -6,7 +6,6 @@ of `KINDS`.
 """
 
 import dataclasses
-import importlib.metadata
 import pathlib
 import platform
 import re
@@ -17,6 +16,7 @@ from typing import Any
 
 import jax
 
+import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
@@ -52,7 +52,7 @@ def provenance() -> dict[str, Any]:
     device = jax.local_devices()[0]
     accelerator = [] if device.platform == "cpu" else [device.device_kind]
     return {
-        "version": importlib.metadata.version("congrasp"),
+        "version": congrasp.__version__,
         "command": shlex.join(["congrasp", *sys.argv[1:]]),
         "machine": ", ".join([f"{cores()} {platform.machine()} cores", *accelerator]),
     }

@@ -31,6 +31,8 @@ from congrasp.services.record.moved_arm import MovedArm
 FORMAT = 2
 MAX_BYTES = 256 << 20
 """Limit of the total size of a motion's arrays, bytes."""
+TRAJECTORY_START = 10**9
+"""Time of the first point of a trajectory, ns."""
 _LARGEST = 1e6
 _INDICES = ("object_colour_values", "object_faces", "joint_link", "link_parent", "capsule_link")
 _META = "meta"
@@ -133,6 +135,24 @@ def robot_joints(motion: GraspMotion) -> list[str]:
     """Returns the names of the arm's joints, if there is an arm, and of the hand's, all different."""
     arm = motion.arm.joint_names.tolist() if motion.arm else []
     return [*arm, *(f"hand_{name}" if name in arm else name for name in motion.joint_names.tolist())]
+
+
+def joint_trajectory(motion: GraspMotion, fingers: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Returns the points of a trajectory for a controller: it begins and ends at rest, one second after its start.
+
+    Controllers reject a goal whose last point moves, and jump to a point at time zero.
+
+    Args:
+      motion: the motion.
+      fingers: (T, F) angles of the fingers, rad.
+
+    Returns:
+      Positions and velocities (T, N) of the joints of `robot_joints`, and T times since the start, ns.
+    """
+    positions = fingers if motion.arm is None else np.concatenate([motion.arm.joint_position, fingers], 1)
+    velocities = np.zeros(positions.shape)
+    velocities[1:-1] = (positions[2:] - positions[:-2]) / (2 * motion.control_dt)
+    return positions, velocities, [TRAJECTORY_START + round(1e9 * t) for t in motion.time.tolist()]
 
 
 def motion_of_episode(episode: Message) -> GraspMotion:

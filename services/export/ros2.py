@@ -17,28 +17,26 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.painting import nearest
 from congrasp.services.export.frames import COLOURS, OBJECT, Body, Track, arm_meshes, bodies, facts, pose_matrices
-from congrasp.services.export.motion_file import GraspMotion, robot_joints
+from congrasp.services.export.motion_file import TRAJECTORY_START, GraspMotion, joint_trajectory, robot_joints
 from congrasp.services.export.urdf import forward_kinematics, robot_urdf
 
 _WORLD = "world"
-_START = 10**9  # ns; in TF a stamp of zero means any time
 
 
 def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
-    """Writes one motion as a bag, which is a folder; it begins at one second."""
+    """Writes one motion as a bag, which is a folder; it begins at one second, since in TF zero means any time."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
     (motion,) = motions
     store = get_typestore(Stores.ROS2_HUMBLE)
     make = _Messages(store.types)
-    since = [round(1e9 * t) for t in motion.time]
-    stamps = [_START + t for t in since]
+    position, velocity, stamps = joint_trajectory(motion, motion.joint_position.astype(float))
     found = bodies(motion)
     frames = [_transforms(make, found, t, stamp) for t, stamp in enumerate(stamps)]
     palm = next(i for i, body in enumerate(found) if body.parent < 0)
     wrist = [frame.transforms[palm].transform for frame in frames]
-    trajectory, states = _joint_messages(make, motion, since, found[palm].name)
+    trajectory, states = _joint_messages(make, robot_joints(motion), position, velocity, stamps, found[palm].name)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         about = facts(motion, frame=f"{_WORLD}: z up; TF frames are the links", unit="m, rad, s", quaternion="by name")
         bag.set_custom_data("congrasp", json.dumps(about))
@@ -52,7 +50,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
 
         send("/robot_description", "std_msgs/msg/String", [make("std_msgs/String", data=robot_urdf(motion))], once=True)
         send("/joint_trajectory", "trajectory_msgs/msg/JointTrajectory", [trajectory], once=True)
-        path_of_wrist = _wrist_trajectory(make, wrist, since, found[palm].name)
+        path_of_wrist = _wrist_trajectory(make, wrist, stamps, found[palm].name)
         send("/wrist_trajectory", "trajectory_msgs/msg/MultiDOFJointTrajectory", [path_of_wrist], once=True)
         corners = motion.object_vertices[motion.object_faces.ravel()]
         colours = (nearest(corners, motion.colours) / 255).tolist() if motion.colours else []
@@ -111,12 +109,10 @@ class _Messages:
         return self("geometry_msgs/Quaternion", **dict(zip("xyzw", map(float, values), strict=True)))
 
 
-def _joint_messages(make: _Messages, motion: GraspMotion, since: Sequence[int], root: str) -> tuple[Any, list[Any]]:
-    """The joints of arm and fingers as one trajectory, and as a state for each frame; `since`: ns from the start."""
-    names, position = robot_joints(motion), motion.joint_position.astype(float)
-    if motion.arm:
-        position = np.concatenate([motion.arm.joint_position, position], 1)
-    velocity = np.gradient(position, motion.control_dt, axis=0) if len(position) > 1 else 0 * position
+def _joint_messages(
+    make: _Messages, names: list[str], position: np.ndarray, velocity: np.ndarray, stamps: Sequence[int], root: str
+) -> tuple[Any, list[Any]]:
+    """The joints of arm and fingers (T, N) as one trajectory, and as a state for each frame; stamps in ns."""
     points = [
         make(
             "trajectory_msgs/JointTrajectoryPoint",
@@ -126,24 +122,24 @@ def _joint_messages(make: _Messages, motion: GraspMotion, since: Sequence[int], 
             effort=np.zeros(0),
             time_from_start=make.duration(ns),
         )
-        for t, ns in enumerate(since)
+        for t, ns in enumerate(stamps)
     ]
     states = [
         make(
             "sensor_msgs/JointState",
-            header=make.header(_START + ns, root),
+            header=make.header(ns, root),
             name=names,
             position=position[t],
             velocity=velocity[t],
             effort=np.zeros(0),
         )
-        for t, ns in enumerate(since)
+        for t, ns in enumerate(stamps)
     ]
     header = make.header(0, root)
     return make("trajectory_msgs/JointTrajectory", header=header, joint_names=names, points=points), states
 
 
-def _wrist_trajectory(make: _Messages, wrist: Sequence[Any], since: Sequence[int], root: str) -> Any:
+def _wrist_trajectory(make: _Messages, wrist: Sequence[Any], stamps: Sequence[int], root: str) -> Any:
     """The palm's transforms in the world as one trajectory."""
     points = [
         make(
@@ -153,7 +149,7 @@ def _wrist_trajectory(make: _Messages, wrist: Sequence[Any], since: Sequence[int
             accelerations=[],
             time_from_start=make.duration(ns),
         )
-        for transform, ns in zip(wrist, since, strict=True)
+        for transform, ns in zip(wrist, stamps, strict=True)
     ]
     header = make.header(0, _WORLD)
     return make("trajectory_msgs/MultiDOFJointTrajectory", header=header, joint_names=[root], points=points)
@@ -251,7 +247,8 @@ def read(path: pathlib.Path) -> list[Track]:
     apart = max(float(np.abs(poses[name] - tf[name]).max()) for name in tf)
     if apart > 1e-4:
         raise CongraspError(f"The joint trajectory and TF contradict each other by {apart:.2g}.")
-    time = np.array([p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in trajectory.points])
+    since = [10**9 * p.time_from_start.sec + p.time_from_start.nanosec for p in trajectory.points]
+    time = 1e-9 * (np.array(since) - TRAJECTORY_START)
     triangles: dict[str, list[np.ndarray]] = {}
     for marker in [*messages["/object"], *(m for array in messages.get("/arm", ()) for m in array.markers)]:
         corners = np.array([[p.x, p.y, p.z] for p in marker.points]).reshape(-1, 3, 3)

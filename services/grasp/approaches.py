@@ -50,9 +50,7 @@ def headings(
     if found is None:
         raise CongraspError(
             f"No approach reaches what may be grasped of '{obj.name}' without touching the rest.",
-            "Make the graspable part larger."
-            if direction is None and position is None
-            else "Leave out --heading and --at, or make the graspable part larger.",
+            _remedy(request, "make the graspable part larger"),
         )
     options, weights = [], []
     for r, (cleared, room) in enumerate(zip(*within_reach(found, obj, obj.rest_poses, own), strict=True)):
@@ -91,17 +89,28 @@ def _balanced(obj: GraspObject) -> GraspObject:
     return dataclasses.replace(obj, points=points[chosen], normals=normals[chosen], labels=labels[chosen])
 
 
+def _remedy(request: GraspRequest, otherwise: str) -> str:
+    """Remedy for a request that no approach fits: to leave out one of its options, or another way."""
+    options = {
+        "--rest": request.rest is not None,
+        "--heading": request.above or request.given("heading", "direction") is not None,
+        "--at": request.given("heading", "position") is not None,
+    }
+    given = [name for name, is_given in options.items() if is_given]
+    return f"Leave out {' or '.join(given)}, or {otherwise}." if given else f"{otherwise.capitalize()}."
+
+
 def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
     """Error and remedy where the table leaves room for no approach."""
     if request.rest is not None:
         return (
             f"'{obj.name}' cannot be approached under these constraints in resting pose {request.rest + 1}.",
-            "Leave out --rest, or set another --heading.",
+            _remedy(request, "set another --heading"),
         )
     if request.given("heading", "direction") is None:
         return (
             f"'{obj.name}' cannot be approached in any of its resting poses.",
-            "Leave out --heading above and --at, or scale it.",
+            _remedy(request, "scale it"),
         )
     down = -matrix(obj.rest_poses[0][3:])[2]
     return (

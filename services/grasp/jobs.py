@@ -137,7 +137,8 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
         key = key_of(at.digest(), options, given, settings.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
         drawn = [settings.film and [*settings.film], settings.view and [*settings.view]]
-        if before is not None and (settings.film is None or json.loads(json.dumps(drawn)) == before.get("drawn")):
+        filmed = settings.film is None or (before and json.loads(json.dumps(drawn)) == before.get("drawn"))
+        if before is not None and filmed and (not settings.pictures or (folder / THUMBNAIL).exists()):
             return Result(at.name, before, skipped=True)
         progress("Importing", 0, 1)
         obj = _load(at, settings.options)

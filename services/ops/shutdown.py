@@ -41,7 +41,7 @@ class Stop(threading.Event):
 
 @contextlib.contextmanager
 def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop]:
-    """Context with a `Stop` that signals set; only in the main thread.
+    """Context with a `Stop` that signals set; outside the main thread, which alone Python signals, nothing sets it.
 
     Python runs handlers between two bytecodes of the main thread, which may be inside a compiler for a minute. The
     interpreter's wake-up file descriptor is written at once, so a thread that reads it sets the event. It ends the
@@ -53,6 +53,9 @@ def on_signal(grace: float = GRACE, *, interrupt: bool = False) -> Iterator[Stop
       interrupt: also raises KeyboardInterrupt in the main thread, for code that does not poll.
     """
     stop = Stop()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
     reader, writer = socket.socketpair()
     writer.setblocking(False)
 

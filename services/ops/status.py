@@ -24,7 +24,7 @@ _SHOWN = 100  # most processes in a table
 
 
 def ask(transport: Transport, run: str) -> dict[str, Any]:
-    """Queries the status of a run from its learner, with `warnings`: a line for each inconsistent counter.
+    """Queries the status of a run from its learner, with `warnings` (see there).
 
     Raises:
       TransportError: no learner of this run responds.
@@ -45,7 +45,7 @@ def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, A
 
 
 def warnings(status: Mapping[str, Any]) -> list[str]:
-    """Inconsistencies of a learner's status, one line each."""
+    """Inconsistencies of a learner's status, and checkpoints that fail, one line each."""
     counters, queue = status["counters"], status["queue"]
     found = []
     for total, parts in _SUMS.items():
@@ -53,7 +53,7 @@ def warnings(status: Mapping[str, Any]) -> list[str]:
             found.append(f"The counters are inconsistent: {total} {counters[total]} is not {_sum(counters, parts)}.")
     if counters["queued"] != queue["length"]:
         found.append(f"{counters['queued']} rollouts are counted as queued, but the queue holds {queue['length']}.")
-    return found
+    return found + [status["trouble"]] * bool(status.get("trouble"))
 
 
 def _sum(counters: Mapping[str, int], parts: tuple[str, ...]) -> str:

@@ -44,6 +44,7 @@ class Converter:
         self._budget = LogBudget(self._forget)
         self._slots: dict[str, int] = {}
         self._ends: dict[str, int] = {}
+        self._now = 0
         self._kinds: dict[str, Callable[[str, str, Message, int], Iterator[Entry]]] = {
             "metrics": self._metrics,
             "event": self._event,
@@ -58,6 +59,9 @@ class Converter:
         Raises:
           CongraspError: it is not a valid log message, or exceeds its sender's budget.
         """
+        if now < self._now:  # the clock was set back: what is still playing keeps its remaining time
+            self._ends = {name: end - (self._now - now) for name, end in self._ends.items()}
+        self._now = now
         *_, kind, role, name = ("", "", *key.split("/"))
         if kind not in self._kinds:
             raise CongraspError(f"{ascii(kind)[:60]} is not a kind of log message.")

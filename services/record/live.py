@@ -1,17 +1,27 @@
 """Serves log entries to the Foxglove app over its WebSocket as they happen."""
 
+import asyncio
 import collections
+import contextlib
 import heapq
 import itertools
 import queue
+import re
+import secrets
+import socket
+import sys
 import threading
 import time
+import urllib.parse
 from typing import Any
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, need_package
 from congrasp.services.record.channels import Channel, Entry
 
-_HOST = "127.0.0.1"
+_HOST, _LOOPBACK = "127.0.0.1", ("127.0.0.1", "localhost", "::1")
+_APP = "foxglove.dev"
+"""Domain of the app in a browser."""
+_HEAD, _HEAD_SECONDS = 16 << 10, 10.0  # bytes of a request's head, and the time in which it must arrive
 _BACKLOG, _BYTES = 20000, 256 << 20  # entries queued for their time; the newest beyond this are dropped
 _TOPICS = 4096  # open channels; beyond this the one that was silent for longest is closed
 _KEPT = 64 << 20  # bytes of latched messages kept for late subscribers
@@ -25,7 +35,7 @@ class LiveServer:
     """
 
     def __init__(self, port: int):
-        """Listens on the loopback interface: there is no authentication, and every client can watch the run.
+        """Listens on the loopback interface: programs of this machine and the Foxglove app can watch the run.
 
         Args:
           port: TCP port; 0 uses a free one (see `port`).
@@ -33,12 +43,9 @@ class LiveServer:
         Raises:
           CongraspError: the package is not installed, or the port is in use.
         """
-        try:
-            import foxglove
-        except ImportError:
-            raise CongraspError(
-                "The live view needs the package 'foxglove-sdk'.", "Run: pip install 'congrasp[viz]'"
-            ) from None
+        need_package("The live view", "foxglove")
+        import foxglove
+
         self._sdk = foxglove
         self._context = foxglove.Context()
         self._topics: collections.OrderedDict[str, tuple[Channel, Any]] = collections.OrderedDict()
@@ -56,15 +63,20 @@ class LiveServer:
             def on_subscribe(self, client: Any, channel: Any) -> None:
                 live._incoming.put(channel.topic)
 
+        # Behind the gate, at an address of the loopback interface that other sites in a browser do not know.
+        inside = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}.{secrets.randbelow(254) + 1}"
+        inside = inside if sys.platform == "linux" else _HOST
         try:
-            self._server = foxglove.start_server(
-                name="congrasp", host=_HOST, port=port, context=self._context, server_listener=Listener()
-            )
-        except (OSError, RuntimeError) as error:
+            outside = socket.create_server((_HOST, port))
+        except (OSError, OverflowError) as error:
             raise CongraspError(
                 f"The live view cannot listen on {_HOST}:{port} ({error}).", "Pass another port with --live."
             ) from None
-        self.port = self._server.port
+        self._server = foxglove.start_server(
+            name="congrasp", host=inside, port=0, context=self._context, server_listener=Listener()
+        )
+        self.port = int(outside.getsockname()[1])
+        self._gate = _Gate(outside, (inside, self._server.port))
         self._thread = threading.Thread(target=self._work, daemon=True, name="live view")
         self._thread.start()
 
@@ -81,6 +93,7 @@ class LiveServer:
         """Stops the server; queued entries are not sent."""
         self._incoming.put(None)
         self._thread.join(timeout)
+        self._gate.close()
         self._server.stop()
 
     def __enter__(self) -> "LiveServer":
@@ -147,3 +160,73 @@ class LiveServer:
             channel.topic, schema=schema, message_encoding=channel.encoding, context=self._context
         )
         self._topics[channel.topic] = channel, opened
+
+
+class _Gate:
+    """Passes connections on to the server of the SDK, which answers any site that a browser shows."""
+
+    def __init__(self, outside: socket.socket, inside: tuple[str, int]):
+        """Accepts connections of a listening socket, for the server at an address."""
+        self._outside, self._inside = outside, inside
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, daemon=True, name="live gate")
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stops accepting, and ends all connections."""
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(1.0)
+        self._outside.close()
+
+    def _run(self) -> None:
+        """Runs until it is closed."""
+        asyncio.set_event_loop(loop := self._loop)
+        loop.run_until_complete(asyncio.start_server(self._admit, sock=self._outside, limit=_HEAD))
+        loop.run_forever()
+        tasks = asyncio.all_tasks(loop)
+        for task in tasks:
+            task.cancel()
+        loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+        loop.close()
+
+    async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Passes on the connection of an allowed client, and answers others with the reason."""
+        with (
+            contextlib.closing(writer),
+            contextlib.suppress(OSError, EOFError, ValueError, asyncio.LimitOverrunError, asyncio.CancelledError),
+        ):
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_SECONDS)
+            if fault := _fault(head.decode("latin-1")):
+                body = f"{fault}\n".encode()
+                writer.write(b"HTTP/1.1 403 Forbidden\r\nContent-Length: %d\r\n\r\n%s" % (len(body), body))
+                await writer.drain()
+                return
+            to_reader, to_writer = await asyncio.open_connection(*self._inside)
+            with contextlib.closing(to_writer):
+                to_writer.write(head)
+                await asyncio.gather(_pump(reader, to_writer), _pump(to_reader, writer))
+
+
+async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Copies one direction of a connection until it ends."""
+    with contextlib.closing(writer):
+        while data := await reader.read(1 << 16):
+            writer.write(data)
+            await writer.drain()
+
+
+def _fault(head: str) -> str:
+    """Reason why a request is refused; empty if it comes from this machine or from the app.
+
+    A site's name may resolve to this machine (DNS rebinding), so Host must name the loopback interface; a browser sends
+    the site as Origin.
+    """
+    fields = (line.partition(":") for line in head.split("\r\n")[1:])
+    headers = {name.strip().lower(): value.strip() for name, _, value in fields}
+    host, origin = headers.get("host", ""), headers.get("origin", "file://")
+    if re.sub(r":\d*$", "", host).strip("[]") not in _LOOPBACK:
+        return "The live view answers only under a name of the loopback interface: open ws://127.0.0.1 with its port."
+    site = urllib.parse.urlsplit(origin)
+    name = site.hostname or ""
+    own = site.scheme not in ("", "http", "https") or name in _LOOPBACK or f".{name}".endswith(f".{_APP}")
+    return "" if own else "Another site asked for the live view: open it in the Foxglove app."

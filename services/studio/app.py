@@ -4,7 +4,7 @@ import contextlib
 import functools
 import pathlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import cast
 
 from congrasp.common.errors import CongraspError
@@ -45,6 +45,7 @@ def open_view(
     recordings: pathlib.Path | None,
     host: str,
     port: int,
+    names: Sequence[str],
     insecure: bool,
     certs: pathlib.Path | None,
 ) -> Iterator[str]:
@@ -72,10 +73,11 @@ def open_view(
             hands = _pretrained()
         recorded = Recordings(recordings) if recordings else None
         loaded = {name: functools.cache(load) for name, load in hands.items()}  # all browsers share compiled programs
-        sessions = Sessions(lambda: Session(loaded, catalogue(objects), MeshImporter(), window, recorded))
-        stack.callback(sessions.close)
-        server = PageServer(sessions.routes, host, port)
+        opened: list[Sessions] = []  # the port is taken before they compile
+        server = PageServer(lambda browser: opened[0].routes(browser), host, port, names)
         stack.callback(server.close)
+        opened.append(Sessions(lambda: Session(loaded, catalogue(objects), MeshImporter(), window, recorded)))
+        stack.callback(opened[0].close)
         yield server.url
 
 

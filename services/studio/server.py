@@ -10,7 +10,7 @@ import secrets
 import socket
 import threading
 import urllib.parse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from congrasp.common.errors import CongraspError
@@ -28,6 +28,8 @@ _TYPES = {
 }
 _POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
 _ROUTES = "/api/"
+_LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_OWN = re.compile("/(api|static)/[^/]*$")
 _TOKEN = re.compile("[0-9a-f]{32}")
 _TIMEOUT = 30.0  # seconds that a request may take to arrive
 _DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes read of a refused body, so that the answer arrives before the close
@@ -67,13 +69,14 @@ class Routes(NamedTuple):
 class PageServer:
     """Serves the page and the routes of a studio until it is closed."""
 
-    def __init__(self, routes: Callable[[str], Routes], host: str, port: int):
+    def __init__(self, routes: Callable[[str], Routes], host: str, port: int, names: Sequence[str] = ()):
         """Listens.
 
         Args:
           routes: returns the routes of a browser, by the token in its cookie; an empty one without a cookie.
-          host: interface; on loopback, only requests to a loopback name are answered.
+          host: interface; on loopback, only requests to a loopback name or one of `names` are answered.
           port: TCP port; 0 takes a free one (see `port`).
+          names: names under which a proxy offers the page.
 
         Raises:
           CongraspError: the port is busy, or there is no such interface.
@@ -87,9 +90,9 @@ class PageServer:
                 """Routes of this browser."""
                 return routes(self.browser())
 
-            def allowed(self) -> bool:
-                """True if it comes from the page itself."""
-                return server._allowed(self)
+            def fault(self) -> str:
+                """Reason why the request is refused; empty if it comes from the page itself."""
+                return server._fault(self)
 
         try:
             self._server = _Server((host, port), Handler)
@@ -100,6 +103,7 @@ class PageServer:
                 "Choose another --port, or end what uses it.",
             ) from None
         self.host, self.port = host, int(self._server.server_address[1])
+        self._names = {*_LOOPBACK, *names} if host in _LOOPBACK else None
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True, name="page")
         self._thread.start()
 
@@ -115,16 +119,21 @@ class PageServer:
         self._server.server_close()
         self._thread.join(2.0)
 
-    def _allowed(self, request: http.server.BaseHTTPRequestHandler) -> bool:
-        """True if a request comes from the page itself: other sites in the browser must not reach it.
+    def _fault(self, request: http.server.BaseHTTPRequestHandler) -> str:
+        """Reason why a request is refused, with the remedy; empty if it comes from the page itself.
 
-        A site's name may resolve to this machine (DNS rebinding), so the Host header must name this machine.
+        Other sites in the browser must not reach the page. A site's name may resolve to this machine (DNS rebinding),
+        so the Host header must name this machine, or a proxy that the user named. Ports differ behind a tunnel.
         """
-        host = request.headers.get("Host", "")
+        host = request.headers.get("Host", "").strip()
         origin, site = request.headers.get("Origin"), request.headers.get("Sec-Fetch-Site")
-        names = {f"{name}:{self.port}" for name in ("127.0.0.1", "localhost", "[::1]")}
-        own = host in names if self.host in ("127.0.0.1", "localhost", "::1") else bool(host.strip())
-        return own and origin in (None, f"http://{host}") and site in (None, "none", "same-origin")
+        name = re.sub(r":\d*$", "", host).strip("[]")
+        if not host or (self._names is not None and not {host, name} & self._names):
+            shown = ascii(name)[:60]
+            return f"The page is not offered as {shown}. Open {self.url} or start it with --allow-host {shown}."
+        if origin not in (None, f"http://{host}", f"https://{host}") or site not in (None, "none", "same-origin"):
+            return f"Another site sent this request. Open the page itself, at {self.url}."
+        return ""
 
 
 class _Server(http.server.ThreadingHTTPServer):
@@ -150,8 +159,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Routes of the requesting browser."""
         raise NotImplementedError
 
-    def allowed(self) -> bool:
-        """True if the request may be answered."""
+    def fault(self) -> str:
+        """Reason why the request is refused; empty if it may be answered."""
         raise NotImplementedError
 
     def do_GET(self) -> None:
@@ -159,10 +168,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         path, query = self._route()
         if self._refused():
             return
-        if path.startswith(_ROUTES) and (route := self.routes().gets.get(path)):
-            self._answer(lambda: route(query))
-        else:
+        if not path.startswith(_ROUTES):
             self._file("index.html" if path == "/" else path.removeprefix("/static/"))
+        elif (routes := self._routes()) and (route := routes.gets.get(path)):
+            self._answer(lambda: route(query))
+        elif routes:
+            self._send(404, "text/plain", b"There is nothing of this name.")
 
     def do_POST(self) -> None:
         """Answers by a route; a request is refused by its headers, before its body is read."""
@@ -171,18 +182,29 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         kind = (self.headers.get("Content-Type") or "").partition(";")[0]
         given = self.headers.get("Content-Length") or ""
         length = int(given) if given.isdecimal() and len(given) < 20 else -1
-        if self._refused(kind not in ("application/json", "application/octet-stream")):
+        fault = "" if kind in ("application/json", "application/octet-stream") else "The page sends no such content."
+        if self._refused(fault):
             self._drain(length)
         elif not 0 <= length <= MOST_BYTES:
             message = "The request has no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
             self._send(413, "application/json", json.dumps({"error": message}).encode())
             self._drain(length)
-        elif (route := self.routes().posts.get(path)) is None:
+        elif (routes := self._routes()) is None:
+            self._drain(length)
+        elif (route := routes.posts.get(path)) is None:
             self._send(404, "application/json", b'{"error": "There is nothing of this name."}')
             self._drain(length)
         else:
             body = self.rfile.read(length)
             self._answer(lambda: route(query, body))
+
+    def _routes(self) -> Routes | None:
+        """Routes of this browser; None if there is no room for it, which is answered."""
+        try:
+            return self.routes()
+        except CongraspError as error:
+            self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
+            return None
 
     def browser(self) -> str:
         """The token in the browser's cookie; empty without one."""
@@ -195,19 +217,21 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Logs nothing."""
 
     def _route(self) -> tuple[str, dict[str, str]]:
-        """Path and query parameters of the request; an empty path for a malformed URL."""
+        """Path, without the prefix of a proxy, and query parameters; an empty path for a malformed URL."""
         try:
             parts = urllib.parse.urlsplit(self.path)
         except ValueError:
             return "", {}
-        return parts.path, dict(urllib.parse.parse_qsl(parts.query))
+        own = _OWN.search(parts.path)
+        path = own[0] if own else "/" if parts.path.endswith("/") else parts.path
+        return path, dict(urllib.parse.parse_qsl(parts.query))
 
-    def _refused(self, more: bool = False) -> bool:
-        """Sends a refusal if the request is not allowed, or `more` is set; returns True if it did."""
-        if not more and self.allowed():
-            return False
-        self._send(403, "application/json", b'{"error": "This page answers only to itself."}')
-        return True
+    def _refused(self, fault: str = "") -> bool:
+        """Sends a refusal if the request is not allowed, or has another fault; returns True if it did."""
+        fault = self.fault() or fault
+        if fault:
+            self._send(403, "application/json", json.dumps({"error": fault}).encode())
+        return bool(fault)
 
     def _drain(self, length: int) -> None:
         """Ends the connection of a request that was answered without its body."""
@@ -224,7 +248,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return
         new = {}
         if file.suffix == ".html" and not self.browser():
-            new = {"Set-Cookie": f"{self.cookie}={secrets.token_hex(16)}; Path=/; HttpOnly; SameSite=Strict"}
+            new = {"Set-Cookie": f"{self.cookie}={secrets.token_hex(16)}; HttpOnly; SameSite=Strict"}
         self._send(200, _TYPES[file.suffix], file.read_bytes(), new)
 
     def _answer(self, work: Callable[[], Answer]) -> None:

@@ -2,13 +2,17 @@
 
 import collections
 import threading
+import time
 from collections.abc import Callable
 
+from congrasp.common.errors import CongraspError
 from congrasp.services.studio.server import Routes
 from congrasp.services.studio.session import Session
 
-MOST = 8
-"""Maximum number of browsers; a further one ends the session that was used least recently."""
+MOST = 16
+"""Maximum number of browsers; a further one ends the session that was used least recently, if it is idle."""
+IDLE = 1800.0
+"""Seconds without a request after which a session is idle."""
 
 
 class Sessions:
@@ -24,21 +28,33 @@ class Sessions:
           CongraspError: `new` failed.
         """
         self._new, self._spare = new, [new()]
-        self._open: collections.OrderedDict[str, Session] = collections.OrderedDict()
+        self._open: collections.OrderedDict[str, tuple[Session, float]] = collections.OrderedDict()
         self._lock = threading.Lock()
 
     def routes(self, browser: str) -> Routes:
-        """Returns the routes of a browser's session, and opens one for a new browser."""
+        """Returns the routes of a browser's session, and opens one for a new browser.
+
+        Raises:
+          CongraspError: too many browsers use the studio.
+        """
         with self._lock:
-            if browser not in self._open:
-                self._open[browser] = self._spare.pop() if self._spare else self._new()
-            self._open.move_to_end(browser)
-            if len(self._open) > MOST:
-                self._open.popitem(last=False)[1].close()
-            return self._open[browser].routes
+            now = time.monotonic()
+            session, _ = self._open.pop(browser, (None, now))
+            if session is None and len(self._open) >= MOST:
+                oldest, used = next(iter(self._open.values()))
+                if now - used < IDLE:
+                    raise CongraspError(
+                        f"{MOST} browsers use this studio.",
+                        f"Come back when one has been idle for {IDLE / 60:.0f} minutes, or start another studio.",
+                    )
+                self._open.popitem(last=False)
+                oldest.close()
+            session = session or (self._spare.pop() if self._spare else self._new())
+            self._open[browser] = session, now
+            return session.routes
 
     def close(self) -> None:
         """Closes all sessions."""
         with self._lock:
-            for session in (*self._spare, *self._open.values()):
+            for session in (*self._spare, *(session for session, _ in self._open.values())):
                 session.close()

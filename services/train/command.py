@@ -111,6 +111,7 @@ def run_training(
                     writers=writers,
                     metrics_port=metrics_port,
                     on_update=progress.update,
+                    on_event=lambda level, text: _warn(text) if level == "error" else None,
                 )
             else:
                 with _full_disk_named(run_dir):
@@ -128,7 +129,7 @@ def run_training(
                         certs=certs,
                         insecure=insecure,
                         report=progress.show,
-                        notify=lambda text: console.print(f"  [yellow]{text}[/]", soft_wrap=True),
+                        notify=_warn,
                     )
         if stop.is_set():
             console.print(f"Stopped. To resume: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
@@ -171,6 +172,11 @@ def _plan(config: RunConfig, actors: int | None, ranks: int, *, listens: bool) -
     if actors is None:
         actors = 0 if ENGINES[physics].on_device and not listens else 2
     return _Plan(ranks, actors, physics, gpus)
+
+
+def _warn(text: str) -> None:
+    """Prints a line about the run's processes."""
+    console.print(f"  {text}", style="yellow", markup=False, soft_wrap=True)
 
 
 def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None, *, resume: bool) -> None:

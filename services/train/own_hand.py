@@ -9,7 +9,7 @@ import pathlib
 import time
 from collections.abc import Callable, Sequence
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
@@ -73,6 +73,7 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
     Raises:
       CongraspError: the self-check failed, a stage failed, or the folder holds the training of another hand.
     """
+    need_package("The report", "jinja2")
     _begin(request)
     _check(request, note)
     if not request.full:

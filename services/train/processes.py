@@ -66,7 +66,7 @@ def train(
       certs: an authority's folder, for mutual TLS.
       insecure: listen beyond loopback without certificates.
       report: called with progress.
-      notify: called with a message when a process is restarted.
+      notify: called with a message when a process is restarted, and with errors of the learner, such as a full disk.
       writers: metric writers of rank 0.
       metrics_port: port of rank 0's Prometheus endpoint on the loopback interface; 0 for none.
 
@@ -200,6 +200,7 @@ def _supervise(
 ) -> None:
     """Restarts processes that die and reports progress, until rank 0 has finished or the run is stopped."""
     metrics = transport.subscribe(Keys(run).learner_metrics, depth=16)
+    events = transport.subscribe(Keys(run).log("event", "learner", "0"), depth=16)
     while not stop.is_set():
         codes = {child.name: child.process.poll() for child in learners if child.process}
         if codes[learners[0].name] == 0:
@@ -217,6 +218,9 @@ def _supervise(
                     child.restarts += 1
                     child.again_at = 0.0
                     child.start()
+        while event := events.receive(0.0):
+            if event[1].meta.get("level") == "error":
+                notify(str(event[1].meta.get("text")))
         received = metrics.receive(_POLL)
         alive = sum(child.process.poll() is None for child in actors if child.process) or len(learners)
         report({**(received[1].meta if received else {}), "actors": alive})

@@ -1,13 +1,14 @@
 """Compiled loops over triangles and over the samples of a picture, which Numba caches between processes."""
 
-import contextlib
-import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
 
-from congrasp.common.io.files import cache_folder
+from congrasp.common.io.files import cache_folder, can_cache
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 GAMMA = 2.2
 """sRGB is about linear light to the power of one over this."""
@@ -19,19 +20,23 @@ _ROUNDING = 1e-9  # of weights: a sample on an edge belongs to both sides
 _SMALL = 1e-6  # samples: a triangle of a smaller area covers nothing
 
 
-def _kept() -> bool:
-    """True if machine code can be cached in the user's cache; otherwise each process compiles it."""
+def _compiled(function: Function) -> Function:
+    """Compiles a function; machine code is cached in the user's cache, unless that cannot be written."""
     folder = cache_folder("kernels")
-    with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-    setattr(numba.config, "CACHE_DIR", str(folder))  # noqa: B010  its stubs know of no settings
-    return os.access(folder, os.W_OK)
+    options: dict[str, Any] = {
+        "nogil": True,
+        "error_model": "numpy",
+        "fastmath": {"contract", "arcp", "nsz", "afn", "reassoc"},
+    }
+    config: Any = numba.config
+    others, config.CACHE_DIR = config.CACHE_DIR, str(folder)
+    try:
+        return numba.njit(cache=can_cache(folder.parent, "XDG_CACHE_HOME"), **options)(function)
+    finally:
+        config.CACHE_DIR = others
 
 
 _Weights = tuple[tuple[float, float, float], tuple[float, float, float]]
-_compiled = numba.njit(
-    cache=_kept(), nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "afn", "reassoc"}
-)
 
 
 @_compiled

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.io.files import write_atomically
 from congrasp.services.record.palette import INK
 
@@ -92,10 +92,9 @@ def save_video(
     Raises:
       CongraspError: the package for videos is absent, or the file cannot be written.
     """
-    try:
-        import imageio_ffmpeg
-    except ImportError:
-        raise CongraspError("Videos need the package 'imageio-ffmpeg'.", "Run: pip install 'congrasp[viz]'") from None
+    need_package("A video", "imageio_ffmpeg")
+    import imageio_ffmpeg
+
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         writer = imageio_ffmpeg.write_frames(

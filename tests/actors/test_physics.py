@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import psutil
 import pytest
 
 from congrasp.actors.physics import resolve_physics
@@ -300,8 +299,7 @@ def test_jax_agrees_with_native(env, optimised):
 
 
 def test_environments_that_do_not_fit_into_the_memory_are_one_clear_line(env, monkeypatch):
-    free = psutil.virtual_memory()._replace(available=1_500_000)
-    monkeypatch.setattr("congrasp.actors.physics.native.psutil.virtual_memory", lambda: free)
+    monkeypatch.setattr("congrasp.actors.physics.native.memory", lambda: 1_500_000)
     native = NativePhysics(HAND, TASK, OBJECTS, 1)
     with pytest.raises(CongraspError, match=r"environments of MuJoCo C need .* GB are free.*smaller --environments"):
         native.start(env)

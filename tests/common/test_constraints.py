@@ -303,3 +303,9 @@ def test_episodes_with_fingers_are_those_without_in_all_else():
     _same(some, more, "fingers", functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-6))
     chosen, pose = (np.asarray(more.goal.active[name]) for name in ("fingers", "pose_finger"))
     assert not chosen[pose].any() and abs(chosen[~pose].mean() - 0.5) < 0.15
+
+
+def test_a_constraint_without_blocks_is_always_active():
+    *_, goal = scene(0)
+    always = [constraint for constraint in known(TASK) if not constraint.blocks]
+    assert always and all(constraint.active(goal).tolist() == [True] * 4 for constraint in always)

@@ -23,6 +23,13 @@ def test_training_never_touches_the_objects_of_evaluation(seed, count, shift):
     assert first >= 0 and first + count <= HELD_OUT_SEED
 
 
+@given(st.integers(0, HELD_OUT_SEED - 1), st.integers(1, 5000), st.integers(0, 2**32), st.integers(0, 2**32))
+def test_actors_share_no_object_while_there_are_enough(seed, count, one, other):
+    actors = (HELD_OUT_SEED - seed % count) // count
+    firsts = [first_seed(ObjectsConfig(seed=seed, count=count), shift % actors) for shift in (one, other)]
+    assert one % actors == other % actors or abs(firsts[0] - firsts[1]) >= count
+
+
 def test_evaluation_has_the_same_objects_everywhere():
     config = ObjectsConfig(count=2, seed=HELD_OUT_SEED + 7)
     assert first_seed(config, 0) == first_seed(config, 123) == HELD_OUT_SEED + 7

@@ -1,6 +1,7 @@
-"""Work spread over processes."""
+"""Cores and memory of this process, and work spread over processes, as scripts of users have it."""
 
 import operator
+import pathlib
 import signal
 import subprocess
 import sys
@@ -9,32 +10,108 @@ import time
 import psutil
 import pytest
 
+import congrasp
 from congrasp.common.runtime import parallel
+from congrasp.common.runtime.parallel import cores, memory, parallel_map
 
-_SCRIPT = """
+_ROOT = pathlib.Path(congrasp.__file__).parents[1]
+_SPREAD = """
 import time
 from congrasp.common.runtime.parallel import parallel_map
-if __name__ == "__main__":
-    parallel_map(time.sleep, [60.0] * 200)
+parallel_map(time.sleep, [60.0] * 200)
 """
+_SCRIPTS = {
+    "make_vec": """
+        import congrasp
+        envs = congrasp.make_vec(num_envs=2)
+        print("RESULT", envs.num_envs)
+        envs.close()
+    """,
+    "thread": """
+        import threading
+        from congrasp.common.objects.procedural import generate_many
+        thread = threading.Thread(target=lambda: print("RESULT", len(generate_many(64, 0))))
+        thread.start()
+        thread.join()
+    """,
+    "a class of the script": """
+        from congrasp.common.runtime.parallel import parallel_map
+        class Mass:
+            def __abs__(self):
+                return 2
+        print("RESULT", sum(parallel_map(abs, [Mass() for _ in range(64)])) // 64)
+    """,
+}
+_UNTOUCHED = """
+import logging, os, signal
+import gymnasium, jax, mujoco, trimesh  # some set variables themselves
+
+def state():
+    root = logging.getLogger()
+    handlers = [signal.getsignal(number) for number in signal.valid_signals()]
+    return dict(os.environ), list(root.handlers), root.level, handlers, signal.set_wakeup_fd(-1)
+
+before = state()
+import congrasp
+for name in congrasp.__all__:
+    getattr(congrasp, name)
+after = state()
+print([(a, b) for a, b in zip(before, after) if a != b])
+"""
+
+two_cores = pytest.mark.skipif(cores() < 2, reason="one core: nothing is spread")
 
 
 @pytest.mark.parametrize("count", [3, 200])
 def test_results_are_those_of_map(count, monkeypatch):
     monkeypatch.setattr(parallel.os, "sched_getaffinity", lambda pid: {0, 1})
-    assert parallel.parallel_map(operator.sub, range(count), [1] * count) == [i - 1 for i in range(count)]
+    assert parallel_map(operator.sub, range(count), [1] * count) == [i - 1 for i in range(count)]
 
 
+@two_cores
+def test_an_error_of_a_call_is_raised_as_by_map():
+    with pytest.raises(ZeroDivisionError):
+        parallel_map(operator.truediv, [1] * 80, [*range(1, 80), 0])
+
+
+@two_cores
+@pytest.mark.parametrize(
+    ("kind", "by"),
+    [
+        pytest.param("make_vec", "file", marks=pytest.mark.slow),  # compiles
+        ("thread", "file"),
+        ("thread", "stdin"),
+        ("a class of the script", "file"),
+    ],
+)
+def test_a_script_without_a_guard_runs_once(kind, by, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(f'print("started", __name__)\n{_dedented(_SCRIPTS[kind])}')
+    command = [sys.executable, script] if by == "file" else [sys.executable, "-"]
+    with script.open() as stdin:
+        done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, cwd=_ROOT, timeout=300)
+    assert done.stdout.split("\n") == ["started __main__", f"RESULT {64 if kind == 'thread' else 2}", ""], done.stderr
+    assert done.returncode == 0 and "Traceback" not in done.stderr
+
+
+def _dedented(text):
+    return "\n".join(line.removeprefix(" " * 8) for line in text.splitlines())
+
+
+def test_the_public_names_change_neither_environment_nor_logging_nor_signals():
+    done = subprocess.run([sys.executable, "-c", _UNTOUCHED], capture_output=True, text=True, cwd=_ROOT, timeout=120)
+    assert done.stdout == "[]\n", done.stderr
+
+
+@two_cores
 def test_workers_end_with_a_killed_parent(tmp_path):
-    if len(psutil.Process().cpu_affinity()) < 2:
-        pytest.skip("one core: nothing is spread")
     script = tmp_path / "spread.py"
-    script.write_text(_SCRIPT)
-    parent = subprocess.Popen([sys.executable, script])
+    script.write_text(_SPREAD)
+    parent = subprocess.Popen([sys.executable, script], cwd=_ROOT)
     try:
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 60
         workers: list[psutil.Process] = []
-        while len(workers) < 3 and time.monotonic() < deadline:  # two workers and multiprocessing's own tracker
+        while len(workers) < 3 and time.monotonic() < deadline:  # the helper and two workers
             time.sleep(0.1)
             workers = psutil.Process(parent.pid).children(recursive=True)
         assert len(workers) >= 3
@@ -45,3 +122,32 @@ def test_workers_end_with_a_killed_parent(tmp_path):
         assert not alive
     finally:
         parent.kill()
+
+
+@pytest.mark.parametrize(
+    ("membership", "files", "expected"),
+    [
+        ("0::/jobs/mine", {"jobs/mine/cpu.max": "50000 100000", "jobs/mine/memory.max": "max"}, (1, None)),
+        ("0::/jobs/mine", {"jobs/mine/cpu.max": "max 100000", "jobs/cpu.max": "150000 100000"}, (2, None)),
+        ("0::/", {"cpu.max": "800000 100000", "memory.max": f"{8 << 20}"}, (3, 0)),  # less than this process uses
+        (
+            "5:memory:/docker/1\n4:cpu,cpuacct:/docker/1",
+            {"cpu/cpu.cfs_quota_us": "110000", "cpu/cpu.cfs_period_us": "100000",
+             "memory/docker/1/memory.limit_in_bytes": f"{8 << 20}"},
+            (2, 0),
+        ),
+        ("4:cpu:/", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, (3, None)),
+        ("", {}, (3, None)),
+    ],
+)  # fmt: skip
+def test_quotas_of_control_groups_count(membership, files, expected, monkeypatch, tmp_path):
+    """Those of the process's group and of all above it, in both versions, on a machine with three cores."""
+    monkeypatch.setattr(parallel.os, "sched_getaffinity", lambda pid: {0, 1, 2})
+    monkeypatch.setattr(parallel, "_GROUPS", tmp_path)
+    monkeypatch.setattr(parallel, "_MEMBERSHIP", tmp_path / "membership")
+    (tmp_path / "membership").write_text(membership)
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(f"{text}\n")
+    assert cores() == expected[0]
+    assert memory() == expected[1] if expected[1] is not None else memory() > 1 << 26

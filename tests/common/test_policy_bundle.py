@@ -98,6 +98,10 @@ def _without(message: Message, name: str) -> Message:
     return Message({k: v for k, v in message.arrays.items() if k != name}, message.meta)
 
 
+def _with(message: Message, name: str, value: float) -> Message:
+    return Message({**message.arrays, name: np.full_like(message.arrays[name], value)}, message.meta)
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -112,6 +116,13 @@ def _without(message: Message, name: str) -> Message:
         (lambda m: Message({**m.arrays, "actor/log_std": np.zeros(3, np.float32)}, m.meta), "actor/log_std"),
         (lambda m: Message({**m.arrays, "actor/log_std": np.full(2, np.nan)}, m.meta), "actor/log_std"),
         (lambda m: Message({**m.arrays, "actor/log_std": np.zeros(2, np.int32)}, m.meta), "actor/log_std"),
+        (lambda m: Message({**m.arrays, "actor/log_std": np.full(2, 1e4, np.float32)}, m.meta), "actor/log_std"),
+        (lambda m: _with(m, "observation/m2", -1.0), "observation/m2"),
+        (lambda m: _with(m, "observation/count", -1.0), "observation/count"),
+        (lambda m: _with(m, "critic/output/bias", 1e30), "critic/output/bias"),
+        (lambda m: Message(m.arrays, {**m.meta, "version": -1}), "version"),
+        (lambda m: Message(m.arrays, {**m.meta, "version": 2**70}), "version"),
+        (lambda m: Message(m.arrays, {**m.meta, "transitions": -1}), "transitions"),
     ],
 )
 def test_a_spoilt_bundle_is_refused_in_one_line(bundle, spoil, words):

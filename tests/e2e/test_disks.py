@@ -17,6 +17,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import LOGS, create_run
 from congrasp.services.ops.audit import audit
+from congrasp.services.ops.status import ask
 from congrasp.services.record.reader import read_metrics
 from congrasp.services.record.recorder import Recorder
 from tests.learner.test_process import CONFIG, MadeUpActor
@@ -58,7 +59,7 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
     hub = MemoryHub()
     journal = tmp_path / "actor.jsonl"
     actor = MadeUpActor(MemoryTransport(hub), journal=Journal(journal))
-    said, complaints, filler = [], [], []
+    said, complaints, filler, warnings = [], [], [], []
     with MemoryTransport(hub) as transport:
         recorder = Recorder(transport, config.name, run_dir / LOGS, warn=complaints.append)
 
@@ -66,6 +67,8 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
             if values["update"] == 4:
                 eventually(lambda: recorder.files and "learner/0/kl" in read_metrics(run_dir))
                 filler.append(fill(disk))
+            if values["update"] == 6:
+                warnings.extend(ask(transport, config.name)["warnings"])
             if values["update"] == 8:
                 eventually(lambda: publish_noise(transport) or recorder.error)
                 filler[0].unlink()
@@ -79,7 +82,9 @@ def test_training_goes_on_over_a_full_disk(disk, tmp_path):
     errors = [text for level, text in said if level == "error"]
     (error,) = (text for text in errors if "checkpoint_" in text)  # although every update tries again
     assert "checkpoint_000000004.safetensors could not be written" in error
-    assert "a kill loses the 2 update(s) since update 2 and all later ones" in error
+    assert "A kill now would lose 2 update(s), those since update 2." in error
+    (warning,) = (text for text in warnings if "checkpoint_000000005" in text)
+    assert "A kill now would lose 3 update(s), those since update 2." in warning
     assert ("info", "Checkpoints can be written again; the newest is of update 8.") in said
     assert not any("\n" in text for text in errors)
     assert complaints == [recorder.error] and "No space left" in recorder.error

@@ -107,6 +107,7 @@ def test_nothing_is_granted_or_taken_before_the_first_weights(bench):
 def test_tickets_run_out_and_return(bench):
     b = bench(version=0, max_staleness=0, batch=1)
     assert b.ticket("t")["granted"] and b.ticket("t")["granted"]
+    assert b.hub._sequences.of(("a", "01")).granted == 1
     assert not b.ticket("u")["granted"]
     b.ticket("t", give_back=True)
     assert b.ticket("u")["granted"]

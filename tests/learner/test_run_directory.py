@@ -136,5 +136,15 @@ def test_one_learner_at_a_time_until_it_dies(run):
         other.kill()
         assert other.wait() == -signal.SIGKILL
     continue_run(folder, dataclasses.replace(config, updates=9))
-    with exclusive(folder):
+    with exclusive(folder) as check:
         assert (folder / "lock").read_text() == str(os.getpid())
+        (folder / "lock").unlink()
+        check()  # reading the file here would release its lock
+        with subprocess.Popen([sys.executable, "-c", script, str(folder)], stderr=subprocess.PIPE) as other:
+            assert b"is in use by process" in other.stderr.read()
+        (folder / "lock").unlink()
+        with subprocess.Popen([sys.executable, "-c", script, str(folder)], stdout=subprocess.PIPE) as other:
+            assert other.stdout.readline() == b"mine\n"
+            with pytest.raises(CongraspError, match=f"in use by process {other.pid}"):
+                check()
+            other.kill()

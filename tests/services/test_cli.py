@@ -9,18 +9,22 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from unittest import mock
 
 import pytest
+import trimesh
 
 import congrasp.services.cli.main as cli
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli import console
 from congrasp.services.cli.main import COMMANDS, load
 from congrasp.services.ops.logs import announced
 from tests.printed import errors
+
+ROOT = Path(__file__).parents[2]
 
 
 def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -59,6 +63,8 @@ def test_help_names_every_command_and_every_command_exists():
         (["train", "--task.hand", "paw"], "no hand 'paw'"),
         (["train", "--resume", "--run-dir", "/nonexistent-run"], "is not a run directory"),
         (["evaluate", "--policy", "/nonexistent.safetensors"], "--policy: there is no file /nonexistent.safetensors"),
+        (["evaluate", "--json", "/dev/null/x.json"], "--json is /dev/null/x.json, but /dev/null is a file"),
+        (["grasp", "mug:7", "--out", "/dev/null/x"], "--out is /dev/null/x, but /dev/null is a file"),
         (["serve", "--hand", "paw"], "no hand 'paw'"),
         (["serve", "--policy", "a", "--connect", "tcp/127.0.0.1:1"], "either a or"),
         (["serve", "--policy", "/nonexistent"], "cannot be read"),
@@ -121,6 +127,10 @@ def test_libraries_add_nothing_to_the_line(arguments, words):
             OSError(errno.EIO, os.strerror(errno.EIO)),
             "A file could not be read or written, because its disk failed. Try another path.",
         ),
+        (
+            FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"),
+            "There is no folder for temporary files that can be written. Set TMPDIR to one.",
+        ),
     ],
 )
 def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(error, line, monkeypatch, capsys):
@@ -181,6 +191,16 @@ main()
     assert done.stdout.endswith("shut down\n") is not late
 
 
+def test_a_command_runs_in_any_thread_of_a_program(capsys):
+    """Python signals the main thread alone."""
+    codes: list[int] = []
+    with mock.patch.dict(os.environ):
+        thread = threading.Thread(target=lambda: codes.append(cli.run(["hands", "list"])))
+        thread.start()
+        thread.join(60.0)
+    assert codes == [0] and "allegro" in capsys.readouterr().out
+
+
 def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(logging.getLogger(), "handlers", [*logging.getLogger().handlers])
     port = free_port()
@@ -191,6 +211,32 @@ def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, monkeypatch, capfd):
             cli.main(["learner", "--run-dir", str(tmp_path / "run"), "--listen", f"tcp/127.0.0.1:{port}"])
     is_one_line(end.value.code, capfd.readouterr().err, f"127.0.0.1:{port} is in use")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments"),
+    [
+        ("matplotlib", ["evaluate", "--table", "noise", "--pictures", "pictures"]),
+        ("imageio_ffmpeg", ["grasp", "mug:7", "--video"]),
+    ],
+)
+def test_a_missing_package_is_named_before_the_work(package, arguments, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    with mock.patch.dict(os.environ), pytest.raises(MissingPackageError, match=rf"'{package}'.*congrasp\[viz\]"):
+        cli.run(arguments)
+
+
+def test_without_a_home_and_a_cache_everything_works(tmp_path):
+    """One line says that nothing is cached."""
+    trimesh.creation.box((0.05, 0.06, 0.07)).export(tmp_path / "box.stl")
+    environment = {name: text for name, text in os.environ.items() if not name.startswith(("XDG_", "JAX_COMP"))}
+    done = subprocess.run(
+        [sys.executable, "-m", "congrasp", "objects", "import", tmp_path / "box.stl", "--out", tmp_path],
+        env={**environment, "HOME": "/proc/nowhere", "PYTHONPATH": str(ROOT)},
+        capture_output=True, text=True, timeout=180,
+    )  # fmt: skip
+    assert done.returncode == 0 and (tmp_path / "box.safetensors").is_file(), done.stderr
+    assert done.stderr.count("/proc/nowhere") == done.stderr.count("XDG_CACHE_HOME") == 1
 
 
 def test_a_misspelt_file_is_named_before_anything_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

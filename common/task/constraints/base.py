@@ -382,8 +382,8 @@ class Constraint:
         return self.goal(**made)
 
     def active(self, goal: Goal) -> Array:
-        """(B,) bool: it is active, see `among`."""
-        return self.among(goal.active)
+        """(B,) bool: it is active, see `among`; always for one without blocks."""
+        return self.among(goal.active) if self.blocks else jnp.ones(len(goal[self.name][0]), bool)
 
     def among(self, blocks: Mapping[str, Array]) -> Array:
         """(B,) bool: one of its blocks is active. Only optional constraints have blocks.

@@ -164,7 +164,7 @@ def describe(constraints: Message) -> dict[str, str]:
         "reference poses": f"{poses.shape[2]} for each",
         "wrist trajectories": f"equally many, {waypoints.shape[2]} waypoints, "
         f"{100 * length.min():.0f} to {100 * length.max():.0f} cm long; "
-        " each ends at its pose",
+        "each ends at its pose",
     }
     if "source" in meta:
         rows["captured"] = f"{meta['source']}: {', '.join(meta['demonstrations'])}"

@@ -22,13 +22,16 @@ import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_PIECES
+from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects.pieces import DEPTH, GROWTH, deepest, merge, solid_hull
 
 FALLBACK_LIMIT = 30.0
 """Limit of V-HACD's processor time, s."""
 STARVED = 20.0
 """Ratio of wall-clock to processor time above which the machine counts as too busy."""
-_MEMORY = 6 << 30  # bytes of address space
+LEAST_MEMORY = 2 << 30
+"""Bytes of memory for which a child is started."""
+_MEMORY = 6 << 30  # bytes of address space of a child, where there is enough for one on every core
 _FINEST = 0.01  # the smallest threshold that CoACD takes, of half the longest side
 _ROOT = pathlib.Path(congrasp.__file__).parents[1]
 
@@ -117,7 +120,8 @@ def _child(method: str, mesh: str, result: str, max_pieces: str, limit: str) -> 
     """Decomposes one mesh file into another; ends at the limit, or when the parent is gone."""
     signal.setitimer(signal.ITIMER_PROF, float(limit))  # of processor time; its signal ends the process
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    most = min(_MEMORY, max(LEAST_MEMORY, memory() // cores()))
+    resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
     with np.load(mesh) as arrays:
         vertices, faces, volume = arrays["vertices"], arrays["faces"], float(arrays["volume"])
     if method == "coacd":

@@ -19,7 +19,7 @@ from congrasp.common.objects import shapes, store
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.spec import Colours, GraspObject, Piece
 from congrasp.common.objects.surface import halves, mass_properties, sample_mesh
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.collision import convex_pieces
 from congrasp.services.assets.objects.colours import sample_colours
@@ -46,21 +46,23 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
     """
     check_options(options)
     key = _cache_key(source, options)
-    cached = _cache_folder(options) / f"{key}{store.SUFFIX}"
+    folder = pathlib.Path(options.cache_dir) if options.cache_dir else cache_folder("objects")
+    cached = folder / f"{key}{store.SUFFIX}"
     if cached.is_file():
         try:
             return store.load(cached)
         except CongraspError:
-            cached.unlink()
+            pass  # it is damaged, and replaced below
     obj = _build(source, options, int(key, 16))
-    store.save(obj, cached)
+    with contextlib.suppress(CongraspError):  # of a full disk, or of a read-only folder
+        store.save(obj, cached)
     return obj
 
 
 def import_sources(
     sources: Sequence[Source], options: ImportOptions
 ) -> Iterator[tuple[int, GraspObject | CongraspError]]:
-    """Imports objects in parallel, one for each core; yields the index of each when done, and the object or error.
+    """Imports objects in parallel, one for each core if memory suffices; yields each index, and the object or error.
 
     Each decomposition is a separate process with a deadline and a memory limit, for which daemon threads of this
     process wait.
@@ -82,7 +84,7 @@ def import_sources(
                 except Exception as error:  # raised in the caller's thread
                     done.put((i, error))
 
-    for _ in range(min(len(sources), cores())):
+    for _ in range(min(len(sources), cores(), max(1, memory() // decompose.LEAST_MEMORY))):
         threading.Thread(target=work, daemon=True).start()
     meshes = max((len(source.visuals) for source in sources), default=0)
     patience = meshes * (options.time_limit + decompose.FALLBACK_LIMIT) + _PATIENCE
@@ -96,11 +98,6 @@ def import_sources(
         raise CongraspError(f"No import has ended for {patience:.0f} s.", "Import fewer objects at once.") from None
     finally:
         todo.clear()
-
-
-def _cache_folder(options: ImportOptions) -> pathlib.Path:
-    """Cache folder of finished imports."""
-    return pathlib.Path(options.cache_dir) if options.cache_dir else cache_folder("objects")
 
 
 def _cache_key(source: Source, options: ImportOptions) -> str:

@@ -1,8 +1,10 @@
 """Options for converting meshes to objects, separate from their use, so that the command line starts quickly."""
 
 import dataclasses
+import pathlib
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.io.files import can_cache
 from congrasp.common.objects.spec import MAX_MESH_PIECES
 from congrasp.services.assets.objects.sizes import Unit
 
@@ -33,7 +35,10 @@ class ImportOptions:
 
 
 def check_options(options: ImportOptions) -> None:
-    """Raises a CongraspError for numbers that are not positive, and for both a material and a density."""
+    """Raises a CongraspError for numbers that are not positive, and for both a material and a density.
+
+    A cache that cannot be written is logged.
+    """
     for name in ("scale", "density", "time_limit", "max_pieces"):
         value = getattr(options, name)
         if value is not None and not value > 0:
@@ -42,3 +47,5 @@ def check_options(options: ImportOptions) -> None:
         raise CongraspError(f"--mass is {options.mass}.", "It must be positive, in kilograms.")
     if options.material and options.density is not None:
         raise CongraspError("--material and --density both say how dense it is.", "Leave one of them out.")
+    if options.cache_dir:
+        can_cache(pathlib.Path(options.cache_dir), "--cache-dir")

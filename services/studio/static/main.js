@@ -46,7 +46,7 @@ class App {
   }
 
   async start() {
-    const state = await ask("/api/state");
+    const state = await ask("api/state");
     await Promise.all([this.hand(state.studio.hand), this.#object(state)]);
     await this.panel.show(state);
     this.#frameAll(state.studio);
@@ -65,11 +65,11 @@ class App {
 
   // Resolves when a hand can be drawn.
   async hand(name) {
-    if (!this.scene.hands.has(name)) this.scene.setHand(name, await fetchMessage("/api/hand", { name }));
+    if (!this.scene.hands.has(name)) this.scene.setHand(name, await fetchMessage("api/hand", { name }));
   }
 
   async #object({ studio, shown }) {
-    const [mesh, paint] = await Promise.all([fetchMessage("/api/object"), fetchMessage("/api/paint")]);
+    const [mesh, paint] = await Promise.all([fetchMessage("api/object"), fetchMessage("api/paint")]);
     this.scene.setObject(mesh.arrays.vertices.data, mesh.arrays.faces.data, mesh.arrays.colours?.data);
     this.body.paint(paint.arrays.avoid.data);
     this.shownObject = shown;
@@ -94,7 +94,7 @@ class App {
 
   // Shows the paint as the server has it.
   async repaint() {
-    this.body.paint((await fetchMessage("/api/paint")).arrays.avoid.data);
+    this.body.paint((await fetchMessage("api/paint")).arrays.avoid.data);
     this.redraw();
   }
 

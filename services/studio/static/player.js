@@ -121,7 +121,7 @@ export class Player {
   async #load(id, name, slot) {
     const number = ++this.wanted;
     try {
-      const motion = new Motion(id, await fetchMessage("/api/motion", { id }));
+      const motion = new Motion(id, await fetchMessage("api/motion", { id }));
       await this.app.hand(motion.hand);
       if (number !== this.wanted) return null;
       const body = new Body(this.app.renderer, motion.vertices, motion.faces, motion.colours);

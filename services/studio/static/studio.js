@@ -57,13 +57,13 @@ export class StudioPanel {
     this.queue = this.queue.then(async () => {
       this.busy(true);
       try {
-        const state = await post("/api/do", { action, ...values });
+        const state = await post("api/do", { action, ...values });
         this.error("");
         await this.show(state);
         return true;
       } catch (error) {
         this.error(error.message);
-        await this.show(await ask("/api/state").catch(() => this.state));
+        await this.show(await ask("api/state").catch(() => this.state));
         return false;
       } finally {
         this.busy(false);
@@ -103,7 +103,7 @@ export class StudioPanel {
 
   // Shows what the server knows now, such as a run's newer weights; whether it answered.
   async refresh() {
-    const state = await ask("/api/state").catch(() => null);
+    const state = await ask("api/state").catch(() => null);
     if (state) await this.show(state);
     return Boolean(state);
   }
@@ -119,7 +119,7 @@ export class StudioPanel {
   async take(file) {
     try {
       this.error("");
-      await upload("/api/upload", file);
+      await upload("api/upload", file);
       await this.refresh();
     } catch (error) {
       this.error(error.message);
@@ -177,7 +177,7 @@ export class StudioPanel {
         const button = document.createElement("button");
         button.dataset.rest = i;
         button.title = `Resting pose ${i + 1}: its z axis is ${tilt}° from up`;
-        const picture = Object.assign(new Image(), { src: `/api/rest?index=${i}&shown=${shown}`, alt: "" });
+        const picture = Object.assign(new Image(), { src: `api/rest?index=${i}&shown=${shown}`, alt: "" });
         button.append(picture, i ? `${i + 1}` : "1, most stable");
         button.addEventListener("click", () => this.act("set_rest_pose", { rest: i }));
         return button;
@@ -235,7 +235,7 @@ export class StudioPanel {
       this.settled = job.number;
       this.error(job.error);
       if (job.error || !job.made) return;
-      if (job.made === DRAWING) this.#download("/api/drawn", {});
+      if (job.made === DRAWING) this.#download("api/drawn", {});
       else this.app.play(job.made, this.#name(job.made));
     }
   }
@@ -245,7 +245,7 @@ export class StudioPanel {
     let job;
     do {
       await new Promise((resolve) => setTimeout(resolve, POLL));
-      job = await ask("/api/job").catch(() => null);
+      job = await ask("api/job").catch(() => null);
       if (job?.running) this.#job(job);
     } while (!job || job.running);
     // Without the new state nobody would hear what came of the job.
@@ -293,7 +293,7 @@ export class StudioPanel {
   #save(kind) {
     const { player, camera } = this.app;
     const { id } = player.motion;
-    if (!this.state.drawn.includes(kind)) return this.#download("/api/export", { id, kind });
+    if (!this.state.drawn.includes(kind)) return this.#download("api/export", { id, kind });
     return this.act("draw_motion", { id, kind, camera: camera.view, frame: player.motion.step(player.time) });
   }
 

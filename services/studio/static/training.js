@@ -71,7 +71,7 @@ export class TrainingPanel {
     if (this.looking) return;
     this.looking = true;
     try {
-      this.view = await ask("/api/training", { names: this.chosen.join(",") });
+      this.view = await ask("api/training", { names: this.chosen.join(",") });
       this.#showWarnings();
       this.#show();
     } catch (error) {
@@ -267,7 +267,7 @@ export class TrainingPanel {
     found.hidden = false;
     found.textContent = "Searching the recordings …";
     try {
-      const { seconds: reach, episodes } = await ask("/api/episodes", { time: curve.times[index], seconds });
+      const { seconds: reach, episodes } = await ask("api/episodes", { time: curve.times[index], seconds });
       const title = document.createElement("p");
       title.textContent = `${episodes.length} episodes within ${short(reach)} s of update ${short(curve.steps[index])}, ${episodes.filter((e) => e.success).length} succeeded`;
       found.replaceChildren(title, ...episodes.map((episode) => {

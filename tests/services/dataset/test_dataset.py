@@ -1,12 +1,15 @@
 """Datasets of grasps: the same shards whoever makes them, in whichever order, killed or not; and what they say."""
 
+import hashlib
 import json
 import os
 import pathlib
 import re
+import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,6 +46,14 @@ def contents(folder: pathlib.Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*.parquet"))}
 
 
+def loader() -> Callable:
+    """The loader of the documentation."""
+    code = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "datasets.md").read_text(), re.S)
+    namespace: dict = {}
+    exec(code[1], namespace)
+    return namespace["batches"]
+
+
 @pytest.fixture(scope="module")
 def short_protocol():
     """Holds and pushes that last an eighth and a fifth of their time."""
@@ -62,12 +73,8 @@ def whole(tmp_path_factory, short_protocol) -> pathlib.Path:
 
 @pytest.fixture(scope="module")
 def columns(whole) -> dict[str, np.ndarray]:
-    """Its grasps, by the loader of the documentation."""
-    page = (ROOT / "docs" / "datasets.md").read_text()
-    code = re.search(r"```python\n(.*?)```", page, re.S)
-    namespace: dict = {}
-    exec(code[1], namespace)
-    batches = [dict(batch) for batch in namespace["batches"](whole, size=3)]
+    """Its grasps."""
+    batches = [dict(batch) for batch in loader()(whole, size=3)]
     assert max(len(batch["q"]) for batch in batches) <= 3
     return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
 
@@ -153,6 +160,24 @@ def test_bad_options(whole, more, words):
     with pytest.raises(CongraspError, match=words) as error:
         cli.run(arguments(whole, *more))
     assert "\n" not in str(error.value)
+
+
+def test_a_damaged_file_is_named_and_a_missing_one_is_made_again(whole, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(whole, folder)
+    card, grasps = made(folder), folder / "grasps" / "00001-of-00002.parquet"
+    assert card["sha256"] == {name: hashlib.sha256(data).hexdigest() for name, data in contents(whole).items()}
+    data = grasps.read_bytes()
+    for place in range(0, len(data), len(data) // 16):
+        grasps.write_bytes(data[:place] + bytes(200) + data[place + 200 :])
+        with pytest.raises(CongraspError, match=r"00001-of-00002\.parquet is damaged"):
+            made(folder)
+    with pytest.raises(OSError, match=r"CRC|checksum"):
+        grasps.write_bytes(data[:2000] + bytes(2000) + data[4000:])
+        list(loader()(folder))
+    grasps.write_bytes(data)
+    (folder / "objects" / grasps.name).unlink()
+    assert made(folder) == card and contents(folder) == contents(whole)
 
 
 def test_a_range_of_the_generator_is_many_objects():

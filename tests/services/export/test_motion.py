@@ -12,6 +12,8 @@ import pyarrow.parquet as pq
 import pygltflib
 import pytest
 import trimesh
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from pxr import Usd, UsdGeom, UsdSkel
 from scipy.spatial.transform import Rotation
 
@@ -169,6 +171,20 @@ def beginning(motion: GraspMotion, count: int) -> GraspMotion:
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_single_frame_is_a_motion(odd_hand: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
     assert export([beginning(odd_hand, 1)], kind, tmp_path)[1] < 0.01
+
+
+def test_a_controller_can_take_the_trajectory_of_a_bag(robot: GraspMotion, tmp_path: pathlib.Path) -> None:
+    """It begins after time zero, and is at rest at both ends."""
+    path, _ = export([robot], "ros2", tmp_path)
+    (file,) = path.glob("*.mcap")
+    with file.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        ((*_, message),) = reader.iter_decoded_messages(topics=["/joint_trajectory"])
+    speeds = np.array([point.velocities for point in message.points])
+    inside = np.gradient(robot.joint_position, robot.control_dt, axis=0)[1:-1]
+    np.testing.assert_allclose(speeds, np.pad(inside, ((1, 1), (0, 0))), rtol=1e-6)
+    since = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
+    np.testing.assert_allclose(since, 1.0 + robot.time, atol=1e-9)
 
 
 def test_a_usd_has_the_rate_that_is_asked_for(odd_hand: GraspMotion, tmp_path: pathlib.Path) -> None:

@@ -14,6 +14,7 @@ from congrasp.common.objects.shapes import matrix
 from congrasp.common.request import GraspRequest
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.grasp import approaches
 from congrasp.services.grasp.approaches import headings
 from congrasp.services.grasp.grasper import with_avoid
 
@@ -43,3 +44,16 @@ def test_fingers_close_across_a_handle_that_few_surface_points_lie_on() -> None:
     position, _, cross, _ = headings(get_hand("human"), with_avoid(cup, avoid), request, 64, rng)
     assert len(np.unique(position, axis=0)) > 4 and (position[:, 0] > face + 0.01).all()
     assert (np.abs(cross[:, 1]) > 0.7).all()  # across the bars of the handle, not along them
+
+
+@pytest.mark.parametrize(
+    ("asked", "remedy"),
+    [
+        (GraspRequest(), "Scale it."),
+        (GraspRequest(rest=2), "Leave out --rest, or scale it."),
+        (GraspRequest(above=True), "Leave out --heading, or scale it."),
+        (GraspRequest({"heading": {"position": np.zeros(3)}}, rest=0), "Leave out --rest or --at, or scale it."),
+    ],
+)
+def test_a_remedy_names_the_options_that_were_given(asked: GraspRequest, remedy: str) -> None:
+    assert approaches._remedy(asked, "scale it") == remedy

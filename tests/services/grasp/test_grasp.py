@@ -240,7 +240,10 @@ def test_exit_codes(tmp_path, capsys, monkeypatch, made_up):
 def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, made_up):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     path = meshes(tmp_path / "things", "a") / "a.stl"
-    assert load("grasp")([str(path), "--out", str(tmp_path / "out")])() == 0
+    assert command(path, "--out", tmp_path / "out") == 0
+    for _ in range(2):
+        assert load("grasp")([str(path), "--out", str(tmp_path / "out")])() == 0
+    assert made_up == ["a", "a"]  # without its pictures it was not done
     assert Image.open(tmp_path / "out" / "a" / PORTRAIT).size == (1280, 720)
     for name, columns in ((OBJECT, 3), (PICTURE, 4)):
         image = np.asarray(Image.open(tmp_path / "out" / "a" / name).convert("RGB")).astype(int)

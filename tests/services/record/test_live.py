@@ -4,6 +4,7 @@ import collections
 import itertools
 import json
 import pathlib
+import socket
 import struct
 import time
 
@@ -122,6 +123,33 @@ def test_a_schema_that_grows_replaces_its_channel() -> None:
                     break
             assert json.loads(seen.frames["/m"][-1][1]) == fields
         assert set(json.loads(seen.advertised["/m"]["schema"])["properties"]) == {"a", "b"}
+
+
+@pytest.mark.parametrize(
+    ("headers", "admitted"),
+    [
+        ({}, True),
+        ({"Origin": "https://app.foxglove.dev"}, True),
+        ({"Origin": "file://"}, True),
+        ({"Origin": "http://localhost:8080"}, True),
+        ({"Host": "localhost:9000"}, True),  # a tunnel
+        ({"Origin": "https://evil.example"}, False),
+        ({"Origin": "https://foxglove.dev.evil.example"}, False),
+        ({"Origin": "null"}, False),
+        ({"Host": "evil.example:80"}, False),
+    ],
+)
+def test_other_sites_in_a_browser_cannot_watch(headers: dict[str, str], admitted: bool) -> None:
+    with LiveServer(0) as server:
+        address = f"127.0.0.1:{server.port}"
+        lines = {"Host": address, "Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13",
+                 "Sec-WebSocket-Key": "x3JJHMbDL1EzLkh9GBhXDw==", "Sec-WebSocket-Protocol": "foxglove.sdk.v1",
+                 **headers}  # fmt: skip
+        with socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as connection:
+            text = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+            connection.sendall(f"GET / HTTP/1.1\r\n{text}\r\n".encode())
+            answer = connection.recv(1 << 12).decode("latin-1")
+    assert answer.startswith("HTTP/1.1 101 " if admitted else "HTTP/1.1 403 ")
 
 
 def test_a_busy_port_is_said_in_words() -> None:

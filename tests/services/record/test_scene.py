@@ -233,3 +233,11 @@ def test_episodes_of_one_actor_follow_each_other_and_actors_stand_side_by_side()
     ]
     places = [next(t for t in tf.transforms if t.parent_frame_id == "world").translation.x for tf in transforms]
     assert places == [0.0, pytest.approx(SPACING)]
+
+
+def test_a_clock_that_is_set_back_drops_no_episode() -> None:
+    convert, day = Converter(), 86_400_000_000_000
+    first = convert(KEY, episode(), START)
+    left = max(entry.time for entry in first) - START
+    times = [entry.time for entry in convert(KEY, episode(), START - day)]
+    assert left < min(times) - (START - day) < 2 * left

@@ -251,7 +251,7 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
     rclpy = Fields(init=lambda: None, create_node=lambda name: Node(), spin_once=spin_once, try_shutdown=lambda: None)
     monkeypatch.setitem(sys.modules, "rclpy", rclpy)
     monkeypatch.setitem(sys.modules, "rclpy.qos", qos)
-    for package in ("sensor_msgs", "geometry_msgs", "std_msgs", "builtin_interfaces", "tf2_msgs"):
+    for package in ("sensor_msgs", "geometry_msgs", "std_msgs", "builtin_interfaces", "tf2_msgs", "rosgraph_msgs"):
         kinds = [kind for kind in STORE.types if kind.startswith(f"{package}/msg/")]
         monkeypatch.setitem(sys.modules, package, types.ModuleType(package))
         module = Fields(**{kind.rpartition("/")[2]: message(kind) for kind in kinds})
@@ -266,6 +266,33 @@ def test_with_rclpy_it_is_the_same_node(example, monkeypatch):
         eventually(turn)
         turn()
         check(policy, obj, [sent["joint_command"], sent["wrist_command"]])
+
+
+def test_stamps_are_of_a_simulator_s_clock_where_one_is_published(example, capsys):
+    def stamp(seconds):
+        return Fields(sec=int(seconds), nanosec=300_000_000)
+
+    def joints(seconds):
+        header = Fields(stamp=stamp(seconds), frame_id="")
+        return "joint_states", Fields(header=header, name=NAMES, position=HAND.q_open.tolist(), velocity=[])
+
+    def clock(seconds):
+        return "clock", Fields(clock=stamp(seconds))
+
+    def measured(*received):
+        sensors.take(list(received))
+        return np.isfinite(sensors.joints()[0]).all()
+
+    bus = Wire()
+    with node_of(example, bus) as (node, _, obj):
+        sensors = node._sensors
+        assert not measured(joints(time.time() - 100))
+        assert measured(joints(12)) and measured(joints(13))
+        assert capsys.readouterr().err.count("joint_states: its stamps are a simulator's") == 1
+        assert measured(joints(14), clock(15)) and not measured(joints(14), clock(50)) and measured(joints(49))
+        bus.said = robot_says(obj)
+        node.step()
+        assert bus.sent["joint_command"].header.stamp.sec == 50
 
 
 ENDPOINT = f"tcp/127.0.0.1:{free_port()}"

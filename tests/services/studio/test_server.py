@@ -6,6 +6,7 @@ import http.server
 import io
 import json
 import pathlib
+import re
 import socket
 import threading
 import time
@@ -26,7 +27,7 @@ from congrasp.services.studio import files
 from congrasp.services.studio import sessions as sessions_module
 from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.server import PageServer, Routes, _Server
+from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
 from congrasp.services.studio.session import Session
 from tests import studio as made_up
 
@@ -100,7 +101,7 @@ def test_a_result_that_is_not_json_is_answered() -> None:
 
 
 def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which a cookie finds again; what one undoes is its own, and the least recent one of too many ends."""
+    """Which a cookie finds again; what one undoes is its own, and the least recent one of too many ends once idle."""
     monkeypatch.setattr(sessions_module, "MOST", 2)
     made: list[Session] = []
 
@@ -129,6 +130,10 @@ def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch)
         assert page.ask("POST", "/api/do", body, Cookie=cookies[0])[0] == 200
         assert [undoable(cookie) for cookie in cookies[:2]] == [True, False] and len(made) == 2
         assert undoable(cookies[0])  # used more recently than the second
+        for path, kind in (("/api/state", "GET"), ("/api/do", "POST")):
+            refused = json.loads(page.ask(kind, path, body if kind == "POST" else b"", Cookie=cookies[2])[1])
+            assert "2 browsers use this studio. Come back" in refused["error"] and len(made) == 2
+        monkeypatch.setattr(sessions_module, "IDLE", 0.0)
         assert not undoable(cookies[2]) and len(made) == 3
         assert undoable(cookies[0]) and not undoable(cookies[1]) and len(made) == 4
     finally:
@@ -153,6 +158,30 @@ def test_other_sites_are_rejected(page: Page) -> None:
     ):
         name, _, value = other.partition("=")
         assert page.ask("GET", "/api/state", **{**own, name: value})[0] == 403, other
+
+
+def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
+    """`ssh -L 9000:localhost:7480` keeps the browser's Host; a proxy of a notebook ends TLS."""
+    server = PageServer(
+        lambda browser: Routes({"/api/state": lambda query: {}}, {}), "127.0.0.1", 0, ["hub.example.org"]
+    )
+    page = Page(server.port)
+
+    def code(**headers: str) -> int:
+        return page.ask("GET", "/api/state", **headers)[0]
+
+    try:
+        assert code(Host="localhost:9000", Origin="http://localhost:9000", Sec_Fetch_Site="same-origin") == 200
+        assert code(Host="hub.example.org", Origin="https://hub.example.org") == 200
+        assert code(Host="localhost:9000", Origin="http://localhost:9001") == 403
+        assert code(Host="hub.example.org", Origin="https://evil.example") == 403
+        refused = page.ask("GET", "/", Host="other.example.org")
+        assert refused[0] == 403 and "--allow-host 'other.example.org'" in json.loads(refused[1])["error"]
+        assert page.ask("GET", "/user/me/proxy/7480/api/state")[0] == page.ask("GET", "/user/me/")[0] == 200
+        for file in STATIC.iterdir():  # a proxy offers the page below a prefix
+            assert not re.search(r"[\"'`]/(api|static)/", file.read_text())
+    finally:
+        server.close()
 
 
 @pytest.mark.parametrize(
