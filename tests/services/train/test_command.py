@@ -22,7 +22,7 @@ from congrasp.services.train.launch import Launch
 from congrasp.services.train.presets import get_preset
 
 LAUNCH = Launch(actors=1)
-CONFIG = RunConfig(updates=10, environments=4, rollout_steps=5)  # 40 steps an update
+CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=5)  # 40 steps an update
 
 
 @pytest.fixture
