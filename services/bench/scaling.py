@@ -20,7 +20,8 @@ from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.runtime.parallel import cores
 from congrasp.learner.run_directory import create_run
-from congrasp.services.train.processes import engine_of, leave_gpus_to, train
+from congrasp.services.train.launch import Launch, Plan, engine_of, leave_gpus_to
+from congrasp.services.train.processes import train
 
 _WARM_UPDATES = 5
 """Updates before the measurement: the first ones compile, and all environments begin with new episodes."""
@@ -129,7 +130,8 @@ def bench_scaling(
     stages: list[Stage] = []
     for count in ranks:
         console.print(f"{count} rank(s): at most {deadline:.0f} s …")
-        stages.append(_measure(config, count, actors, gpus, seconds, deadline, stages[0] if stages else None, console))
+        plan = Plan(Launch(ranks=count, metric_writers=()), actors, physics, gpus)
+        stages.append(_measure(config, plan, seconds, deadline, stages[0] if stages else None, console))
         result = {
             "machine": {"host": platform.node(), "cores": cores(), "jax": jax.__version__, "gpus": gpus},
             "config": dataclasses.asdict(config),
@@ -142,16 +144,10 @@ def bench_scaling(
 
 
 def _measure(
-    config: RunConfig,
-    ranks: int,
-    actors: int,
-    gpus: bool,
-    seconds: float,
-    deadline: float,
-    first: Stage | None,
-    console: Console,
+    config: RunConfig, plan: Plan, seconds: float, deadline: float, first: Stage | None, console: Console
 ) -> Stage:
     """Trains with one number of ranks until the measurement is complete."""
+    ranks = plan.launch.ranks
     run_dir = pathlib.Path(tempfile.mkdtemp(prefix=f"congrasp-scaling-{ranks}-"))
     stop = threading.Event()
     meter = _Meter(seconds, deadline, stop, lambda text: console.print(f"  {text}"))
@@ -160,11 +156,8 @@ def _measure(
         train(
             run_dir,
             config,
-            actors=actors,
-            physics=config.physics,
+            plan,
             stop=stop,
-            ranks=ranks,
-            gpus=gpus,
             report=meter.show,
             notify=lambda text: console.print(f"  {text}", soft_wrap=True),
         )

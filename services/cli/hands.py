@@ -232,8 +232,8 @@ def train(
     from congrasp.common.hands import get_hand
     from congrasp.services.assets.hands.model_files import Choices
     from congrasp.services.cli.console import at_least
+    from congrasp.services.train.launch import accelerators
     from congrasp.services.train.own_hand import Request, train_hand
-    from congrasp.services.train.processes import accelerators
 
     at_least(0, episodes=episodes, pool=pool)
     at_least(1, patience=patience)

@@ -131,7 +131,7 @@ def _given(texts: tuple[str, ...], needed: "list[RequiredPolicy]") -> "dict[Requ
 
 def _check_device(wanted: list[str]) -> None:
     """Raises a CongraspError if policies must be trained and there is no GPU."""
-    from congrasp.services.train.processes import accelerators
+    from congrasp.services.train.launch import accelerators
 
     if wanted and accelerators()[0] == "cpu":
         raise CongraspError(

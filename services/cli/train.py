@@ -8,35 +8,30 @@ from typing import Annotated, Any
 import tyro
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
-from congrasp.common.config import MetricWriter, RunConfig, Split
+from congrasp.common.config import RunConfig, Split
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.io.inputs import file_name
 from congrasp.common.task.methods import STUDENT, STUDENTS, with_method
 from congrasp.learner.run_directory import CONFIG_FILE, open_run
+from congrasp.services.train.launch import Launch
 from congrasp.services.train.presets import get_preset, with_hand
 from congrasp.services.train.student import student_of
 
 
 def train(
     config: Annotated[RunConfig, tyro.conf.arg(name="")],
+    launch: Annotated[Launch, tyro.conf.arg(name="")] = Launch(),  # noqa: B008
     preset: str = "quickstart",
     method: str | None = None,
     hand: str | None = None,
     run_dir: pathlib.Path | None = None,
-    actors: int | None = None,
-    ranks: int = 1,
     initial: pathlib.Path | None = None,
     teacher: str | None = None,
     constraints: pathlib.Path | None = None,
     split: Split | None = None,
     resume: bool = False,
-    listen: str | None = None,
-    certs: pathlib.Path | None = None,
-    insecure: bool = False,
     evaluation: int = 192,
-    metric_writers: tuple[MetricWriter, ...] = ("tensorboard",),
-    metrics_port: int = 0,
 ) -> int:
     """Train a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
 
@@ -45,6 +40,7 @@ def train(
 
     Args:
       config: The run.
+      launch: Its processes.
       preset: Named configuration to start from: quickstart, full, human, allegro or sharpa; or check, which trains
         nothing and shows that physics, messages, log, server and pictures work here.
       method: Method whose settings are used: ours, a baseline or ablation of the paper (graspxl, dgrasp,
@@ -53,10 +49,6 @@ def train(
       hand: The hand, by its name or its file ('congrasp hands list', 'congrasp hands import'); by default the
         preset's.
       run_dir: Folder of the run; runs/NAME-DATE by default.
-      actors: Actor processes. By default two; on a GPU none: a single actor then runs in the learner's process, and
-        rollouts never leave the device.
-      ranks: Learners that train together, data parallel; each has --actors actors, and a separate GPU if there are
-        GPUs. The batch grows with them.
       initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
       teacher: A policy file, or the hand of a pretrained policy, to distil into a policy for robots, which sees the
         joints, the wrist and a tracker's object poses, no forces and no velocities (docs/students.md), or with
@@ -66,13 +58,7 @@ def train(
       split: Split of these sets: training (the default), held out, or all.
       resume: Resume from the newest intact checkpoint in --run-dir, with the configuration of the run; options that
         only the learner uses, such as --updates and --ppo.…, may be changed.
-      listen: Endpoint for actors of other machines, such as tls/0.0.0.0:7447; by default only this machine can join.
-      certs: The authority's folder (congrasp certs), for mutual TLS.
-      insecure: Listen beyond loopback without certificates.
       evaluation: Episodes of the evaluation after training, on held-out objects; 0 leaves it out.
-      metric_writers: Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there,
-        for `wandb sync`), wandb (needs an account); without a name, none.
-      metrics_port: Port of the learner's Prometheus endpoint, http://127.0.0.1:PORT/metrics; 0 for none.
 
     Examples:
       congrasp train --preset quickstart --run-dir runs/mine
@@ -90,16 +76,10 @@ def train(
     return run_training(
         config,
         run_dir or pathlib.Path("runs") / f"{file_name(config.name, 'a run')}-{time.strftime('%Y%m%d-%H%M%S')}",
-        actors=actors,
+        launch,
         resume=resume,
         initial=initial,
         evaluation=evaluation,
-        ranks=ranks,
-        writers=metric_writers,
-        metrics_port=metrics_port,
-        listen=listen,
-        certs=certs,
-        insecure=insecure,
     )
 
 

@@ -7,23 +7,19 @@ import pathlib
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, Self
+from collections.abc import Iterator
+from typing import Any, Self
 
 import numpy as np
 from rich.console import Console
 
-from congrasp.common.config import MetricWriter, ObjectsConfig, RunConfig
+from congrasp.common.config import ObjectsConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, policy_spec
-from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.stages import imported, since_start, stages
-from congrasp.common.transport import urls
-from congrasp.common.transport.ports import LEARNER_URL
-from congrasp.common.transport.security import CERTIFICATE_FILE, check_exposure
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.checkpoint import Checkpoints
 from congrasp.learner.run_directory import (
@@ -40,9 +36,10 @@ from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.ops.shutdown import on_signal
 from congrasp.services.serve.load import example_episode, one_answer, serving, wait_until_ready
+from congrasp.services.train.launch import Launch, Plan
 from congrasp.services.train.learn import learn
 from congrasp.services.train.presets import FULL, easier
-from congrasp.services.train.processes import engine_of, leave_gpus_to, train
+from congrasp.services.train.processes import train
 from congrasp.services.viz.render import episode_sheet
 from congrasp.services.viz.sheets import save_png
 
@@ -53,36 +50,14 @@ _SPACE = 64 << 10  # bytes below which a disk counts as full
 console = Console(highlight=False)
 
 
-class _Plan(NamedTuple):
-    """Plan that the options give on this machine."""
-
-    ranks: int
-    actors: int
-    """Actor processes of each rank; 0 runs an actor in each learner's process."""
-    physics: PhysicsName
-    gpus: bool
-    """True if each of several ranks has a separate GPU."""
-
-    @property
-    def in_process(self) -> bool:
-        """True if learner and actor run in this process."""
-        return self.actors == 0 and self.ranks == 1
-
-
 def run_training(
     config: RunConfig,
     run_dir: pathlib.Path,
+    launch: Launch,
     *,
-    actors: int | None,
     resume: bool,
     evaluation: int,
     initial: pathlib.Path | None = None,
-    writers: Sequence[MetricWriter] = ("tensorboard",),
-    metrics_port: int = 0,
-    listen: str | None = None,
-    certs: pathlib.Path | None = None,
-    insecure: bool = False,
-    ranks: int = 1,
 ) -> int:
     """Trains, evaluates and shows the result; `services.cli.train` describes the arguments.
 
@@ -93,13 +68,12 @@ def run_training(
       CongraspError: the arguments contradict each other, the configuration cannot run, or a process failed permanently.
     """
     imported()
-    _check_connections(actors, listen, certs, config.name, insecure=insecure)
-    plan = _plan(config, actors, ranks, listens=listen is not None or certs is not None)
+    plan = launch.planned(config)
     _prepare(run_dir, config, initial, resume=resume)
     _announce(config, run_dir, plan)
     with on_signal() as stop:
         began = time.monotonic()
-        with _Progress(config, ranks) as progress:
+        with _Progress(config, launch.ranks) as progress:
             if plan.in_process:
                 learn(
                     run_dir,
@@ -108,29 +82,14 @@ def run_training(
                     inside=plan.physics,
                     stop=stop,
                     resume=resume,
-                    writers=writers,
-                    metrics_port=metrics_port,
+                    writers=launch.metric_writers,
+                    metrics_port=launch.metrics_port,
                     on_update=progress.update,
                     on_event=lambda level, text: _warn(text) if level == "error" else None,
                 )
             else:
                 with _full_disk_named(run_dir):
-                    train(
-                        run_dir,
-                        config,
-                        actors=plan.actors,
-                        physics=plan.physics,
-                        stop=stop,
-                        ranks=ranks,
-                        gpus=plan.gpus,
-                        writers=writers,
-                        metrics_port=metrics_port,
-                        endpoint=listen,
-                        certs=certs,
-                        insecure=insecure,
-                        report=progress.show,
-                        notify=_warn,
-                    )
+                    train(run_dir, config, plan, stop=stop, report=progress.show, notify=_warn)
         if stop.is_set():
             console.print(f"Stopped. To resume: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
             return stop.exit_code
@@ -139,39 +98,6 @@ def run_training(
             _show(run_dir, config, evaluation)
         _next_steps(run_dir)
     return 0
-
-
-def _check_connections(
-    actors: int | None, listen: str | None, certs: pathlib.Path | None, run: str, *, insecure: bool
-) -> None:
-    """Raises a `CongraspError` if the learner may not listen as requested, or if only some roles have certificates."""
-    if listen is None and certs is None:
-        return
-    if certs is not None and (certs / CERTIFICATE_FILE).exists():
-        raise CongraspError(
-            f"{certs} belongs to one role.", "Pass the authority's folder, which holds those of all roles."
-        )
-    check_exposure(listen or LEARNER_URL, urls.find_credentials(certs, "learner", run), insecure=insecure)
-    for role in ("actor", "observer"):
-        urls.find_credentials(certs, role, run)
-    if actors == 0:
-        raise CongraspError("With --actors 0 nothing listens.", "Remove --listen and --certs, or --actors.")
-
-
-def _plan(config: RunConfig, actors: int | None, ranks: int, *, listens: bool) -> _Plan:
-    """Chooses engine and numbers of processes; on a GPU one process does everything unless others may connect."""
-    if actors is not None and actors < 0:
-        raise CongraspError(
-            f"--actors is {actors}.",
-            "Pass a number of actor processes, or 0 to run the actor in the learner's process.",
-        )
-    if ranks < 1:
-        raise CongraspError(f"--ranks is {ranks}.", "Pass a number of learners from 1 on.")
-    gpus = ranks > 1 and leave_gpus_to(ranks)
-    physics = engine_of(config.physics, gpus)
-    if actors is None:
-        actors = 0 if ENGINES[physics].on_device and not listens else 2
-    return _Plan(ranks, actors, physics, gpus)
 
 
 def _warn(text: str) -> None:
@@ -200,11 +126,12 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
         )
 
 
-def _announce(config: RunConfig, run_dir: pathlib.Path, plan: _Plan) -> None:
+def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:
     """Prints a summary of the run, and in what it is easier than the full task."""
+    ranks = plan.launch.ranks
     console.print(
-        f"[bold]{config.name}[/]: {config.updates} updates of {plan.ranks * _steps_per_update(config)} steps, "
-        f"{plan.ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on '{plan.physics}' in "
+        f"[bold]{config.name}[/]: {config.updates} updates of {ranks * _steps_per_update(config)} steps, "
+        f"{ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on '{plan.physics}' in "
         f"{run_dir}",
         soft_wrap=True,
     )

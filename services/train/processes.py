@@ -2,27 +2,22 @@
 
 import os
 import pathlib
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
-
-from congrasp.actors.physics import resolve_physics
 from congrasp.actors.process.own_references import references_file
-from congrasp.common.config import MetricWriter, RunConfig
+from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.io.journal import AUDIT
-from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import local_url, rank_url, reachable_url
 from congrasp.services.ops.children import CHILD_GRACE, Child, end_all, wait_for
+from congrasp.services.train.launch import Plan
 
 MAX_RESTARTS = 5
 _BAD_INPUT = 2
@@ -34,21 +29,13 @@ Report = Callable[[dict[str, Any]], None]
 def train(
     run_dir: pathlib.Path,
     config: RunConfig,
+    plan: Plan,
     *,
-    actors: int,
-    physics: PhysicsName,
     stop: threading.Event,
-    ranks: int = 1,
-    gpus: bool = False,
-    endpoint: str | None = None,
-    certs: pathlib.Path | None = None,
-    insecure: bool = False,
     report: Report = lambda status: None,
     notify: Callable[[str], None] = lambda text: None,
-    writers: Sequence[MetricWriter] = (),
-    metrics_port: int = 0,
 ) -> None:
-    """Runs a prepared run directory to its end with one learner and `actors` actor processes, or several of both.
+    """Runs a prepared run directory to its end with one learner and its actor processes, or several of both.
 
     A process that dies is restarted (the learner from its last checkpoint), up to `MAX_RESTARTS` times each. If one of
     several ranks dies, the others end as well, and all are restarted.
@@ -56,37 +43,28 @@ def train(
     Args:
       run_dir: created by `learner.run_directory.create_run`; with checkpoints, the run resumes from the latest.
       config: the run's configuration.
-      actors: number of actor processes of each rank; 0 runs an actor in each rank's process.
-      physics: engine of the actors.
+      plan: its processes. Rank r listens on the ports after those of rank r - 1; without an endpoint, on free ones of
+        the loopback interface.
       stop: drains everything within a few seconds when set.
-      ranks: learner processes that train together.
-      gpus: each rank sees one GPU, the others hidden from it.
-      endpoint: address of the learner (rank r on the ports after those of rank r - 1); free ports of the loopback
-        interface by default.
-      certs: an authority's folder, for mutual TLS.
-      insecure: listen beyond loopback without certificates.
       report: called with progress.
       notify: called with a message when a process is restarted, and with errors of the learner, such as a full disk.
-      writers: metric writers of rank 0.
-      metrics_port: port of rank 0's Prometheus endpoint on the loopback interface; 0 for none.
 
     Raises:
       CongraspError: a process failed permanently; the message has the last line of its log.
     """
+    launch = plan.launch
     # One more for the ports through which the ranks join.
-    endpoint = endpoint or local_url(ranks + 1)
-    certificates = [] if certs is None else ["--certs", str(certs)]
-    listen = [endpoint, *certificates, *(["--insecure"] if insecure else [])]
+    endpoint = launch.listen or local_url(launch.ranks + 1)
+    certificates = [] if launch.certs is None else ["--certs", str(launch.certs)]
+    listen = [endpoint, *certificates, *(["--insecure"] if launch.insecure else [])]
     connect = [reachable_url(endpoint), *certificates]
     logs = run_dir / "logs"
     logs.mkdir(exist_ok=True)
-    learners = _learners(run_dir, listen, connect[0], ranks=ranks, inside=not actors, gpus=gpus)
-    learners[0].arguments += ["--metrics-port", str(metrics_port), "--metric-writers", *writers]
-    children = _actors(run_dir, config.name, connect, ranks=ranks, actors=actors, physics=physics)
+    learners, children = _learners(run_dir, plan, listen, connect[0]), _actors(run_dir, plan, config.name, connect)
     try:
         for child in (*learners, *children):
             child.start()
-        transport = _connect(connect[0], learners[0], stop, certs)
+        transport = _connect(connect[0], learners[0], stop, launch.certs)
         if transport is not None:
             notify(" ".join([f"Watch it in the browser with: congrasp view {run_dir}", *certificates]))
             with transport:
@@ -95,10 +73,9 @@ def train(
         end_all([*learners, *children])
 
 
-def _learners(
-    run_dir: pathlib.Path, listen: Sequence[str], connect: str, *, ranks: int, inside: bool, gpus: bool
-) -> list[Child]:
+def _learners(run_dir: pathlib.Path, plan: Plan, listen: Sequence[str], connect: str) -> list[Child]:
     """Returns the learner processes; `listen` is --listen with its options, `connect` the URL of rank 0."""
+    ranks, inside = plan.launch.ranks, not plan.actors
     coordinator = rank_url(connect, ranks).partition("/")[2]
     found = []
     for rank in range(ranks):
@@ -107,65 +84,26 @@ def _learners(
         if ranks > 1 or inside:
             arguments += ["--rank", str(rank), "--ranks", str(ranks), "--coordinator", coordinator]
             arguments += ["--inside"] if inside else []
-        environment = {"CUDA_VISIBLE_DEVICES": _gpu(rank)} if gpus else {}
+        environment = {"CUDA_VISIBLE_DEVICES": _gpu(rank)} if plan.gpus else {}
         found.append(Child(name, arguments, run_dir / "logs" / f"{name}.log", environment))
+    found[0].arguments += ["--metrics-port", str(plan.launch.metrics_port)]
+    found[0].arguments += ["--metric-writers", *plan.launch.metric_writers]
     return found
 
 
-def _actors(
-    run_dir: pathlib.Path, run: str, connect: Sequence[str], *, ranks: int, actors: int, physics: PhysicsName
-) -> list[Child]:
+def _actors(run_dir: pathlib.Path, plan: Plan, run: str, connect: Sequence[str]) -> list[Child]:
     """Returns the actor processes of all ranks; `connect` is rank 0's URL with its options."""
+    ranks, actors = plan.launch.ranks, plan.actors
     threads = max(1, cores() // max(1, ranks * actors))
     found = []
     for number in range(ranks * actors):
         name = f"actor-{number}"
         arguments = ["actor", "--connect", rank_url(connect[0], number // actors), *connect[1:], "--run", run]
-        arguments += ["--id", name, "--physics", physics, "--audit", str(run_dir / AUDIT / f"{name}.jsonl")]
+        arguments += ["--id", name, "--physics", plan.physics, "--audit", str(run_dir / AUDIT / f"{name}.jsonl")]
         arguments += ["--references", str(references_file(run_dir, name))]
         arguments += ["--threads", str(threads), "--patience", "60" if ranks == 1 else "300"]
         found.append(Child(name, arguments, run_dir / "logs" / f"{name}.log"))
     return found
-
-
-def leave_gpus_to(ranks: int) -> bool:
-    """Returns True if each rank has a GPU; this process then uses none, so that the ranks have all memory.
-
-    Raises:
-      CongraspError: there are fewer GPUs than ranks, but not none.
-    """
-    backend, count = accelerators()
-    if backend == "cpu":
-        return False
-    if count < ranks:
-        raise CongraspError(f"{ranks} ranks need {ranks} GPUs, but JAX finds {count}.", "Pass a smaller --ranks.")
-    jax.config.update("jax_platforms", "cpu")
-    return True
-
-
-def accelerators() -> tuple[str, int]:
-    """Returns JAX's name of this machine's hardware, and its number of devices.
-
-    A separate process checks this, since a process that initialises a GPU holds memory of it.
-
-    Raises:
-      CongraspError: JAX does not start.
-    """
-    code = "import jax; print(jax.default_backend(), jax.local_device_count())"
-    environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    try:
-        seen = subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120.0
-        )
-        backend, count = seen.stdout.split()
-    except (subprocess.TimeoutExpired, ValueError):
-        raise CongraspError("JAX does not start here.", "Check 'congrasp doctor'.") from None
-    return backend, int(count)
-
-
-def engine_of(name: PhysicsName, gpus: bool) -> PhysicsName:
-    """Resolves `auto` for the ranks, even if this process sees no GPU but they do."""
-    return resolve_physics(name, "cuda" if gpus else "")
 
 
 def _gpu(rank: int) -> str:

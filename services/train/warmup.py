@@ -9,8 +9,8 @@ from collections.abc import Callable
 from congrasp.common.config import RunConfig
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.learner.run_directory import create_run
+from congrasp.services.train.launch import engine_of
 from congrasp.services.train.learn import learn
-from congrasp.services.train.processes import engine_of
 
 _GRACE = 60.0
 """Seconds for an actor within a rollout: a process that exits meanwhile would abort."""

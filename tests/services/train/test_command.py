@@ -12,10 +12,12 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
-from congrasp.services.train.command import EPISODE, _check_connections, _next_steps, _Progress
+from congrasp.services.train.command import EPISODE, _next_steps, _Progress
+from congrasp.services.train.launch import Launch
 from congrasp.services.train.presets import get_preset
 
-CONFIG = RunConfig(updates=10, environments=4, rollout_steps=5)  # 40 steps an update
+LAUNCH = Launch(actors=1)
+CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=5)  # 40 steps an update
 
 
 @pytest.fixture
@@ -89,7 +91,7 @@ def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, fr
     monkeypatch.setattr(command, "train", die)
     monkeypatch.setattr(command.shutil, "disk_usage", lambda path: types.SimpleNamespace(free=free))
     with pytest.raises(CongraspError, match=words):
-        command.run_training(CONFIG, tmp_path, actors=1, resume=False, evaluation=0)
+        command.run_training(CONFIG, tmp_path, LAUNCH, resume=False, evaluation=0)
 
 
 @pytest.mark.parametrize(
@@ -103,9 +105,8 @@ def test_a_run_that_dies_of_a_full_disk_names_it(said, monkeypatch, tmp_path, fr
 )
 def test_a_configuration_that_cannot_run_leaves_no_run_behind(said, tmp_path, change, words):
     with pytest.raises(CongraspError, match=words):
-        command.run_training(
-            dataclasses.replace(CONFIG, **change), tmp_path / "run", actors=1, resume=False, evaluation=0
-        )
+        config = dataclasses.replace(CONFIG, **change)
+        command.run_training(config, tmp_path / "run", LAUNCH, resume=False, evaluation=0)
     assert not (tmp_path / "run").exists()
 
 
@@ -116,7 +117,7 @@ def test_a_run_says_at_its_start_what_was_made_easier(said, monkeypatch, tmp_pat
     monkeypatch.setattr(command, "train", stop)
     config = RunConfig(objects=ObjectsConfig(count=8), network=NetworkConfig(hidden=(32,)), physics="native")
     with pytest.raises(KeyboardInterrupt):
-        command.run_training(config, tmp_path, actors=1, resume=False, evaluation=0)
+        command.run_training(config, tmp_path, LAUNCH, resume=False, evaluation=0)
     full = get_preset("human").objects.count
     assert (
         f"Easier than the full task: an actor has 8 objects, not {full}; networks have layers of 32 units" in said()[1]
@@ -127,12 +128,12 @@ def test_a_training_that_others_may_join_has_all_certificates_before_it_starts(t
     create_authority(tmp_path)
     for role in ("learner", "actor", "observer"):
         issue(tmp_path, role)
-    _check_connections(None, "tls/0.0.0.0:7447", tmp_path, "quickstart", insecure=False)
-    _check_connections(None, "tcp/0.0.0.0:7447", None, "quickstart", insecure=True)
+    Launch(listen="tls/0.0.0.0:7447", certs=tmp_path).planned(CONFIG)
+    Launch(listen="tcp/0.0.0.0:7447", insecure=True).planned(CONFIG)
     with pytest.raises(CongraspError, match="belongs to one role"):
-        _check_connections(None, "tls/0.0.0.0:7447", tmp_path / "learner.0", "quickstart", insecure=False)
+        Launch(listen="tls/0.0.0.0:7447", certs=tmp_path / "learner.0").planned(CONFIG)
     with pytest.raises(CongraspError, match="With --actors 0 nothing listens"):
-        _check_connections(0, "tls/0.0.0.0:7447", tmp_path, "quickstart", insecure=False)
+        Launch(actors=0, listen="tls/0.0.0.0:7447", certs=tmp_path).planned(CONFIG)
     (tmp_path / "observer.0" / "tls.key").unlink()
     with pytest.raises(CongraspError, match=r"observer.0/tls.key is missing.*--role observer"):
-        _check_connections(None, "tls/0.0.0.0:7447", tmp_path, "quickstart", insecure=False)
+        Launch(listen="tls/0.0.0.0:7447", certs=tmp_path).planned(CONFIG)
