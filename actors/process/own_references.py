@@ -2,7 +2,7 @@
 
 `actors.harvest` collects them over hundreds of updates. Without them, the goals of a restarted actor are less feasible:
 a run on one H200 that was resumed at update 993 fell from 68 to 60 % of reference poses held, and took 250 updates to
-recover. The file has the poses in half precision, 3 MB for 1,600 objects; trajectories to them are drawn anew.
+recover. The file has the poses in half precision, 3 MB for 1,600 objects; trajectories to them are drawn again.
 """
 
 import contextlib

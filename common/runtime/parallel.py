@@ -8,7 +8,6 @@ import multiprocessing.connection
 import multiprocessing.spawn
 import os
 import pathlib
-import pickle
 import select
 import signal
 import subprocess
@@ -79,9 +78,7 @@ def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> li
     rows = list(zip(*columns, strict=True))
     workers = _workers(len(rows))
     results = _helper().results(workers, function, rows) if workers else [None] * len(rows)
-    return [
-        function(*row) if result is None else pickle.loads(result) for row, result in zip(rows, results, strict=True)
-    ]
+    return [function(*row) if found is None else found[0] for row, found in zip(rows, results, strict=True)]
 
 
 def prepare_workers(calls: int) -> None:
@@ -111,8 +108,8 @@ class _Helper:
         with self._lock:
             self._connected()
 
-    def results(self, workers: int, function: Callable[..., Any], rows: list[Any]) -> list[bytes | None]:
-        """Returns the pickled result of each call, None for those that failed."""
+    def results(self, workers: int, function: Callable[..., Result], rows: list[Any]) -> list[tuple[Result] | None]:
+        """Returns the result of each call, None for those that failed."""
         with self._lock:
             try:
                 connection = self._connected()
@@ -182,20 +179,20 @@ def serve(descriptor: int) -> None:
 
 
 def _results(
-    descriptor: int, folder: str, workers: int, function: Callable[..., Any], rows: list[Any]
-) -> list[bytes | None]:
-    """The pickled result of each call, None for those that failed, by workers that end with the socket."""
+    descriptor: int, folder: str, workers: int, function: Callable[..., Result], rows: list[Any]
+) -> list[tuple[Result] | None]:
+    """The result of each call, None for those that failed, by workers that end with the socket."""
     os.chdir(folder)
     context = multiprocessing.get_context("fork")
     with concurrent.futures.ProcessPoolExecutor(workers, context, _end_with, (descriptor,)) as pool:
         return list(pool.map(_call, [(function, row) for row in rows], chunksize=4))
 
 
-def _call(call: tuple[Callable[..., Any], tuple[Any, ...]]) -> bytes | None:
-    """The pickled result of a call; None if it fails."""
+def _call(call: tuple[Callable[..., Result], tuple[Any, ...]]) -> tuple[Result] | None:
+    """The result of a call; None if it fails."""
     function, row = call
     try:
-        return pickle.dumps(function(*row))
+        return (function(*row),)
     except Exception:
         return None
 
