@@ -15,10 +15,17 @@ from docutils.parsers.rst import Directive
 from sphinx.application import Sphinx
 from typing_extensions import Doc
 
+from congrasp.common import errors
 from congrasp.common.config import RunConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.methods import METHODS
 from congrasp.common.wire import messages
 from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
+from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.record import moved_arm
+from congrasp.services.viz.titles import TITLES
 
 _WIDTH = 100
 _DEFAULT = 60
@@ -55,10 +62,70 @@ class Messages(Directive):
         return [_section(spec.kind, [_table(("entry", "type", "shape"), list(_entries(spec)))]) for spec in specs]
 
 
+class Constraints(Directive):
+    """Goal arrays and errors of every constraint."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table of the goal arrays and one of the errors."""
+        arrays = [
+            (f"{constraint.name}_{name}", str(array.shape).replace("'", ""), array.meaning)
+            for constraint in CONSTRAINTS
+            for name, array in constraint.arrays.items()
+        ]
+        measured = [
+            (spec.column or spec.name, spec.unit or "share", spec.window, spec.meaning)
+            for constraint in CONSTRAINTS
+            for spec in constraint.errors
+        ]
+        return [
+            _table(("goal array", "shape", "meaning"), arrays),
+            _table(("error", "unit", "window", "meaning"), measured),
+        ]
+
+
+class Errors(Directive):
+    """Public errors: class, base, condition, exit code of the command line, code on the wire."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        rows = [
+            (kind.__name__, kind.__bases__[0].__name__, _first_line(kind), str(kind.exit_code), kind.code)
+            for kind in vars(errors).values()
+            if isinstance(kind, type) and issubclass(kind, CongraspError)
+        ]
+        return [_table(("class", "base", "condition", "exit code", "code"), rows)]
+
+
+class Methods(Directive):
+    """The method, baselines and ablations."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        return [_table(("name", "description"), [(name, method.meaning) for name, method in METHODS.items()])]
+
+
+class Metrics(Directive):
+    """Metrics of learner and actors."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        return [_table(("metric", "unit", "meaning"), [(name, *_meant(*entry)) for name, entry in TITLES.items()])]
+
+
+class MotionArrays(Directive):
+    """Arrays of a motion file."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        hints = typing.get_type_hints(GraspMotion, include_extras=True)
+        arrays = {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
+        return [_table(("array", "shape, unit, frame"), [*arrays.items(), *moved_arm.MEANINGS.items()])]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Registers the directives with Sphinx."""
-    for name, directive in (("commands", Commands), ("configuration", Configuration), ("messages", Messages)):
-        app.add_directive(name, directive)
+    for directive in (Commands, Configuration, Constraints, Errors, Messages, Methods, Metrics, MotionArrays):
+        app.add_directive(re.sub(r"\B([A-Z])", r"-\1", directive.__name__).lower(), directive)
     return {"parallel_read_safe": True}
 
 
@@ -111,6 +178,14 @@ def _entries(spec: MessageSpec) -> Iterator[tuple[str, str, str]]:
     for name, kind in spec.meta.items():
         kinds = kind if isinstance(kind, tuple) else (kind,)
         yield name, " or ".join(one.__name__ for one in kinds), "metadata"
+
+
+def _first_line(documented: type) -> str:
+    return (documented.__doc__ or "").partition("\n")[0]
+
+
+def _meant(title: str, unit: str, meaning: str = "") -> tuple[str, str]:
+    return unit, f"{title}. {meaning}".strip()
 
 
 def _short(value: typing.Any) -> str:

@@ -95,7 +95,7 @@ class Relation(NamedTuple):
     settled: Literal["overridden", "redirected", "refused"]
     """Effect on the weaker constraint; a refused request is an error."""
     measure: Any
-    """(hand, surface, goal) -> dict of arrays (B, ...): distances between the two."""
+    """Function (hand, surface, goal) -> dict of arrays (B, ...), distances between the two."""
     contradicts: Any
     """measured -> (B,) bool."""
     message: Any
@@ -333,7 +333,7 @@ class Constraint:
         return None
 
     def avoid_region(self, given: Mapping[str, Any], obj: GraspObject) -> np.ndarray | None:
-        """(N,) bool, the avoid region requested by `parse`d options; None if they request none.
+        """(N,) bool, the avoid region requested by the options; None if they request none.
 
         Raises:
           CongraspError: the region would be empty or the whole surface.
