@@ -25,6 +25,7 @@ from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.record import moved_arm
+from congrasp.services.train.student import CAMERAS, TRACKERS
 from congrasp.services.viz.titles import TITLES
 
 _WIDTH = 100
@@ -122,9 +123,21 @@ class MotionArrays(Directive):
         return [_table(("array", "shape, unit, frame"), [*arrays.items(), *moved_arm.MEANINGS.items()])]
 
 
+class Sensing(Directive):
+    """Sensors that are drawn in the training of students: ranges of a tracker and of a camera."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        rows = [
+            (f"--task.sensing.{name}", _short(value), _short(getattr(CAMERAS, name.replace("-", "_"))), meaning)
+            for name, value, meaning in _fields(TRACKERS, "")
+        ]
+        return [_table(("option", "tracker", "camera", "meaning"), rows)]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Registers the directives with Sphinx."""
-    for directive in (Commands, Configuration, Constraints, Errors, Messages, Methods, Metrics, MotionArrays):
+    for directive in (Commands, Configuration, Constraints, Errors, Messages, Methods, Metrics, MotionArrays, Sensing):
         app.add_directive(re.sub(r"\B([A-Z])", r"-\1", directive.__name__).lower(), directive)
     return {"parallel_read_safe": True}
 
