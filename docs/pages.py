@@ -139,7 +139,24 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Registers the directives with Sphinx."""
     for directive in (Commands, Configuration, Constraints, Errors, Messages, Methods, Metrics, MotionArrays, Sensing):
         app.add_directive(re.sub(r"\B([A-Z])", r"-\1", directive.__name__).lower(), directive)
+    app.connect("autodoc-process-docstring", _keep, priority=400)
+    app.connect("autodoc-process-docstring", _restore, priority=600)
     return {"parallel_read_safe": True}
+
+
+_VALUES = ("attribute", "data", "property")
+_written: dict[str, list[str]] = {}
+"""Docstrings of values by name, before napoleon takes what precedes a colon for a type."""
+
+
+def _keep(app: Sphinx, what: str, name: str, described: object, options: object, lines: list[str]) -> None:
+    if what in _VALUES:
+        _written[name] = lines[:]
+
+
+def _restore(app: Sphinx, what: str, name: str, described: object, options: object, lines: list[str]) -> None:
+    if what in _VALUES:
+        lines[:] = _written.pop(name)
 
 
 def _words(command: str) -> Iterator[list[str]]:
