@@ -18,6 +18,9 @@ from typing_extensions import Doc
 from congrasp.common import errors
 from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.policy.pretrained import pretrained_hands
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.methods import METHODS
 from congrasp.common.wire import messages
@@ -52,6 +55,30 @@ class Configuration(Directive):
         """Returns a table."""
         rows = [(f"--{name}", _short(value), text) for name, value, text in _fields(RunConfig(), "")]
         return [_table(("option", "default", "meaning"), rows)]
+
+
+class Hands(Directive):
+    """The hands of the package with a policy, and the order of their joints."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table of the hands and one of their joints."""
+        hands = [get_hand(name) for name in pretrained_hands()]
+        facts = [
+            (
+                hand.name,
+                f"{len(hand.joints)}, of {len(hand.fingers)} fingers",
+                str(len(hand.links)),
+                f"{sum(link.mass for link in hand.links):.3f} kg",
+                f"{min(_torques(hand)):.2g} to {max(_torques(hand)):.2g}",
+                f"x {hand.object_scale:g}",
+            )
+            for hand in hands
+        ]
+        joints = [(hand.name, ", ".join(joint.name for joint in hand.joints)) for hand in hands]
+        return [
+            _table(("hand", "joints", "links", "mass", "torques, N m", "objects"), facts),
+            _table(("hand", "joints in their order"), joints),
+        ]
 
 
 class Messages(Directive):
@@ -137,7 +164,18 @@ class Sensing(Directive):
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Registers the directives with Sphinx."""
-    for directive in (Commands, Configuration, Constraints, Errors, Messages, Methods, Metrics, MotionArrays, Sensing):
+    for directive in (
+        Commands,
+        Configuration,
+        Constraints,
+        Errors,
+        Hands,
+        Messages,
+        Methods,
+        Metrics,
+        MotionArrays,
+        Sensing,
+    ):
         app.add_directive(re.sub(r"\B([A-Z])", r"-\1", directive.__name__).lower(), directive)
     app.connect("autodoc-process-docstring", _keep, priority=400)
     app.connect("autodoc-process-docstring", _restore, priority=600)
@@ -208,6 +246,10 @@ def _entries(spec: MessageSpec) -> Iterator[tuple[str, str, str]]:
     for name, kind in spec.meta.items():
         kinds = kind if isinstance(kind, tuple) else (kind,)
         yield name, " or ".join(one.__name__ for one in kinds), "metadata"
+
+
+def _torques(hand: Hand) -> list[float]:
+    return [motor.torque_limit for motor in hand.motors]
 
 
 def _first_line(documented: type) -> str:
