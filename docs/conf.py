@@ -14,7 +14,6 @@ html_show_sphinx = False
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "pages"]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
-smartquotes_action = "qe"  # a dash in an option stays
 copybutton_exclude = ".linenos, .gp"
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"

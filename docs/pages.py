@@ -283,14 +283,22 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> nodes.tabl
     group.extend(nodes.colspec(colwidth=1) for _ in head)
     body = nodes.tbody()
     for row in rows:
-        body += _row([nodes.literal(text=row[0]), *(nodes.Text(cell) for cell in row[1:])])
-    group += nodes.thead("", _row([nodes.Text(cell) for cell in head]))
+        body += _row([[nodes.literal(text=row[0])], *map(_inline, row[1:])])
+    group += nodes.thead("", _row([[nodes.Text(cell)] for cell in head]))
     group += body
     return nodes.table("", group)
 
 
-def _row(cells: list[nodes.Node]) -> nodes.row:
+def _row(cells: list[list[nodes.Node]]) -> nodes.row:
     row = nodes.row()
     for cell in cells:
-        row += nodes.entry("", nodes.paragraph("", "", cell))
+        row += nodes.entry("", nodes.paragraph("", "", *cell))
     return row
+
+
+def _inline(text: str) -> list[nodes.Node]:
+    """Returns text with code in backquotes, and options, as literals."""
+    parts = re.split(r"`([^`]+)`|(--[a-z][\w.-]*\w)", text)
+    return [
+        nodes.Text(part) if i % 3 == 0 else nodes.literal(text=part) for i, part in enumerate(parts) if part is not None
+    ]
