@@ -15,10 +15,21 @@ from docutils.parsers.rst import Directive
 from sphinx.application import Sphinx
 from typing_extensions import Doc
 
+from congrasp.common import errors
 from congrasp.common.config import RunConfig
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.policy.pretrained import pretrained_hands
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.methods import METHODS
 from congrasp.common.wire import messages
 from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
+from congrasp.services.export.motion_file import GraspMotion
+from congrasp.services.record import moved_arm
+from congrasp.services.train.student import CAMERAS, TRACKERS
+from congrasp.services.viz.titles import TITLES
 
 _WIDTH = 100
 _DEFAULT = 60
@@ -46,6 +57,30 @@ class Configuration(Directive):
         return [_table(("option", "default", "meaning"), rows)]
 
 
+class Hands(Directive):
+    """The hands of the package with a policy, and the order of their joints."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table of the hands and one of their joints."""
+        hands = [get_hand(name) for name in pretrained_hands()]
+        facts = [
+            (
+                hand.name,
+                f"{len(hand.joints)}, of {len(hand.fingers)} fingers",
+                str(len(hand.links)),
+                f"{sum(link.mass for link in hand.links):.3f} kg",
+                f"{min(_torques(hand)):.2g} to {max(_torques(hand)):.2g}",
+                f"x {hand.object_scale:g}",
+            )
+            for hand in hands
+        ]
+        joints = [(hand.name, ", ".join(joint.name for joint in hand.joints)) for hand in hands]
+        return [
+            _table(("hand", "joints", "links", "mass", "torques, N m", "objects"), facts),
+            _table(("hand", "joints in their order"), joints),
+        ]
+
+
 class Messages(Directive):
     """Entries of every kind of message on the wire."""
 
@@ -55,11 +90,111 @@ class Messages(Directive):
         return [_section(spec.kind, [_table(("entry", "type", "shape"), list(_entries(spec)))]) for spec in specs]
 
 
+class Constraints(Directive):
+    """Goal arrays and errors of every constraint."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table of the goal arrays and one of the errors."""
+        arrays = [
+            (f"{constraint.name}_{name}", str(array.shape).replace("'", ""), array.meaning)
+            for constraint in CONSTRAINTS
+            for name, array in constraint.arrays.items()
+        ]
+        measured = [
+            (spec.column or spec.name, spec.unit or "share", spec.window, spec.meaning)
+            for constraint in CONSTRAINTS
+            for spec in constraint.errors
+        ]
+        return [
+            _table(("goal array", "shape", "meaning"), arrays),
+            _table(("error", "unit", "window", "meaning"), measured),
+        ]
+
+
+class Errors(Directive):
+    """Public errors: class, base, condition, exit code of the command line, code on the wire."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        rows = [
+            (kind.__name__, kind.__bases__[0].__name__, _first_line(kind), str(kind.exit_code), kind.code)
+            for kind in vars(errors).values()
+            if isinstance(kind, type) and issubclass(kind, CongraspError)
+        ]
+        return [_table(("class", "base", "condition", "exit code", "code"), rows)]
+
+
+class Methods(Directive):
+    """The method, baselines and ablations."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        return [_table(("name", "description"), [(name, method.meaning) for name, method in METHODS.items()])]
+
+
+class Metrics(Directive):
+    """Metrics of learner and actors."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        return [_table(("metric", "unit", "meaning"), [(name, *_meant(*entry)) for name, entry in TITLES.items()])]
+
+
+class MotionArrays(Directive):
+    """Arrays of a motion file."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        hints = typing.get_type_hints(GraspMotion, include_extras=True)
+        arrays = {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
+        return [_table(("array", "shape, unit, frame"), [*arrays.items(), *moved_arm.MEANINGS.items()])]
+
+
+class Sensing(Directive):
+    """Sensors that are drawn in the training of students: ranges of a tracker and of a camera."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        rows = [
+            (f"--task.sensing.{name}", _short(value), _short(getattr(CAMERAS, name.replace("-", "_"))), meaning)
+            for name, value, meaning in _fields(TRACKERS, "")
+        ]
+        return [_table(("option", "tracker", "camera", "meaning"), rows)]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Registers the directives with Sphinx."""
-    for name, directive in (("commands", Commands), ("configuration", Configuration), ("messages", Messages)):
-        app.add_directive(name, directive)
+    for directive in (
+        Commands,
+        Configuration,
+        Constraints,
+        Errors,
+        Hands,
+        Messages,
+        Methods,
+        Metrics,
+        MotionArrays,
+        Sensing,
+    ):
+        app.add_directive(re.sub(r"\B([A-Z])", r"-\1", directive.__name__).lower(), directive)
+    app.connect("autodoc-process-docstring", _keep, priority=400)
+    app.connect("autodoc-process-docstring", _restore, priority=600)
     return {"parallel_read_safe": True}
+
+
+_VALUES = ("attribute", "data", "property")
+_written: dict[str, list[str]] = {}
+"""Docstrings of values by name, before napoleon takes what precedes a colon for a type."""
+
+
+def _keep(app: Sphinx, what: str, name: str, described: object, options: object, lines: list[str]) -> None:
+    if what in _VALUES:
+        _written[name] = lines[:]
+
+
+def _restore(app: Sphinx, what: str, name: str, described: object, options: object, lines: list[str]) -> None:
+    if what in _VALUES:
+        lines[:] = _written.pop(name)
 
 
 def _words(command: str) -> Iterator[list[str]]:
@@ -113,6 +248,18 @@ def _entries(spec: MessageSpec) -> Iterator[tuple[str, str, str]]:
         yield name, " or ".join(one.__name__ for one in kinds), "metadata"
 
 
+def _torques(hand: Hand) -> list[float]:
+    return [motor.torque_limit for motor in hand.motors]
+
+
+def _first_line(documented: type) -> str:
+    return (documented.__doc__ or "").partition("\n")[0]
+
+
+def _meant(title: str, unit: str, meaning: str = "") -> tuple[str, str]:
+    return unit, f"{title}. {meaning}".strip()
+
+
 def _short(value: typing.Any) -> str:
     text = "" if value == "" else str(value)
     return text if len(text) <= _DEFAULT else text[:_DEFAULT] + "…"
@@ -136,14 +283,22 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> nodes.tabl
     group.extend(nodes.colspec(colwidth=1) for _ in head)
     body = nodes.tbody()
     for row in rows:
-        body += _row([nodes.literal(text=row[0]), *(nodes.Text(cell) for cell in row[1:])])
-    group += nodes.thead("", _row([nodes.Text(cell) for cell in head]))
+        body += _row([[nodes.literal(text=row[0])], *map(_inline, row[1:])])
+    group += nodes.thead("", _row([[nodes.Text(cell)] for cell in head]))
     group += body
     return nodes.table("", group)
 
 
-def _row(cells: list[nodes.Node]) -> nodes.row:
+def _row(cells: list[list[nodes.Node]]) -> nodes.row:
     row = nodes.row()
     for cell in cells:
-        row += nodes.entry("", nodes.paragraph("", "", cell))
+        row += nodes.entry("", nodes.paragraph("", "", *cell))
     return row
+
+
+def _inline(text: str) -> list[nodes.Node]:
+    """Returns text with code in backquotes, and options, as literals."""
+    parts = re.split(r"`([^`]+)`|(--[a-z][\w.-]*\w)", text)
+    return [
+        nodes.Text(part) if i % 3 == 0 else nodes.literal(text=part) for i, part in enumerate(parts) if part is not None
+    ]

@@ -218,7 +218,7 @@ def measures(samples: Sample, control_dt: float) -> dict[str, np.ndarray]:
       control_dt: seconds of a control step.
 
     Returns:
-      `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, for hands with meshes, `hand_mesh_mm`: the maximum, mm.
+      The maxima `hand_hand_mm`, `hand_table_mm`, `hand_object_mm` and, for hands with meshes, `hand_mesh_mm`, in mm.
         `wrist_speed` (m/s) and `wrist_acceleration` (m/s^2): the peak, with `_mean` and `_p95` over the episode's
         steps. `finger_jerk`: root mean square over joints and steps, rad/s^3. `link_force_peak` (N): that of the link
         with the highest force; `link_force`: the mean over touching links (0 if none touches). `torque_share` and

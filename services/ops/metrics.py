@@ -1,4 +1,4 @@
-"""A Prometheus endpoint for each role; docs/operations.md lists the metrics."""
+"""A Prometheus endpoint for each role."""
 
 import collections
 import contextlib

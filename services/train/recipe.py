@@ -15,7 +15,7 @@ effect, because the virtual wrist is scaled to it (`common.hands.spec.wrist_gain
   at a part only, so that they train it more: `p_affordance` = 0.6 + 0.2 h, and against what they then touch
   `affordance_distance` = 0.15 + 0.05 h, `affordance_force` = 0.30 + 0.10 h.
 
-docs/training.md compares this with manual tuning. Everything else is the same for all hands.
+Everything else is the same for all hands.
 """
 
 import dataclasses

@@ -7,7 +7,7 @@ from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.metrics import DIVERGED
 
 _KINDS = {"rad": "angle", "m": "distance", "": "share of links"}
-_TITLES = {
+TITLES = {
     **json.loads(pathlib.Path(__file__).with_suffix(".json").read_text()),
     f"episode/{DIVERGED}": ("Diverged physics", "share of episodes"),
     **{
@@ -26,14 +26,15 @@ _TITLES = {
         for spec in constraint.errors
     },
 }
+"""Title, unit and, where these are not enough, the meaning of each metric."""
 _UNITS = {"_per_second": "1/s", "_seconds": "s", "_rad": "rad", "_m": "m", "_bytes": "bytes", "_ratio": "share"}
 """Units of metrics without a title, by the endings of their names."""
 
 
 def titled(metric: str) -> tuple[str, str]:
     """Title and unit of a metric by its name after the process; the title of an unknown one is its name in words."""
-    if metric in _TITLES:
-        title, unit = _TITLES[metric]
+    if metric in TITLES:
+        title, unit, *_ = TITLES[metric]
         return title, unit
     group, _, name = metric.rpartition("/")
     ending = next((end for end in _UNITS if name.endswith(end)), "")

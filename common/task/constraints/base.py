@@ -38,7 +38,7 @@ class GoalArray:
     meaning: str
     """Unit, frame and meaning."""
     kind: Literal["real", "position", "direction", "quaternion", "flag"] = "real"
-    """Kind of value: positions, directions and quaternions are in the object frame, and the latter two must be unit
+    """Kind of value. Positions, directions and quaternions are in the object frame, and the latter two must be unit
     vectors; flags are booleans."""
     neutral: tuple[float, ...] = ()
     """Last axis of the value used where no request gives one; zeros by default."""
@@ -95,7 +95,7 @@ class Relation(NamedTuple):
     settled: Literal["overridden", "redirected", "refused"]
     """Effect on the weaker constraint; a refused request is an error."""
     measure: Any
-    """(hand, surface, goal) -> dict of arrays (B, ...): distances between the two."""
+    """Function (hand, surface, goal) -> dict of arrays (B, ...), distances between the two."""
     contradicts: Any
     """measured -> (B,) bool."""
     message: Any
@@ -126,7 +126,7 @@ class Option(NamedTuple):
     name: str
     help: str
     kind: Literal["text", "direction", "place", "part", "pose", "path"] = "text"
-    """Kind of the parsed value: a text; three numbers in the axes of the object's file, normalised; three numbers in
+    """Kind of the parsed value, a text; three numbers in the axes of the object's file, normalised; three numbers in
     the coordinates of the file, converted to a position (3,) in the object frame; a `Part`; a wrist pose with finger
     angles, or a wrist path of K waypoints, from a file: dicts of `q`, `position` and `quaternion`, object frame."""
     words: tuple[str, ...] = ()
@@ -150,10 +150,11 @@ class Constraint:
     """A constraint; subclasses set the attributes and override methods as needed."""
 
     name: ClassVar[str]
+    """Name in training (`--task.p-NAME`, metric `success/NAME`), rows of evaluations, queries, files and the studio."""
     title: ClassVar[str]
     """Display name, in lower case."""
     goal: ClassVar[type]
-    """NamedTuple of the goal arrays; its fields are annotated with `GoalArray`."""
+    """NamedTuple of the goal arrays, whose fields are annotated with `GoalArray`; `NAME_FIELD` in queries and files."""
     blocks: ClassVar[tuple[str, ...]] = ()
     """Blocks of the observation that it gates, each with its mask bit; the heading, always active, has none."""
     overrides: ClassVar[tuple[str, ...]] = ()
@@ -163,16 +164,19 @@ class Constraint:
     guides: ClassVar[str] = ""
     """Block whose activity passes the wrist's guidance to `guidance`; empty if it does not guide the wrist."""
     region: ClassVar[int] = 0
-    """Region of the constraint bank from which its episodes are drawn: 0 the whole surface, 1 the graspable region."""
+    """Region of the constraint bank from which its episodes are drawn (0 the whole surface, 1 the graspable region)."""
     from_reference: ClassVar[bool] = False
     """True if it is drawn from reference grasps."""
     harvested: ClassVar[bool] = True
     """True if successful grasps under it may become references."""
     weights: ClassVar[tuple[Weight, ...]] = ()
+    """Terms of the reward, each with a setting `--task.reward.TERM`."""
     errors: ClassVar[tuple[ErrorSpec, ...]] = ()
+    """Errors, each with a metric `episode/ERROR`, a column in tables and a lane in the studio."""
     relations: ClassVar[tuple[Relation, ...]] = ()
     """Relations to weaker constraints."""
     options: ClassVar[tuple[Option, ...]] = ()
+    """Options of `congrasp grasp` that request it."""
     needs: ClassVar[tuple[str, ...]] = ()
     """Fields of a query, in addition to its goal arrays, that a request for it must contain."""
     invalid: ClassVar[tuple[str, str]] = ("", "")
@@ -333,7 +337,7 @@ class Constraint:
         return None
 
     def avoid_region(self, given: Mapping[str, Any], obj: GraspObject) -> np.ndarray | None:
-        """(N,) bool, the avoid region requested by `parse`d options; None if they request none.
+        """(N,) bool, the avoid region requested by the options; None if they request none.
 
         Raises:
           CongraspError: the region would be empty or the whole surface.
