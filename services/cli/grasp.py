@@ -85,7 +85,7 @@ def grasp(
       hand: Hand of the pretrained policy; human:left takes its mirror image.
       attempts: Number of attempts simulated in parallel, at most 1024.
       seed: Seed of the attempts.
-      approach: Seconds in which the hand first comes from beside the table; longer where an arm needs it (1 m/s).
+      approach: Seconds in which the hand first comes from the side of the table; longer where an arm needs it (1 m/s).
       lift: Metres by which the hand lifts the object off the table, which then stays; 0 removes the table.
       rest: Resting pose on the table: upright, or a number from 1 on (congrasp objects rests shows them).
       folder: Folder of objects, which can be named in place of files.
