@@ -31,7 +31,7 @@ def doctor(
         print(f"{'ok  ' if finding.fine else 'BAD '} {finding.what:13s} {finding.text}")
     fine = all(finding.fine for finding in findings)
     if fine:
-        print("Next: congrasp train --preset check (physics, messages, log, server and pictures; it learns nothing)")
+        print("Next: congrasp train --preset check --actors 1 (tries physics, messages, log, server and pictures)")
     return 0 if fine else 1
 
 

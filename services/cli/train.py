@@ -31,7 +31,7 @@ def train(
     constraints: pathlib.Path | None = None,
     split: Split | None = None,
     resume: bool = False,
-    evaluation: int = 192,
+    evaluation: int | None = None,
 ) -> int:
     """Train a policy: one learner and its actors on this machine, over Zenoh on the loopback interface.
 
@@ -58,7 +58,8 @@ def train(
       split: Split of these sets: training (the default), held out, or all.
       resume: Resume from the newest intact checkpoint in --run-dir, with the configuration of the run; options that
         only the learner uses, such as --updates and --ppo.…, may be changed.
-      evaluation: Episodes of the evaluation after training, on held-out objects; 0 leaves it out.
+      evaluation: Episodes of the evaluation after training, on held-out objects; by default 192, or three times
+        --environments if that is less; 0 leaves it out.
 
     Examples:
       congrasp train --preset quickstart --run-dir runs/mine
@@ -79,7 +80,7 @@ def train(
         launch,
         resume=resume,
         initial=initial,
-        evaluation=evaluation,
+        evaluation=min(192, 3 * config.environments) if evaluation is None else evaluation,
     )
 
 

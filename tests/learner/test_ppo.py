@@ -141,6 +141,12 @@ def test_learning_rate_follows_the_divergence_within_its_range(kl, before, limit
     np.testing.assert_allclose(ppo._adapt_rate(jnp.float32(before), jnp.float32(kl), hyper), rate, rtol=1e-6)
 
 
+def test_a_trained_policy_begins_with_a_tenth_of_the_rate():
+    policy = ALGORITHM.policy(fresh())
+    rates = [float(state.optimizer.hyperparams["learning_rate"]) for state in (fresh(), ALGORITHM.init(0, policy))]
+    assert rates == pytest.approx([toy.SETTINGS.learning_rate, toy.SETTINGS.learning_rate / 10])
+
+
 def test_divergence_and_noise_are_bounded_as_the_run_settles():
     """Over the last updates the target falls to a tenth, the noise's ceiling geometrically; before, it has a floor."""
     settings = PPOConfig(kl_target=0.01, settling=0.2)
