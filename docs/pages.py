@@ -4,7 +4,9 @@ import contextlib
 import dataclasses
 import inspect
 import io
+import json
 import os
+import pathlib
 import re
 import textwrap
 import typing
@@ -20,6 +22,7 @@ from congrasp.common.wire import messages
 from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
 
+_CASES = pathlib.Path(__file__).parents[1] / "tests" / "cases"
 _WIDTH = 100
 _DEFAULT = 60
 """Most characters of a default value."""
@@ -55,10 +58,20 @@ class Messages(Directive):
         return [_section(spec.kind, [_table(("entry", "type", "shape"), list(_entries(spec)))]) for spec in specs]
 
 
+class Cases(Directive):
+    """Files that do not load, from the descriptions that the tests run."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        cases = [json.loads(file.read_text()) for file in sorted(_CASES.glob("*/case.json"))]
+        rows = [(case["sign"], f"congrasp {case['command']}", case["remedy"]) for case in cases if "sign" in case]
+        return [_table(("sign", "for example", "remedy"), rows)]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Registers the directives with Sphinx."""
-    for name, directive in (("commands", Commands), ("configuration", Configuration), ("messages", Messages)):
-        app.add_directive(name, directive)
+    for directive in (Cases, Commands, Configuration, Messages):
+        app.add_directive(directive.__name__.lower(), directive)
     return {"parallel_read_safe": True}
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.spec import Capsule, Hand, Link, chain, vector
+from congrasp.common.io.npz import read_npz
 from congrasp.common.io.pickles import read_pickle
 
 VARIABLE = "CONGRASP_MANO"
@@ -77,12 +78,13 @@ class ManoModel:
 
 
 def read_mano(path: pathlib.Path) -> ManoModel:
-    """Reads a MANO file.
+    """Reads a MANO file: the pickle of mano.is.tue.mpg.de, one with other kinds of its arrays, or an NPZ file of them.
 
     Raises:
       CongraspError: the file is missing, is not a MANO file, or is that of a left hand.
     """
-    content = read_pickle(path)
+    zipped = path.is_file() and path.read_bytes()[:4] == b"PK\x03\x04"
+    content = read_npz(path, _REMEDY) if zipped else read_pickle(path)
     arrays = []
     for name, shape in _SHAPES.items():
         array = content.get(name)

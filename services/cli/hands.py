@@ -129,6 +129,7 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     from congrasp.common.io.files import write_atomically
     from congrasp.services.assets.hands.model_files import describe
     from congrasp.services.assets.hands.visual import save_meshes
+    from congrasp.services.cli.console import say
     from congrasp.services.viz.hand_sheets import joints_sheet
     from congrasp.services.viz.sheets import save_png
 
@@ -142,9 +143,7 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     get_hand.cache_clear()
     picture = png or path.with_suffix(".png")
     save_png(picture, joints_sheet(hand))
-    for line in describe(proposal):
-        print(line)
-    print(f"\n{path}\n{picture}")
+    say(*describe(proposal), "", path, picture)
 
 
 def check(
@@ -262,11 +261,11 @@ def train(
 
 def _taken(hand: str, choices: "Choices") -> str:
     """Name of a hand in commands; that of a URDF or MJCF is imported, unless it was before."""
-    from congrasp.common.hands import own_hands
+    from congrasp.common.hands import SUFFIX, own_hands
     from congrasp.services.assets.hands.model_files import import_hand as proposed
 
     file = pathlib.Path(hand)
-    if file.suffix.lower() not in (".urdf", ".xml", ".mjcf"):
+    if not file.is_file() or file.suffix == SUFFIX:
         return hand
     proposal = proposed(file, choices)
     name = proposal.hand.name

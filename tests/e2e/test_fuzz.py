@@ -39,7 +39,7 @@ from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
-from congrasp.services.assets.objects.sources import read_mesh
+from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.grasp.wrist_paths import read_bvh, read_wrist_path
 from congrasp.services.record.entries import Converter

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import GraspObject
-from congrasp.services.assets.objects.sources import load_geometry, read_mesh
+from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh, upright
 
 LEAST_SHARE = 0.10
 """Least share of the surface that the graspable region must have (paper, section Constraint Setup)."""
@@ -96,7 +96,8 @@ def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
     Raises:
       CongraspError: the mesh cannot be read, or lies elsewhere.
     """
-    dense, _ = trimesh.sample.sample_surface(read_mesh(path), 8000, seed=0)
+    part = read_mesh(path, up="y" if obj.file_up == "y" else "auto")
+    dense, _ = trimesh.sample.sample_surface(part, 8000, seed=0)
     distance = cKDTree(np.asarray(dense) * obj.file_scale + obj.origin).query(obj.points)[0]
     if distance.min() > _ON_PART:
         raise CongraspError(
@@ -126,7 +127,7 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
         colours = mesh.colors if len(mesh.colors) else None
     if colours is None:
         raise CongraspError(f"{path} has no coloured vertices.", "Paint them and export as PLY with colours.")
-    vertices = np.asarray(mesh.vertices, float) * obj.file_scale + obj.origin
+    vertices = upright(np.asarray(mesh.vertices, float), obj.file_up) * obj.file_scale + obj.origin
     finite = np.isfinite(vertices).all(-1)
     vertices, rgb = vertices[finite], np.asarray(colours)[finite, :3].astype(int)
     _check_box(obj, path, vertices)

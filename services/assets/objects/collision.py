@@ -11,9 +11,10 @@ from scipy.spatial import QhullError
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.services.assets.objects import decompose, repair
-from congrasp.services.assets.objects.fidelity import Fidelity, fidelity
+from congrasp.services.assets.objects.fidelity import Fidelity, enclosed, fidelity
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.pieces import SQUEEZE, merge, simplify, squeeze
+from congrasp.services.assets.objects.repair import encloses
 from congrasp.services.assets.objects.sources import Source
 
 _TOO_LARGE = 0.01  # share of the volume; pieces of thin walls fill the inside of bends
@@ -56,7 +57,7 @@ def convex_pieces(
     Raises:
       CongraspError: the object has no volume.
     """
-    triangles, closed = np.asarray(whole.triangles), all(mesh.is_volume for mesh in meshes)
+    triangles, closed = np.asarray(whole.triangles), all(encloses(mesh) for mesh in meshes)
     try:
         if not given:
             found = _cut(source, meshes, triangles, closed, options, notes)
@@ -113,14 +114,25 @@ def _cut(
         found = decompose.decompose(
             np.asarray(small.vertices),
             np.asarray(small.faces),
-            volume=float(mesh.volume) if closed and small.is_volume else None,
+            volume=enclosed(np.asarray(small.triangles)).volume if closed and encloses(small) else None,
             time_limit=options.time_limit,
             max_pieces=limit,
         )
         hulls.extend(found.pieces)
         owners.extend([owner if source.parts_are_pieces else 0] * len(found.pieces))
         notes.extend(found.notes)
-    return _fitted(triangles, hulls, owners, closed)
+    cut = _fitted(triangles, hulls, owners, closed)
+    if cut.errors.excess <= 1 or len(hulls) == len(meshes):
+        return cut
+    whole = [shapes.hull_of(mesh.vertices) for mesh in meshes]
+    owners = list(range(len(meshes))) if source.parts_are_pieces else [0] * len(meshes)
+    filled = _fitted(triangles, [hull.points[hull.vertices] for hull in whole], owners, closed)
+    if filled.errors.excess < cut.errors.excess:
+        notes.append(
+            f"its convex hull is closer to its shape than {len(hulls)} pieces ({cut.errors}): hollows are filled"
+        )
+        return filled
+    return cut
 
 
 def _fitted(triangles: np.ndarray, found: list[np.ndarray], owners: list[int], closed: bool) -> Collision:

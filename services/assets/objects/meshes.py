@@ -23,15 +23,18 @@ from congrasp.common.runtime.parallel import cores
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.collision import convex_pieces
 from congrasp.services.assets.objects.colours import sample_colours
+from congrasp.services.assets.objects.fidelity import enclosed
 from congrasp.services.assets.objects.materials import Weight, guessed_mass, materials_of, weigh
+from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.regions import cut_to_hold
-from congrasp.services.assets.objects.sizes import metres_per_unit
-from congrasp.services.assets.objects.sources import Source, read_mesh
+from congrasp.services.assets.objects.repair import encloses
+from congrasp.services.assets.objects.sizes import Up, metres_per_unit
+from congrasp.services.assets.objects.sources import Source
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
-_CACHE_VERSION = 8
+_CACHE_VERSION = 9
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
 
@@ -116,8 +119,12 @@ def _cache_key(source: Source, options: ImportOptions) -> str:
 def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     """The object of a source; the seed draws its surface points."""
     notes: list[str] = []
-    given = [np.asarray(read_mesh(file.path).vertices, np.float64) for file in source.pieces]
-    visuals = [read_mesh(file.path, notes) for file in source.visuals] or [shapes.triangulate(piece) for piece in given]
+    given = [np.asarray(read_mesh(file.path, up=options.up).vertices, np.float64) for file in source.pieces]
+    visuals = [read_mesh(file.path, notes, options.up) for file in source.visuals]
+    visuals = visuals or [shapes.triangulate(piece) for piece in given]
+    up = up_of(source.files()[0].path, options.up)
+    if up == "y":
+        notes.append("its y axis, which points up in the file, became its z axis (--up z leaves the axes)")
     if not (given or source.parts):
         visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
     if not source.parts:
@@ -126,12 +133,14 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
     meshes = [_scaled(mesh, factor) for mesh in visuals]
     whole = _joined(meshes)
-    closed = all(mesh.is_volume for mesh in meshes)
+    closed = all(encloses(mesh) for mesh in meshes)
     if not (closed or options.material):
         notes.append(
             f"its surface is open: mass and inertia are those of its convex {'pieces' if source.pieces else 'hull'} "
             "(--material weighs its wall, and --mass sets the mass)"
         )
+    if any(enclosed(np.asarray(mesh.triangles)).overlaps for mesh in meshes if encloses(mesh)):
+        notes.append("its bodies overlap: what lies in several of them weighs once")
     hulls, owners, errors = convex_pieces(source, meshes, whole, [factor * piece for piece in given], options, notes)
     mass, center, inertia = _weighed(source, meshes, factor, hulls if source.pieces else None, options)
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
@@ -139,14 +148,14 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     points, normals, face = sample_mesh(
         np.asarray(whole.triangles), pieces, np.random.default_rng(seed), oriented=closed
     )
-    part_names, graspable, labels = _labels(source, meshes, factor, center, points, face)
+    part_names, graspable, labels = _labels(source, meshes, factor, center, points, face, options.up)
     share = graspable[labels].mean()
     if not 0.1 <= share <= 0.9:
         notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
     if not source.parts_are_pieces:
         pieces = _labelled(pieces, points, labels)
     picture = repair.with_few_faces(whole)
-    colours = _colours(source, factor, center, seed, notes)
+    colours = _colours(source, factor, center, seed, options.up, notes)
     obj = GraspObject(
         name=source.name,
         family="imported",
@@ -163,7 +172,8 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         visual_faces=np.asarray(picture.faces, np.int32),
         origin=tuple((-center).tolist()),
         file_scale=factor,
-        notes=tuple(notes),
+        file_up=up,
+        notes=tuple(dict.fromkeys(notes)),
         surface_error=errors.surface,
         volume_error=errors.volume,
         colours=colours,
@@ -172,10 +182,10 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     return obj if source.parts else cut_to_hold(obj)
 
 
-def _colours(source: Source, factor: float, center: np.ndarray, seed: int, notes: list[str]) -> Colours | None:
+def _colours(source: Source, factor: float, center: np.ndarray, seed: int, up: Up, notes: list[str]) -> Colours | None:
     """Colours of the files, in the object frame; None if they have none, or cannot be read."""
     try:
-        found = sample_colours([file.path for file in source.visuals], seed)
+        found = sample_colours([file.path for file in source.visuals], seed, up, notes)
     except CongraspError as error:
         notes.append(f"its colours are left out: {error}")
         return None
@@ -198,6 +208,11 @@ def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
     return mesh
 
 
+def _scaled_parts(source: Source, factor: float, up: Up) -> list[trimesh.Trimesh]:
+    """Meshes of the part files in metres."""
+    return [_scaled(read_mesh(part.path, up=up), factor) for part in source.parts]
+
+
 def _weighed(
     source: Source,
     meshes: Sequence[trimesh.Trimesh],
@@ -216,20 +231,19 @@ def _weighed(
     """
     whole, text = _joined(meshes), options.material
     if "=" in text:
-        bodies = meshes if source.parts_are_pieces else [_scaled(read_mesh(part.path), factor) for part in source.parts]
+        bodies = meshes if source.parts_are_pieces else _scaled_parts(source, factor, options.up)
         found = weigh(bodies, materials_of(text, [part.part for part in source.parts]))
     elif text:
         found = weigh(meshes, materials_of(text, [""] * len(meshes)))
     else:
-        if all(mesh.is_volume for mesh in meshes):
-            properties = whole.mass_properties
-            volume, center = float(properties["volume"]), np.asarray(properties["center_mass"])
-            inertia = np.asarray(properties["inertia"])
+        area = float(whole.area)
+        if all(encloses(mesh) for mesh in meshes):
+            volume, area, center, inertia, _ = enclosed(np.asarray(whole.triangles))
         else:
             solids = [np.asarray(whole.vertices)] if hulls is None else hulls
             pieces = tuple(Piece("mesh", (0, 0, 0), vertices=solid) for solid in solids)
             volume, center, inertia = mass_properties(pieces, np.ones(len(pieces)))
-        mass = guessed_mass(volume, float(whole.area)) if options.density is None else options.density * volume
+        mass = guessed_mass(volume, area) if options.density is None else options.density * volume
         found = Weight(mass, center, inertia * mass / volume)
     mass = found.mass if options.mass is None else options.mass
     return Weight(mass, found.center, found.inertia * (mass / found.mass))
@@ -258,6 +272,7 @@ def _labels(
     center: np.ndarray,
     points: np.ndarray,
     face: np.ndarray,
+    up: Up,
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names of the parts, which of them form the graspable region, and the part (N,) of each surface point."""
     if source.parts_are_pieces:
@@ -265,10 +280,9 @@ def _labels(
         labels = np.searchsorted(ends, face, side="right")
     elif source.parts:
         distances = []
-        for file in source.parts:
-            part = read_mesh(file.path)
+        for part in _scaled_parts(source, factor, up):
             dense, _ = trimesh.sample.sample_surface(part, 4000, seed=0)
-            distances.append(cKDTree(dense * factor - center).query(points)[0])
+            distances.append(cKDTree(dense - center).query(points)[0])
         labels = np.argmin(distances, axis=0)
     else:
         labels = halves(points, 0.5)

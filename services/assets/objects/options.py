@@ -4,7 +4,7 @@ import dataclasses
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import MAX_MESH_PIECES
-from congrasp.services.assets.objects.sizes import Unit
+from congrasp.services.assets.objects.sizes import Unit, Up
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +28,8 @@ class ImportOptions:
     """Seconds for the convex decomposition (CoACD) of one mesh; V-HACD takes over after it."""
     max_pieces: int = MAX_MESH_PIECES
     """Largest number of convex pieces of an object; more are merged."""
+    up: Up = "auto"
+    """Axis that points up in the files, which becomes z: auto takes y for GLB, as glTF prescribes, and z for others."""
     cache_dir: str = ""
     """Folder that caches finished imports; the user's cache folder if empty."""
 

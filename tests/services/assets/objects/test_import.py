@@ -196,38 +196,6 @@ def test_an_open_mesh_counts_its_hull(tmp_path, options, hull_alone):
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-4)
 
 
-def far_obj(path):
-    path.write_text("v 1e200 0 0\nv -1e200 0 0\nv 0 1e200 0\nv 0 0 1e200\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
-
-
-def slanted_obj(path):
-    path.write_text("v 0 0 0\nv .1 0 .1\nv .1 .1 .1\nv 0 .1 0\nv .05 .05 .05\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n")
-
-
-BAD = {
-    "text.stl": (lambda path: path.write_text("not a mesh"), "no triangles"),
-    "text.ply": (lambda path: path.write_text("not a mesh"), "cannot be read as PLY"),
-    "text.glb": (lambda path: path.write_text("not a mesh"), "cannot be read as GLB"),
-    "far.obj": (far_obj, r"coordinate of 1e\+200. 1e\+12 is the most"),
-    "slanted.obj": (slanted_obj, "points lie in a plane"),
-    "triangle.obj": (lambda path: path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "only 1 proper triangles"),
-    "drawing.step": (lambda path: path.write_text("ISO"), "not an STL, OBJ, PLY or GLB"),
-    "folder": (lambda path: path.mkdir(), "holds no STL, OBJ, PLY or GLB"),
-    "missing.stl": (lambda path: None, "no file or folder"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_meshes_are_one_line(tmp_path, options, name):
-    make, expected = BAD[name]
-    make(tmp_path / name)
-    with pytest.raises(CongraspError, match=expected) as error:
-        objects_of(tmp_path / name, options)
-    assert name in str(error.value)
-    assert "\n" not in str(error.value)
-    assert not (tmp_path / "cache").exists()
-
-
 @pytest.mark.parametrize("bad", [{"scale": 0.0}, {"density": -1.0}, {"mass": 0.0}, {"time_limit": float("nan")}])
 def test_bad_options_are_named(tmp_path, bad):
     block().export(tmp_path / "block.stl")
@@ -306,7 +274,8 @@ def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert result.method == "vhacd"
     assert result.notes == ["coacd took longer than 0.01 s of processor time"]
-    assert sum(shapes.hull_of(piece).volume for piece in result.pieces) < 1.2 * mesh.volume
+    volume = sum(shapes.hull_of(piece).volume for piece in result.pieces)
+    assert 0.8 * mesh.volume < volume < 1.2 * mesh.volume
     monkeypatch.setattr(decompose, "FALLBACK_LIMIT", 0.01)
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert (result.method, len(result.pieces)) == ("hull", 1)
