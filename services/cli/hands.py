@@ -92,7 +92,7 @@ def import_hand(
     couplings and capsules are all in it.
 
     Args:
-      file: The hand's URDF (.urdf) or MJCF (.xml), a right or left hand of hinges.
+      file: The hand's URDF or MJCF, a right or left hand of hinges.
       name: Its name; that of the file by default.
       palm: Body of the palm; by default the one from which most fingers branch.
       thumb: The last body of the finger that opposes the others; by default one called thumb, or the one that best
@@ -137,6 +137,8 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     if hand.name in HANDS:
         raise CongraspError(f"'{hand.name}' is a hand of congrasp.", "Pass another --name.")
     path = out or hands_folder() / f"{hand.name}{SUFFIX}"
+    if path.exists():
+        say(f"The file {path} of an earlier import is replaced (--name or --out keeps it).")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, hand_text(hand).encode())
     save_meshes(path, proposal.meshes)
@@ -206,8 +208,8 @@ def train(
     Repeat the command to resume a stopped one.
 
     Args:
-      hand: The hand's URDF (.urdf) or MJCF (.xml), which is imported unless there is a custom hand of its name; or a
-        hand's name or file.
+      hand: The hand's URDF or MJCF, which is imported unless there is a custom hand of its name; or a hand's name or
+        file.
       name: As in 'congrasp hands import', like the next three.
       palm: Body of the palm.
       thumb: The last body of the finger that opposes the others.

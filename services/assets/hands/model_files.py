@@ -25,7 +25,7 @@ from congrasp.services.assets.hands.geometry import bare, far_end, fit_capsules,
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
 from congrasp.services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
 from congrasp.services.assets.hands.visual import link_mesh
-from congrasp.services.assets.objects.sizes import length
+from congrasp.services.assets.objects.sizes import METRES, length
 
 _LEVER = 0.02  # least distance of a joint from the tip that it moves, m
 _TURN = np.deg2rad(10)  # largest range of a joint below which grasping is impossible
@@ -37,9 +37,6 @@ _HEAVY = 5.0  # kg, mass of a link
 _MESHES = "meshes.npz"
 
 
-_MILLIMETRES = (
-    'Are its lengths in mm? Give meshes scale="0.001 0.001 0.001", and offsets in metres; or a scale is missing.'
-)
 _TWICE = "Has a scale such as 0.001 been applied twice? Lengths are in metres."
 _DEGREES = 'Are its limits in degrees? A URDF has radians; an MJCF has degrees, unless <compiler angle="radian"/>.'
 _GRAMS = "Is its mass in grams? Masses are in kg."
@@ -169,14 +166,21 @@ def _check_units(path: pathlib.Path, links: list[Link], sizes: dict[str, float])
         away = max((float(np.linalg.norm(joint.anchor)) for joint in link.joints), default=0.0)
         turn = max(((max(-joint.lower, joint.upper), joint.name) for joint in link.joints), default=(0.0, ""))
         for wrong, what, remedy in (
-            (size > _LINK[1], f"the link '{link.name}' is {length(size)} long", _MILLIMETRES),
+            (size > _LINK[1], f"the link '{link.name}' is {length(size)} long", _smaller_unit(size)),
             (size < _LINK[0], f"the link '{link.name}' is {length(size)} long", _TWICE),
-            (away > _FAR, f"the link '{link.name}' turns {length(away)} from the palm", _MILLIMETRES),
+            (away > _FAR, f"the link '{link.name}' turns {length(away)} from the palm", _smaller_unit(away)),
             (turn[0] > _RANGE, f"the joint '{turn[1]}' turns to {turn[0]:.4g} rad", _DEGREES),
             (link.mass > _HEAVY, f"the link '{link.name}' weighs {link.mass:.4g} kg", _GRAMS),
         ):
             if wrong:
                 raise CongraspError(f"{path}: {what}, which is no hand's.", remedy)
+
+
+def _smaller_unit(size: float) -> str:
+    """Remedy for a length of a hand, in what should be m, that is too large."""
+    units = [f"{unit} ({length(size * factor)})" for unit, factor in METRES.items() if size * factor < _LINK[1]]
+    question = f"Are its lengths in {' or '.join(units)}? " if units else ""
+    return f'{question}Give meshes a scale such as "0.001 0.001 0.001", and offsets in metres.'
 
 
 def describe(proposal: Proposal) -> list[str]:
