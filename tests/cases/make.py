@@ -121,7 +121,29 @@ def main() -> None:
     both = trimesh.util.concatenate([BOX, BOX])
     other = trimesh.util.concatenate([BOX, moved(BOX, 0.04, 0, 0)])
     random = np.random.default_rng(0)
+    ball = trimesh.creation.icosphere(1, 0.03)
+    mixed, pierced = ball.copy(), ball.copy()
+    spoilt, worse = (trimesh.creation.icosphere(2, 0.03) for _ in range(2))
+    mixed.faces[::7] = np.asarray(mixed.faces)[::7, ::-1]
+    pierced.update_faces(np.arange(len(ball.faces)) > 1)
+    spoilt.vertices[3], worse.vertices[:40] = np.nan, np.nan
+    far = ball.copy().apply_scale(0.5).apply_translation([0.2, 0, 0])
+    inverted = BOX.copy()
+    inverted.invert()
     files = {
+        "sound/ball.stl": stl(ball),
+        "unit_guess/part.stl": stl(BOX.copy().apply_scale(1000)),
+        "unit_unclear/part.stl": stl(BOX.copy().apply_scale(100)),
+        "inside_out/part.stl": stl(inverted),
+        "mixed_winding/ball.stl": stl(trimesh.Trimesh(ball.vertices, mixed.faces, process=False)),
+        "holes/ball.stl": stl(pierced),
+        "apart/two.stl": stl(trimesh.util.concatenate([far, ball])),
+        "not_finite/ball.ply": spoilt.export(file_type="ply"),
+        "not_finite_many/ball.ply": worse.export(file_type="ply"),
+        "parts/tool/graspable.stl": stl(moved(trimesh.creation.box((0.02, 0.02, 0.1)), 0, 0, 0.05)),
+        "parts/tool/non_graspable.stl": stl(moved(trimesh.creation.box((0.06, 0.02, 0.03)), 0, 0, 0.115)),
+        "parts_tiny/ball/top.stl": box,
+        "parts_tiny/ball/bottom.stl": stl(moved(trimesh.creation.box((0.01,) * 3), *(0.346408,) * 3)),
         "stl_count/part.stl": box[:80] + struct.pack("<I", 5) + box[84:],
         "stl_tail/part.stl": box + b"colour table",
         "stl_cut/part.stl": box[:-30],

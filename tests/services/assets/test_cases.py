@@ -4,8 +4,8 @@
 
 * `command`, run in a copy of the folder, as after `congrasp`, and `status`, its exit code.
 * `says`, patterns in what it prints, and `never`, patterns that are not in it.
-* `objects`: the objects in `out` by name, with `size_cm`, `mass_g`, most `pieces` and their `volume_cm3` where they
-  matter.
+* `objects`: the objects in `out` by name, with `size_cm`, `mass_g`, most `pieces` and their `volume_cm3`, `parts`, and
+  `outwards` for normals that point away from the middle, where they matter.
 * `files`: further inputs by name: a `text`, a `copy` of another case's, or one `from` `_hand` with `replace`, what
   comes `before` it, and its `encoding`.
 * `sign` and `remedy`: a row of the page "My file does not load".
@@ -105,6 +105,10 @@ def test_a_case_ends_as_it_should(name, tmp_path, monkeypatch, capsys):
             assert 1000 * obj.mass == pytest.approx(facts["mass_g"], rel=0.01)
         if "pieces" in facts:
             assert len(obj.pieces) <= facts["pieces"] and obj.shape_reliable
+        if "outwards" in facts:
+            assert (obj.normals * obj.points).sum(-1).min() > 0
+        if "parts" in facts:
+            assert list(obj.part_names) == facts["parts"]
         if "volume_cm3" in facts:
             assert 1e6 * sum(shapes.volume(piece) for piece in obj.pieces) == pytest.approx(
                 facts["volume_cm3"], rel=0.2

@@ -62,24 +62,6 @@ def test_pieces_and_halves_of_a_block(tmp_path, options):
     assert obj.non_graspable_points.mean() == pytest.approx(0.35, abs=0.01)
 
 
-def test_units_scale_density_and_mass(tmp_path, options, quick_import):
-    block(1000 * SIDES).export(tmp_path / "block.stl")
-    with pytest.raises(CongraspError, match=r"block\.stl is 80 m long .*too large.*--unit mm' \(8 cm\)") as error:
-        objects_of(tmp_path / "block.stl", options)
-    assert "\n" not in str(error.value)
-    with pytest.raises(CongraspError, match=r"is 0\.08 mm long.*too small.*--scale 0\.00125"):
-        objects_of(tmp_path / "block.stl", ImportOptions("m", 1e-6, cache_dir=options.cache_dir))
-    made = ImportOptions("mm", 0.5, density=3000.0, cache_dir=options.cache_dir)
-    (obj,) = objects_of(tmp_path / "block.stl", made)
-    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), SIDES / 2, rtol=1e-5)
-    np.testing.assert_allclose(obj.mass, 3000 * np.prod(SIDES / 2), rtol=1e-5)
-    (heavy,) = objects_of(tmp_path / "block.stl", ImportOptions("mm", mass=0.7, cache_dir=options.cache_dir))
-    assert heavy.mass == 0.7
-    (light,) = objects_of(tmp_path / "block.stl", ImportOptions("mm", density=1.0, cache_dir=options.cache_dir))
-    np.testing.assert_allclose(light.mass, np.prod(SIDES), rtol=1e-5)
-    np.testing.assert_allclose(light.inertia / light.mass, heavy.inertia / 0.7, rtol=1e-6)
-
-
 def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import, monkeypatch):
     path = tmp_path / "block.stl"
     block().export(path)
@@ -96,32 +78,6 @@ def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import,
     for cached in (tmp_path / "cache").iterdir():
         cached.write_bytes(b"damaged")
     assert digest(objects_of(path, options)[0]) == digest(larger)
-
-
-@pytest.mark.parametrize("names", [("graspable", "non_graspable"), ("top_watertight_tiny", "bottom_watertight_tiny")])
-def test_part_files_become_the_parts(tmp_path, options, quick_import, names):
-    folder = tmp_path / "tool"
-    folder.mkdir()
-    block((0.02, 0.02, 0.1), (0, 0, 0.05)).export(folder / f"{names[0]}.obj")
-    block((0.06, 0.02, 0.03), (0, 0, 0.115)).export(folder / f"{names[1]}.obj")
-    (obj,) = objects_of(folder, options)
-    assert (obj.name, obj.part_names) == ("tool", ("graspable", "non-graspable"))
-    assert obj.graspable.tolist() == [True, False]
-    top = 0.115 - 0.015 - (0.02 * 0.02 * 0.1 * 0.05 + 0.06 * 0.02 * 0.03 * 0.115) / (0.02**2 * 0.1 + 0.06 * 0.02 * 0.03)
-    clear = np.abs(obj.points[:, 2] - top) > 1e-4
-    np.testing.assert_array_equal(obj.non_graspable_points[clear], obj.points[clear, 2] > top)
-    assert [piece.part for piece in obj.pieces] == [0, 1]
-
-
-def test_a_tiny_part_mesh_is_ignored(tmp_path, options, quick_import):
-    folder = tmp_path / "ball"
-    folder.mkdir()
-    block().export(folder / "top.obj")
-    block((0.01,) * 3, (0.346408,) * 3).export(folder / "bottom.obj")
-    (obj,) = objects_of(folder, options)
-    assert obj.part_names == ("graspable",)
-    assert not obj.non_graspable_points.any()
-    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), SIDES, rtol=1e-5)
 
 
 def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import):
