@@ -7,6 +7,7 @@ the file, writes its arrays into FOLDER and returns what goes to FOLDER/answer.j
 import contextlib
 import importlib
 import json
+import math
 import os
 import pathlib
 import re
@@ -16,6 +17,7 @@ import stat
 import subprocess
 import sys
 import tempfile
+import urllib.parse
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -48,7 +50,7 @@ _NAMED = re.compile(r"""<(\w+)[^<>]*?\bfile\w*\s*=\s*["']([^"']+)["']""")
 _FOLDERS = re.compile(r"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']+)["']""")
 _CLASSES = re.compile(r"""<default\b[^<>]*?\bclass\s*=\s*["']([^"']+)["']""")
 _OPENING = re.compile(r"opening file '([^']*)'")
-_XACRO = re.compile(r"<xacro:|\bxmlns:xacro\b|\$\{|\$\((?:find|arg|eval)\b")
+_XACRO = re.compile(r"<xacro:|\$\{|\$\((?:find|arg|eval)\b")
 _FINITE = (
     *("body_pos", "body_quat", "body_mass", "body_inertia", "jnt_pos", "jnt_axis", "jnt_range", "geom_pos"),
     *("geom_size", "geom_quat", "mesh_vert", "dof_armature", "dof_damping", "actuator_biasprm"),
@@ -320,6 +322,9 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     compiler = extension.find("compiler")
     compiler = ET.SubElement(extension, "compiler") if compiler is None else compiler
     compiler.attrib |= {"strippath": "false", "discardvisual": "false", "balanceinertia": "true", "meshdir": ""}
+    names = Counter(link.get("name") for link in robot.findall("link"))
+    if repeated := [name for name, count in names.items() if count > 1]:
+        raise _Known(f"several links are called '{repeated[0]}'. Rename all but one")
     _check_joints(robot, notes)
     assets, lacking = dict[str, bytes](), dict[str, None]()
     for link in robot.iter("link"):
@@ -370,18 +375,29 @@ def _value(element: ET.Element, name: str, joint: str, missing: float = 0.0) -> 
     """A number of an element of a joint."""
     text = element.get(name, str(missing))
     try:
-        return float(text)
+        value = float(text)
     except ValueError:
-        raise _Known(f"{name} of the joint '{joint}' is '{text[:40]}', not a number. Correct it") from None
+        value = math.nan
+    if not math.isfinite(value):
+        raise _Known(f"{name} of the joint '{joint}' is '{text[:40]}', not a finite number. Correct it")
+    return value
 
 
 def _mesh_file(path: pathlib.Path, name: str) -> pathlib.Path | None:
     """Path of a mesh named in a URDF file, relative to it or to a parent folder; None if there is none."""
-    plain = re.sub(r"^(?:file|package|model)://", "", name.strip()).replace("\\", "/")
+    plain = urllib.parse.unquote(re.sub(r"^(?:file|package|model)://", "", name.strip())).replace("\\", "/")
     above = [path.parent, *path.parent.parents[:3]]
     parts = pathlib.PurePosixPath(plain).parts
     within = [plain, *("/".join(parts[i:]) for i in range(1, len(parts)))] if parts else []
-    return next((file for folder in above for part in within if (file := folder / part).is_file()), None)
+    return next((file for folder in above for part in within if (file := _there(folder / part))), None)
+
+
+def _there(path: pathlib.Path) -> pathlib.Path | None:
+    """The file at a path, or one whose name differs in upper and lower case alone; None if there is none."""
+    if path.is_file() or not path.parent.is_dir():
+        return path if path.is_file() else None
+    alike = (file for file in path.parent.iterdir() if file.name.lower() == path.name.lower() and file.is_file())
+    return next(alike, None)
 
 
 def _readable(file: pathlib.Path) -> tuple[bytes, str]:

@@ -20,7 +20,7 @@ from congrasp.common.hands.motors import motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from congrasp.common.io.npz import read_npz
 from congrasp.services.assets.hands.actuators import Drive
-from congrasp.services.assets.hands.compile import compiled_model, confined
+from congrasp.services.assets.hands.compile import LEAST, compiled_model, confined
 from congrasp.services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_box, solids_of, surface
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
 from congrasp.services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
@@ -109,6 +109,10 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
             "Pass another --palm.",
         )
     _to_palm(data, tree.palm)
+    wide = np.sqrt(model.body_inertia.max(1) / np.maximum(model.body_mass, LEAST[0])) > _LINK[1]
+    if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
+        said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"
+        notes.append(f"{said}: {', '.join(doubtful)}")
     sizes: dict[str, float] = {}
     links, drive = _links(model, data, tree, sizes, notes)
     _check_units(path, links, sizes)

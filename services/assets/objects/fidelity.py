@@ -99,7 +99,7 @@ def _farthest(surface: _Surface, other: _Surface) -> float:
 
 
 class Enclosed(NamedTuple):
-    """What the outer surface of a closed mesh encloses; bodies that overlap count once."""
+    """Measures of the space inside a closed mesh; bodies that overlap count once."""
 
     volume: float
     """m^3."""
@@ -114,7 +114,7 @@ class Enclosed(NamedTuple):
 
 
 def enclosed(triangles: np.ndarray) -> Enclosed:
-    """Measures what the outward triangles (F, 3, 3) of a closed mesh enclose, m.
+    """Measures the space inside the outward triangles (F, 3, 3) of a closed mesh, m.
 
     What lies in several of its bodies, by rays along each axis, is taken off the mesh's integrals.
     """

@@ -1,12 +1,11 @@
 """Mesh files: their kind by content, limits before they are read, and what the readers of trimesh leave to the caller.
 
 STL is read here, by its content and size. Before trimesh reads them, an OBJ's relative indices become absolute, and a
-GLB's integers the numbers that they stand for.
+GLB's integers the numbers that they stand for (`gltf`).
 """
 
 import array
 import io
-import json
 import pathlib
 import re
 import stat
@@ -19,16 +18,13 @@ import trimesh
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file
 from congrasp.services.assets.objects import repair
+from congrasp.services.assets.objects.gltf import MAX_FACES, plain_glb
 from congrasp.services.assets.objects.sizes import Up
 
 SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CONVERT = "Convert it to STL, OBJ, PLY or GLB."
 MAX_BYTES = 512 << 20
 """Bytes of a mesh file."""
-MAX_FACES = 20_000_000
-"""Triangles of a mesh file, those of a GLB file counted wherever the scene shows them."""
-MAX_NODES = 10_000
-"""Nodes, meshes and accessors of a GLB file, each."""
 _AGAIN = "Export it again, or convert it."
 _BLENDER = "Open it in Blender and export it as GLB or OBJ."
 _UNPACK = "Unpack it and name the mesh inside."
@@ -86,16 +82,6 @@ _FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and p
 _PLY_HEADER = 1 << 16  # bytes
 _SIZES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
 _SIZES |= {"int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8}
-_COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_COMPRESSED = {
-    "KHR_draco_mesh_compression": "is compressed with Draco",
-    "EXT_meshopt_compression": "is compressed with meshopt (gltfpack -c)",
-    "KHR_meshopt_compression": "is compressed with meshopt (gltfpack -c)",
-}
-_LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp", "KHR_animation_")
-"""Beginnings of glTF extensions that change no geometry."""
-_TRIANGLES = (4, 5)  # glTF's modes of primitives: triangles and strips of them
 
 
 def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto") -> trimesh.Trimesh:
@@ -171,7 +157,7 @@ def load_geometry(path: pathlib.Path, remedy: str, *, notes: list[str] | None = 
     try:
         if kind == ".stl":
             return _stl(data, said)
-        prepared = {".ply": _checked_ply, ".glb": _plain_glb, ".obj": _plain_obj}[kind](data, said)
+        prepared = {".ply": _checked_ply, ".glb": plain_glb, ".obj": _plain_obj}[kind](data, said)
         files = _Files(path, said)
         return trimesh.load(io.BytesIO(prepared), file_type=kind[1:], resolver=files, process=False, **options)
     except CongraspError as error:
@@ -279,7 +265,7 @@ def _rows_of_numbers(text: bytes) -> bool:
 
 
 def _zip(path: pathlib.Path) -> tuple[str, str]:
-    """What a zip archive is, and the remedy."""
+    """Kind of a zip archive, and the remedy."""
     try:
         names = zipfile.ZipFile(path).namelist()
     except (OSError, zipfile.BadZipFile):
@@ -407,137 +393,3 @@ def _checked_ply(data: bytes, notes: list[str]) -> bytes:
     if sum(rows * width for rows, width in elements) > len(data):
         raise ValueError(f"it announces {max(elements)[0]} rows, but has {len(data)} bytes")
     return data
-
-
-def _plain_glb(data: bytes, notes: list[str]) -> bytes:
-    """A GLB file of triangles alone, whose positions and texture coordinates are floats.
-
-    Raises:
-      CongraspError: it needs an extension that changes geometry, such as a compression; a predicate without a subject.
-      ValueError: its parts do not fit its size.
-    """
-    length = int.from_bytes(data[12:16], "little")
-    if len(data) < 20 or length > len(data):
-        raise ValueError(f"it announces {length} bytes of JSON, but has {len(data)}")
-    tree, binary = json.loads(data[20 : 20 + length]), bytearray(data[28 + length :])
-    _check_extensions(tree)
-    _keep_triangles(tree, notes)
-    _check_scene(tree, len(data))
-    accessors = _list(tree, "accessors")
-    used = {
-        index
-        for mesh in _list(tree, "meshes")
-        for piece in _list(mesh, "primitives")
-        for name, index in piece["attributes"].items()
-        if name == "POSITION" or name.startswith("TEXCOORD")
-    }
-    for index in sorted(used):
-        part = accessors[index]
-        if part["componentType"] == 5126 and "sparse" not in part:
-            continue
-        values = _floats(tree, part, binary)
-        binary += bytes(-len(binary) % 4)
-        tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes})
-        binary += values.tobytes()
-        view = len(tree["bufferViews"]) - 1
-        accessors[index] = {"bufferView": view, "componentType": 5126, "count": len(values), "type": part["type"]}
-    if _list(tree, "buffers"):
-        tree["buffers"][0]["byteLength"] = max(len(binary), tree["buffers"][0].get("byteLength", 0))
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    binary += bytes(-len(binary) % 4)
-    whole = data[:8] + (28 + len(text) + len(binary)).to_bytes(4, "little")
-    chunks = ((text, b"JSON"), (bytes(binary), b"BIN\0"))
-    return whole + b"".join(len(chunk).to_bytes(4, "little") + name + chunk for chunk, name in chunks)
-
-
-def _check_extensions(tree: dict[str, Any]) -> None:
-    """Raises a CongraspError for a required extension that changes geometry, and for compressed data without it."""
-    views = [name for view in _list(tree, "bufferViews") for name in view.get("extensions", {})]
-    for name in (*tree.get("extensionsRequired", []), *views):
-        if name in _COMPRESSED:
-            raise CongraspError(f"{_COMPRESSED[name]}.", "Export it without compression.")
-        if name != "KHR_mesh_quantization" and not str(name).startswith(_LOOKS):
-            raise CongraspError(f"needs the glTF extension '{name}'.", "Export it without that extension.")
-
-
-def _keep_triangles(tree: dict[str, Any], notes: list[str]) -> None:
-    """Removes primitives of lines, points or nothing from the meshes."""
-    left_out = 0
-    for mesh in _list(tree, "meshes"):
-        pieces = _list(mesh, "primitives")
-        mesh["primitives"] = [
-            piece
-            for piece in pieces
-            if "POSITION" in piece.get("attributes", {}) and piece.get("mode", 4) in _TRIANGLES
-        ]
-        left_out += len(pieces) - len(mesh["primitives"])
-    if left_out:
-        notes.append(f"{left_out} of its primitives without triangles or positions were left out")
-
-
-def _floats(tree: dict[str, Any], part: dict[str, Any], binary: bytearray) -> np.ndarray:
-    """The float32 values (count, columns) of an accessor; normalised integers are divided by their largest value."""
-
-    def values(view: int, offset: int, kind: str, rows: int, columns: int) -> np.ndarray:
-        """Values of a buffer view."""
-        about = tree["bufferViews"][view]
-        start, size = about.get("byteOffset", 0) + offset, np.dtype(kind).itemsize
-        if about.get("buffer", 0) or rows * columns == 0:
-            raise ValueError("its numbers are in another file")
-        steps = about.get("byteStride", size * columns), size
-        return np.ndarray((rows, columns), kind, bytes(binary), start, steps)
-
-    kind, columns, count = _NUMBERS[part["componentType"]], _COLUMNS[part["type"]], part["count"]
-    if "bufferView" in part:
-        found = values(part["bufferView"], part.get("byteOffset", 0), kind, count, columns).astype(np.float32)
-    else:
-        found = np.zeros((count, columns), np.float32)
-    if some := part.get("sparse"):
-        at, new = some["indices"], some["values"]
-        rows = values(at["bufferView"], at.get("byteOffset", 0), _NUMBERS[at["componentType"]], some["count"], 1)
-        found[rows[:, 0]] = values(new["bufferView"], new.get("byteOffset", 0), kind, some["count"], columns)
-    if part.get("normalized") and np.dtype(kind).kind != "f":
-        found = np.maximum(found / np.iinfo(kind).max, -1.0).astype(np.float32)
-    return found
-
-
-def _check_scene(tree: dict[str, Any], size: int) -> None:
-    """Accessors lie in the file, and the scene, which may show a mesh many times, has a bounded number of triangles."""
-    accessors, meshes, nodes = (_list(tree, name) for name in ("accessors", "meshes", "nodes"))
-    for name in ("accessors", "bufferViews"):
-        for part in _list(tree, name):
-            _check_counts(part, size)
-    taken = sum(part["count"] * _COLUMNS[part["type"]] * int(_NUMBERS[part["componentType"]][2]) for part in accessors)
-    if taken > 16 * size + (1 << 20):
-        raise ValueError(f"its accessors take {taken} bytes, but it has {size}")
-    faces = [sum(_triangles(piece, accessors) for piece in _list(mesh, "primitives")) for mesh in meshes]
-    shown, parents = 0, set[int]()
-    for node in nodes:
-        for child in node.get("children", []):
-            if child in parents or not isinstance(child, int):
-                raise ValueError("a node of its scene has two parents")
-            parents.add(child)
-        if "mesh" in node:
-            shown += faces[node["mesh"]]
-    if max(shown, sum(faces)) > MAX_FACES:
-        raise ValueError(f"its scene has more than {MAX_FACES} triangles")
-
-
-def _list(tree: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    found = tree.get(name, [])
-    if len(found) > MAX_NODES:
-        raise ValueError(f"it has more than {MAX_NODES} {name}")
-    return found
-
-
-def _check_counts(part: dict[str, Any], size: int) -> None:
-    for name in ("count", "byteLength", "byteOffset", "byteStride"):
-        value = part.get(name, 0)
-        if type(value) is not int or not 0 <= value <= size:
-            raise ValueError(f"it has a {name} of {value!r:.30}, but {size} bytes")
-
-
-def _triangles(piece: dict[str, Any], accessors: list[dict[str, Any]]) -> int:
-    index = piece.get("indices", piece["attributes"]["POSITION"])
-    return int(accessors[index]["count"])

@@ -8,6 +8,7 @@ import pathlib
 import queue
 import threading
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -23,7 +24,7 @@ from congrasp.common.runtime.parallel import cores
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.collision import convex_pieces
 from congrasp.services.assets.objects.colours import sample_colours
-from congrasp.services.assets.objects.fidelity import enclosed
+from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import Weight, guessed_mass, materials_of, weigh
 from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
 from congrasp.services.assets.objects.options import ImportOptions, check_options
@@ -119,16 +120,7 @@ def _cache_key(source: Source, options: ImportOptions) -> str:
 def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     """The object of a source; the seed draws its surface points."""
     notes: list[str] = []
-    given = [np.asarray(read_mesh(file.path, up=options.up).vertices, np.float64) for file in source.pieces]
-    visuals = [read_mesh(file.path, notes, options.up) for file in source.visuals]
-    visuals = visuals or [shapes.triangulate(piece) for piece in given]
-    up = up_of(source.files()[0].path, options.up)
-    if up == "y":
-        notes.append("its y axis, which points up in the file, became its z axis (--up z leaves the axes)")
-    if not (given or source.parts):
-        visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
-    if not source.parts:
-        visuals = [repair.closed(mesh, notes) for mesh in visuals]
+    given, visuals, up = _read(source, options.up, notes)
     sides = tuple(_joined(visuals).extents.tolist())
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
     meshes = [_scaled(mesh, factor) for mesh in visuals]
@@ -139,10 +131,13 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
             f"its surface is open: mass and inertia are those of its convex {'pieces' if source.pieces else 'hull'} "
             "(--material weighs its wall, and --mass sets the mass)"
         )
-    if any(enclosed(np.asarray(mesh.triangles)).overlaps for mesh in meshes if encloses(mesh)):
+    solid = enclosed(np.asarray(whole.triangles)) if closed else None
+    if solid and solid.overlaps:
         notes.append("its bodies overlap: what lies in several of them weighs once")
-    hulls, owners, errors = convex_pieces(source, meshes, whole, [factor * piece for piece in given], options, notes)
-    mass, center, inertia = _weighed(source, meshes, factor, hulls if source.pieces else None, options)
+    hulls, owners, errors = convex_pieces(
+        source, meshes, np.asarray(whole.triangles), solid and solid.volume, [factor * x for x in given], options, notes
+    )
+    mass, center, inertia = _weighed(source, meshes, factor, solid, hulls if source.pieces else None, options)
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
     whole.apply_translation(-center)
     points, normals, face = sample_mesh(
@@ -182,6 +177,23 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     return obj if source.parts else cut_to_hold(obj)
 
 
+def _read(
+    source: Source, up: Up, notes: list[str]
+) -> tuple[list[np.ndarray], list[trimesh.Trimesh], Literal["y", "z"]]:
+    """The convex pieces (V, 3) in a source's folder, its repaired surfaces, z up, and the files' axis that was up."""
+    given = [np.asarray(read_mesh(file.path, up=up).vertices, np.float64) for file in source.pieces]
+    visuals = [read_mesh(file.path, notes, up) for file in source.visuals]
+    visuals = visuals or [shapes.triangulate(piece) for piece in given]
+    found = up_of(source.files()[0].path, up)
+    if found == "y":
+        notes.append("its y axis, which points up in the file, became its z axis (--up z leaves the axes)")
+    if not (given or source.parts):
+        visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
+    if not source.parts:
+        visuals = [repair.closed(mesh, notes) for mesh in visuals]
+    return given, visuals, found
+
+
 def _colours(source: Source, factor: float, center: np.ndarray, seed: int, up: Up, notes: list[str]) -> Colours | None:
     """Colours of the files, in the object frame; None if they have none, or cannot be read."""
     try:
@@ -217,6 +229,7 @@ def _weighed(
     source: Source,
     meshes: Sequence[trimesh.Trimesh],
     factor: float,
+    solid: Enclosed | None,
     hulls: Sequence[np.ndarray] | None,
     options: ImportOptions,
 ) -> Weight:
@@ -226,6 +239,7 @@ def _weighed(
       source: the object's files.
       meshes: its surface, m.
       factor: metres per unit of the files.
+      solid: measures of what the surface encloses; None for an open one.
       hulls: vertices (V, 3) of the convex solids that replace an open surface, m; the surface's hull if None.
       options: material, density and mass.
     """
@@ -237,8 +251,8 @@ def _weighed(
         found = weigh(meshes, materials_of(text, [""] * len(meshes)))
     else:
         area = float(whole.area)
-        if all(encloses(mesh) for mesh in meshes):
-            volume, area, center, inertia, _ = enclosed(np.asarray(whole.triangles))
+        if solid:
+            volume, area, center, inertia, _ = solid
         else:
             solids = [np.asarray(whole.vertices)] if hulls is None else hulls
             pieces = tuple(Piece("mesh", (0, 0, 0), vertices=solid) for solid in solids)

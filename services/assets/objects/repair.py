@@ -104,15 +104,20 @@ def encloses(mesh: trimesh.Trimesh) -> bool:
     Bodies of it may touch along edges, or intersect.
     """
     edges = np.asarray(mesh.edges)
-    _, group = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    _, group = np.unique(_codes(edges), return_inverse=True)
     passes = np.bincount(group.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
     return not passes.any() and float(np.linalg.det(mesh.triangles).sum()) > 0
 
 
 def is_manifold(faces: np.ndarray) -> bool:
     """True if each edge of triangles (F, 3) belongs to two of them."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return bool((np.unique(edges, axis=0, return_counts=True)[1] == 2).all())
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return bool((np.unique(_codes(edges), return_counts=True)[1] == 2).all())
+
+
+def _codes(edges: np.ndarray) -> np.ndarray:
+    """(E,) numbers of edges (E, 2), the same in both directions."""
+    return edges.min(1).astype(np.int64) * (int(edges.max(initial=0)) + 1) + edges.max(1)
 
 
 def without_repeats(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
