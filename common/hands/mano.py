@@ -14,8 +14,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.spec import Capsule, Hand, Link, chain, vector
-from congrasp.common.io.npz import read_npz
-from congrasp.common.io.pickles import read_pickle
+from congrasp.common.io.pickles import read_archive, read_pickle
 
 VARIABLE = "CONGRASP_MANO"
 """Environment variable with the path of the user's file."""
@@ -84,7 +83,7 @@ def read_mano(path: pathlib.Path) -> ManoModel:
       CongraspError: the file is missing, is not a MANO file, or is that of a left hand.
     """
     zipped = path.is_file() and path.read_bytes()[:4] == b"PK\x03\x04"
-    content = read_npz(path, _REMEDY) if zipped else read_pickle(path)
+    content = read_archive(path) if zipped else read_pickle(path)
     arrays = []
     for name, shape in _SHAPES.items():
         array = content.get(name)

@@ -80,6 +80,21 @@ def read_pickles(pickles: Iterable[tuple[str, bytes]]) -> list[dict[str, np.ndar
     return found
 
 
+def read_archive(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """Arrays of an NPZ file by name; those of pickles inside are named as in `read_pickle`.
+
+    Raises:
+      CongraspError: it is not an NPZ file, exceeds the limits of `common.io.npz`, or holds anything but plain values
+        and arrays.
+    """
+    arrays = read_npz(path, "Download the file again.", pickled=True)
+    pickles = {name: arrays.pop(name) for name, value in list(arrays.items()) if isinstance(value, bytes)}
+    found = read_pickles((f"{path}, '{name[:60]}'", data) for name, data in pickles.items())
+    for name, inside in zip(pickles, found, strict=True):
+        arrays |= {f"{name}/{key}".removesuffix("/"): array for key, array in inside.items()}
+    return arrays
+
+
 def _unpickle(source: pathlib.Path, answer: pathlib.Path, names: list[str]) -> None:
     """Runs the child process; a CongraspError names the pickle at which it ended."""
     limits = map(str, (MEMORY, SECONDS, MAX_BYTES))

@@ -164,7 +164,7 @@ def _resolved(part: Any) -> Any:
         case _Array():
             _, shape, kind, fortran, data = part.state
             if kind.arguments[0] in ("O8", "O"):
-                return data[0] if shape == () else data
+                return _resolved(data[0]) if shape == () else data
             return _numbers(data, kind, shape, "F" if fortran else "C")
         case _Sparse():
             state, values = part.state, _resolved(part.state["data"])

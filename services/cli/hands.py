@@ -126,9 +126,9 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     from congrasp.common.errors import CongraspError
     from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder
     from congrasp.common.hands.files import hand_text
+    from congrasp.common.hands.meshes import save_meshes
     from congrasp.common.io.files import write_atomically
     from congrasp.services.assets.hands.model_files import describe
-    from congrasp.services.assets.hands.visual import save_meshes
     from congrasp.services.cli.console import say
     from congrasp.services.viz.hand_sheets import joints_sheet
     from congrasp.services.viz.sheets import save_png

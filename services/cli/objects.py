@@ -96,7 +96,7 @@ def import_meshes(
                     say(f"{obj.name}: {note}.")
                 if not obj.shape_reliable:
                     unreliable += 1
-                    print(f"{obj.name}: its shape is UNRELIABLE. Repair the mesh, or set --time-limit or --max-pieces.")
+                    print(f"{obj.name}: its shape is unreliable. Repair the mesh, or set --time-limit or --max-pieces.")
             progress.advance(task)
     if done:
         doubtful = f", {unreliable} of them with an unreliable shape" if unreliable else ""

@@ -165,6 +165,7 @@ def main() -> None:
         "archive_3mf/part.3mf": archive("3D/3dmodel.model", "[Content_Types].xml"),
         "archive_usdz/part.usdz": archive("part.usdc"),
         "archive_zip/part.stl": archive("models/mug.obj", "licence.txt"),
+        **{f"{case}/{folder}/mug.stl": box for case in ("sets_of_one_name", "equal_names") for folder in "ab"},
         "names/碗.stl": box,
         "names/कटोरी.stl": box,
         "names/mug.stl": box,

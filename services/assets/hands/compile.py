@@ -130,11 +130,6 @@ def _child(called: str, source: str, folder: str) -> None:
     pathlib.Path(folder, _ANSWER).write_text(json.dumps(answer))
 
 
-def compiled_model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
-    """Compiles a URDF or MJCF file, without files that it names and that are missing; see `robot_spec`."""
-    return robot_spec(path, notes)[1]
-
-
 def robot_spec(path: pathlib.Path, notes: list[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     """Reads a URDF or MJCF file, whose root element determines which it is.
 

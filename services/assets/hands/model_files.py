@@ -15,16 +15,22 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.files import TAKEN_JOINTS, faults, hand_from_text, hand_text
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.measures import fitting_scale
-from congrasp.common.hands.meshes import MAX_DISTANCE, Meshes
+from congrasp.common.hands.meshes import MAX_DISTANCE, Meshes, load_meshes, save_meshes
 from congrasp.common.hands.motors import motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
-from congrasp.common.io.npz import read_npz
 from congrasp.services.assets.hands.actuators import Drive
-from congrasp.services.assets.hands.compile import LEAST, compiled_model, confined
-from congrasp.services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_box, solids_of, surface
+from congrasp.services.assets.hands.compile import LEAST, confined, robot_spec
+from congrasp.services.assets.hands.geometry import (
+    bare,
+    far_end,
+    fit_capsules,
+    inertia_box,
+    link_mesh,
+    solids_of,
+    surface,
+)
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
 from congrasp.services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
-from congrasp.services.assets.hands.visual import link_mesh
 from congrasp.services.assets.objects.sizes import METRES, length
 
 _LEVER = 0.02  # least distance of a joint from the tip that it moves, m
@@ -34,7 +40,7 @@ _LINK = 5e-4, 0.5  # m, sizes of a link
 _FAR = 1.0  # m, distance of a joint from the palm's origin
 _RANGE = 7.0  # rad, largest limit of a joint
 _HEAVY = 5.0  # kg, mass of a link
-_MESHES = "meshes.npz"
+_HAND = "hand.json"
 
 
 _TWICE = "Has a scale such as 0.001 been applied twice? Lengths are in metres."
@@ -73,17 +79,14 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     """Imports the hand of a file, which a confined process reads; see `propose`."""
     with confined(write_proposal, path, dataclasses.asdict(choices)) as (answer, folder):
         hand = hand_from_text(answer["hand"], str(path))
-        arrays = read_npz(folder / _MESHES, "")
-    drawn = [link.name for link in hand.links if f"{link.name}/0" in arrays]
-    meshes = {name: (arrays[f"{name}/0"], arrays[f"{name}/1"]) for name in drawn}
+        meshes = load_meshes(folder / _HAND, hand)
     return Proposal(hand, answer["palm"], tuple(answer["notes"]), meshes)
 
 
 def write_proposal(path: pathlib.Path, folder: pathlib.Path, options: dict[str, Any]) -> dict[str, Any]:
     """Does the work of `import_hand` in the confined process: writes the meshes, returns the rest."""
     proposal = propose(path, Choices(**options))
-    arrays: dict[str, Any] = {f"{name}/{i}": x for name, mesh in proposal.meshes.items() for i, x in enumerate(mesh)}
-    np.savez(folder / _MESHES, **arrays)
+    save_meshes(folder / _HAND, proposal.meshes)
     return {"hand": hand_text(proposal.hand), "palm": proposal.palm, "notes": list(proposal.notes)}
 
 
@@ -99,7 +102,7 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
         masses of another unit.
     """
     notes: list[str] = []
-    model = compiled_model(path, notes)
+    _, model = robot_spec(path, notes)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     tree = hand_tree(model, choices.palm, notes)

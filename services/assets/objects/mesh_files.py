@@ -84,6 +84,7 @@ _SIZES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2,
 _SIZES |= {"int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8}
 
 
+@np.errstate(all="ignore")  # of numbers that are refused, or far out
 def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto") -> trimesh.Trimesh:
     """Reads one mesh, in the file's own unit, with merged vertices and each proper triangle once.
 
@@ -247,14 +248,14 @@ def _is_text_stl(start: bytes) -> bool:
     return text.startswith(b"solid") and re.search(rb"\bfacet\s", text) is not None
 
 
+@np.errstate(all="ignore")
 def _holds_records(start: bytes) -> bool:
     """True if binary STL records with unit normals follow the header, whatever count it announces."""
     whole = max(len(start) - _STL_HEADER, 0) // _STL_TRIANGLE
     if whole < 4 or start.isascii():
         return False
     rows = np.frombuffer(start, _STL_ROW, whole, _STL_HEADER)
-    with np.errstate(all="ignore"):
-        unit = np.abs(np.linalg.norm(rows["normal"].astype(float), axis=-1) - 1) < 1e-3
+    unit = np.abs(np.linalg.norm(rows["normal"].astype(float), axis=-1) - 1) < 1e-3
     return bool(unit.all()) and _plausible(rows, rows)
 
 
@@ -334,6 +335,7 @@ def _binary_stl(data: bytes, notes: list[str]) -> np.ndarray:
     return rows["corners"][:whole].astype(float)
 
 
+@np.errstate(all="ignore")
 def _plausible(rows: np.ndarray, sound: np.ndarray) -> bool:
     """True if records have the values of triangles: not degenerate, and of the size of sound ones."""
     corners, known = rows["corners"].astype(float), sound["corners"].astype(float)

@@ -22,13 +22,13 @@ from congrasp.common.objects.spec import Colours, GraspObject, Piece
 from congrasp.common.objects.surface import halves, mass_properties, sample_mesh
 from congrasp.common.runtime.parallel import cores
 from congrasp.services.assets.objects import decompose, repair
+from congrasp.services.assets.objects.affordance import cut_to_hold
 from congrasp.services.assets.objects.collision import convex_pieces
 from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import Weight, guessed_mass, materials_of, weigh
 from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
 from congrasp.services.assets.objects.options import ImportOptions, check_options
-from congrasp.services.assets.objects.regions import cut_to_hold
 from congrasp.services.assets.objects.repair import encloses
 from congrasp.services.assets.objects.sizes import Up, metres_per_unit
 from congrasp.services.assets.objects.sources import Source

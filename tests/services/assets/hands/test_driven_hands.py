@@ -15,7 +15,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.files import hand_from_text, hand_text
 from congrasp.common.hands.kinematics import grasp_frame, link_transforms
-from congrasp.common.hands.meshes import MAX_FACES, load_meshes
+from congrasp.common.hands.meshes import MAX_FACES, load_meshes, save_meshes
 from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.hands.skin import skin_of, skin_of_meshes
 from congrasp.common.hands.spec import chain_of
@@ -25,7 +25,6 @@ from congrasp.common.objects.spec import Piece
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.model_files import Choices, describe, propose
-from congrasp.services.assets.hands.visual import save_meshes
 from congrasp.services.cli import main
 from congrasp.services.export.frames import skin_of_motion
 from congrasp.services.export.motion_file import hand_arrays, motion_of_episode
