@@ -64,8 +64,8 @@ class Cases(Directive):
     def run(self) -> list[nodes.Node]:
         """Returns a table."""
         cases = [json.loads(file.read_text()) for file in sorted(_CASES.glob("*/case.json"))]
-        rows = [(case["sign"], f"congrasp {case['command']}", case["remedy"]) for case in cases if "sign" in case]
-        return [_table(("sign", "for example", "remedy"), rows)]
+        rows = [(case["command"], case["sign"], case["remedy"]) for case in cases if "sign" in case]
+        return [_table(("for example", "sign", "remedy"), rows)]
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
@@ -149,10 +149,16 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> nodes.tabl
     group.extend(nodes.colspec(colwidth=1) for _ in head)
     body = nodes.tbody()
     for row in rows:
-        body += _row([nodes.literal(text=row[0]), *(nodes.Text(cell) for cell in row[1:])])
+        body += _row([nodes.literal(text=row[0]), *map(_inline, row[1:])])
     group += nodes.thead("", _row([nodes.Text(cell) for cell in head]))
     group += body
     return nodes.table("", group)
+
+
+def _inline(text: str) -> nodes.inline:
+    """A text whose parts in backticks are literal."""
+    parts = enumerate(text.split("`"))
+    return nodes.inline("", "", *(nodes.literal(text=part) if i % 2 else nodes.Text(part) for i, part in parts))
 
 
 def _row(cells: list[nodes.Node]) -> nodes.row:

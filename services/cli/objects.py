@@ -90,7 +90,9 @@ def import_meshes(
                 report_error(obj)
                 failures += 1
             else:
-                catalogue.add(obj)
+                earlier = file.read_bytes() if (file := catalogue.path(obj.name)).is_file() else None
+                if earlier not in (None, catalogue.add(obj).read_bytes()):
+                    say(f"{obj.name}: it replaced another object of that name in {out}.")
                 done += 1
                 for note in obj.notes:
                     say(f"{obj.name}: {note}.")
