@@ -36,6 +36,7 @@ from congrasp.services.assets.objects.sources import Source
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
 _CACHE_VERSION = 9
+_DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
 
@@ -49,8 +50,8 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
       CongraspError: an option is invalid, or a mesh cannot be used; the message names it, its fault and the remedy.
     """
     check_options(options)
-    key = _cache_key(source, options)
-    cached = _cache_folder(options) / f"{key}{store.SUFFIX}"
+    key = _key(source, options)
+    cached = _cache_folder(options) / f"{key}-{_CACHE_VERSION}-{options.up}{store.SUFFIX}"
     if cached.is_file():
         try:
             return store.load(cached)
@@ -107,10 +108,10 @@ def _cache_folder(options: ImportOptions) -> pathlib.Path:
     return pathlib.Path(options.cache_dir) if options.cache_dir else cache_folder("objects")
 
 
-def _cache_key(source: Source, options: ImportOptions) -> str:
-    """24 hex digits of everything that an import depends on."""
+def _key(source: Source, options: ImportOptions) -> str:
+    """24 hex digits of the files and options of an import, which are also the seed of its surface points."""
     settings = dataclasses.replace(options, cache_dir="")
-    content = hashlib.sha256(f"{_CACHE_VERSION} {source.name} {settings}".encode())
+    content = hashlib.sha256(f"{_DRAWS} {source.name} {settings}".encode())
     for file in source.files():
         content.update(f" {file.path.name} {file.role} {file.part} ".encode())
         content.update(hashlib.sha256(file.path.read_bytes()).digest())

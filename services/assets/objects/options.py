@@ -28,7 +28,7 @@ class ImportOptions:
     """Seconds for the convex decomposition (CoACD) of one mesh; V-HACD takes over after it."""
     max_pieces: int = MAX_MESH_PIECES
     """Largest number of convex pieces of an object; more are merged."""
-    up: Up = "auto"
+    up: Up = dataclasses.field(default="auto", repr=False)  # and so not in the seed of surface points
     """Axis that points up in the files, which becomes z: auto takes y for GLB, as glTF prescribes, and z for others."""
     cache_dir: str = ""
     """Folder that caches finished imports; the user's cache folder if empty."""
