@@ -146,7 +146,7 @@ def robot_spec(path: pathlib.Path, notes: list[str]) -> tuple[mujoco.MjSpec, muj
     mujoco.set_mju_user_warning(lambda text: None)  # otherwise they go to MUJOCO_LOG.TXT
     try:
         with contextlib.chdir(path.parent):  # an attached model's files are searched from there
-            spec = _spec(path, notes)
+            spec = _spec(pathlib.Path.cwd() / path.name, notes)
             model = _compiled(spec, notes)
         for name, most in LIMITS.items():
             if getattr(model, name) > most:
@@ -183,9 +183,10 @@ def _spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
                 raise ValueError(f"it repeats a part {count[:40]} times, more than {MAX_COUNT}")
     root = re.search(r"<\s*([A-Za-z_][\w:.-]*)", text)
     kind = root[1] if root else ""
-    if kind == "robot" and _XACRO.search(text):
-        plain = path.name.removesuffix(".xacro").removesuffix(".urdf").removesuffix(".xml")
-        raise _Known(f"this is xacro, of which ROS makes a URDF. Run 'xacro {path.name} > {plain}_plain.urdf' first")
+    if kind == "robot" and _XACRO.search(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)):
+        stem = path.name.partition(".")[0]
+        plain = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_plain.urdf"
+        raise _Known(f"this is xacro, of which ROS makes a URDF. Run 'xacro {path.name} > {plain}' and import that")
     if kind == "robot":
         spec = _urdf(path, text, notes)
     elif kind in ("mujoco", "mujocoinclude"):
