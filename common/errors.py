@@ -4,7 +4,13 @@ import importlib.util
 import re
 
 _LONGEST = 2000  # characters: a line may quote input from elsewhere
-_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+# Controls, line separators, lone surrogates, and marks that change the direction of the text around them.
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def printable(text: str) -> str:
+    """Returns a text as one line for a terminal: blanks for line ends, and escapes such as \\x1b for other controls."""
+    return _UNPRINTABLE.sub(lambda found: " " if found[0] in "\t\n\r\u2028\u2029" else ascii(found[0])[1:-1], text)
 
 
 class CongraspError(Exception):
@@ -19,7 +25,7 @@ class CongraspError(Exception):
     code = ""
 
     def __init__(self, what: str, remedy: str = ""):
-        text = _UNPRINTABLE.sub(" ", f"{what} {remedy}".strip())
+        text = printable(f"{what} {remedy}".strip())
         super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}")
 
 

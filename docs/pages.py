@@ -4,7 +4,9 @@ import contextlib
 import dataclasses
 import inspect
 import io
+import json
 import os
+import pathlib
 import re
 import textwrap
 import typing
@@ -31,6 +33,7 @@ from congrasp.services.record import moved_arm
 from congrasp.services.train.student import CAMERAS, TRACKERS
 from congrasp.services.viz.titles import TITLES
 
+_CASES = pathlib.Path(__file__).parents[1] / "tests" / "cases"
 _WIDTH = 100
 _DEFAULT = 60
 """Most characters of a default value."""
@@ -162,9 +165,20 @@ class Sensing(Directive):
         return [_table(("option", "tracker", "camera", "meaning"), rows)]
 
 
+class Cases(Directive):
+    """Files that do not load, from the descriptions that the tests run."""
+
+    def run(self) -> list[nodes.Node]:
+        """Returns a table."""
+        cases = [json.loads(file.read_text()) for file in sorted(_CASES.glob("*/case.json"))]
+        rows = [(case["command"], case["sign"], case["remedy"]) for case in cases if "sign" in case]
+        return [_table(("for example", "sign", "remedy"), rows)]
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Registers the directives with Sphinx."""
     for directive in (
+        Cases,
         Commands,
         Configuration,
         Constraints,

@@ -14,7 +14,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.spec import Capsule, Hand, Link, chain, vector
-from congrasp.common.io.pickles import read_pickle
+from congrasp.common.io.pickles import read_archive, read_pickle
 
 VARIABLE = "CONGRASP_MANO"
 """Environment variable with the path of the user's file."""
@@ -77,12 +77,13 @@ class ManoModel:
 
 
 def read_mano(path: pathlib.Path) -> ManoModel:
-    """Reads a MANO file.
+    """Reads a MANO file: the pickle of mano.is.tue.mpg.de, one with other kinds of its arrays, or an NPZ file of them.
 
     Raises:
       CongraspError: the file is missing, is not a MANO file, or is that of a left hand.
     """
-    content = read_pickle(path)
+    zipped = path.is_file() and path.read_bytes()[:4] == b"PK\x03\x04"
+    content = read_archive(path) if zipped else read_pickle(path)
     arrays = []
     for name, shape in _SHAPES.items():
         array = content.get(name)

@@ -3,13 +3,16 @@
 Physics and policies use the capsules only. The meshes are for pictures, exports and measurements of penetration.
 """
 
+import io
 import pathlib
+from typing import Any
 
 import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand, own_hands
 from congrasp.common.hands.spec import Hand
+from congrasp.common.io.files import write_atomically
 from congrasp.common.io.npz import read_npz
 
 SUFFIX = ".visual.npz"
@@ -75,3 +78,15 @@ def own_meshes(hand: Hand) -> Meshes:
     except CongraspError:  # a different hand of this name whose file cannot be read
         return {}
     return load_meshes(file, hand) if mine.text == hand.text else {}
+
+
+def save_meshes(path: pathlib.Path, meshes: Meshes) -> None:
+    """Writes the meshes of a hand next to its file; without any, removes an existing file."""
+    if not meshes:
+        beside(path).unlink(missing_ok=True)
+        return
+    parts = [(name, *part) for name, mesh in meshes.items() for part in zip(PARTS, mesh, strict=True)]
+    arrays: dict[str, Any] = {f"{name}/{part}": array for name, part, array in parts}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_atomically(beside(path), buffer.getvalue())

@@ -1,17 +1,19 @@
 """Validation of external input: names used as files, and files of bounded size."""
 
+import hashlib
 import json
 import os
 import pathlib
-import re
 import stat
+import unicodedata
+from collections.abc import Iterable
 from typing import Any, BinaryIO
 
 from congrasp.common.errors import CongraspError
 
 LONGEST_NAME = 100
 """Longest name of a file or folder, in characters."""
-_NAME = re.compile(rf"\w[\w .+()-]{{0,{LONGEST_NAME - 1}}}")
+_LONGEST_BYTES = 200  # of a name in UTF-8; file systems take 255, with suffixes
 
 
 def file_name(text: object, what: str) -> str:
@@ -24,12 +26,49 @@ def file_name(text: object, what: str) -> str:
     Raises:
       CongraspError: it is empty or too long, begins with a dot, or holds a slash or another special character.
     """
-    if isinstance(text, str) and _NAME.fullmatch(text):
-        return text
+    if isinstance(text, str) and text and (text[0].isalnum() or text[0] == "_"):
+        fits = len(text) <= LONGEST_NAME and len(text.encode(errors="replace")) <= _LONGEST_BYTES
+        if fits and all(_is_letter(c) or c in "_ .+()-" for c in text):
+            return text
     raise CongraspError(
         f"'{ascii(text)[1:61].rstrip(chr(39))}' cannot name {what}.",
         f"Use letters, digits, dots, hyphens and underscores, {LONGEST_NAME} at most.",
     )
+
+
+def safe_name(text: str) -> str:
+    """Returns a text as a `file_name`: letters of any script stay, other characters become underscores.
+
+    A name that is too long is cut, and ends with eight hex digits of the whole. A text without letters becomes
+    "object".
+    """
+    text = unicodedata.normalize("NFC", text)
+    safe = "".join(c if _is_letter(c) or c in "._-" else "_" for c in text)
+    while safe and not safe[0].isalnum():  # a mark may follow those that are left out
+        safe = safe[1:]
+    if len(safe) > LONGEST_NAME or len(safe.encode()) > _LONGEST_BYTES:
+        digits = hashlib.sha256(text.encode(errors="replace")).hexdigest()[:8]
+        safe = safe[: LONGEST_NAME - 20].encode()[: _LONGEST_BYTES - 20].decode(errors="ignore") + f"-{digits}"
+    return safe or "object"
+
+
+def distinct_names(names: Iterable[str]) -> list[str]:
+    """Returns the names, with a number at each that repeats one (in upper or lower case), such as mug-2."""
+    names = list(names)
+    taken, given = {name.casefold() for name in names}, list[str]()
+    used = set[str]()
+    for name in names:
+        free, number = name, 2
+        while free.casefold() in used or (free != name and free.casefold() in taken):
+            free, number = f"{name}-{number}", number + 1
+        used.add(free.casefold())
+        given.append(free)
+    return given
+
+
+def _is_letter(c: str) -> bool:
+    """True for a letter or digit of any script, or a mark that belongs to one."""
+    return c.isalnum() or unicodedata.category(c).startswith("M")
 
 
 def read_file(path: pathlib.Path, largest: int, remedy: str = "") -> bytes:

@@ -30,6 +30,11 @@ DEADLINE = 200.0
 """Deadline in seconds, for a busy machine."""
 _CHILD = pathlib.Path(__file__).with_name("unpickle.py")
 _REMEDY = "Only pickles of plain values and arrays are read; download the file again."
+_CONVERT = (
+    "If you trust the file, convert it where its packages are installed, and name the NPZ file: "
+    "python -c \"import numpy, pickle; d = pickle.load(open('{}', 'rb'), encoding='latin1'); "
+    "numpy.savez('{}', **{{k: v.toarray() if hasattr(v, 'toarray') else numpy.array(v) for k, v in d.items()}})\""
+)
 
 
 def read_pickle(path: pathlib.Path) -> dict[str, np.ndarray]:
@@ -75,6 +80,21 @@ def read_pickles(pickles: Iterable[tuple[str, bytes]]) -> list[dict[str, np.ndar
     return found
 
 
+def read_archive(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """Arrays of an NPZ file by name; those of pickles inside are named as in `read_pickle`.
+
+    Raises:
+      CongraspError: it is not an NPZ file, exceeds the limits of `common.io.npz`, or holds anything but plain values
+        and arrays.
+    """
+    arrays = read_npz(path, "Download the file again.", pickled=True)
+    pickles = {name: arrays.pop(name) for name, value in list(arrays.items()) if isinstance(value, bytes)}
+    found = read_pickles((f"{path}, '{name[:60]}'", data) for name, data in pickles.items())
+    for name, inside in zip(pickles, found, strict=True):
+        arrays |= {f"{name}/{key}".removesuffix("/"): array for key, array in inside.items()}
+    return arrays
+
+
 def _unpickle(source: pathlib.Path, answer: pathlib.Path, names: list[str]) -> None:
     """Runs the child process; a CongraspError names the pickle at which it ended."""
     limits = map(str, (MEMORY, SECONDS, MAX_BYTES))
@@ -95,4 +115,8 @@ def _unpickle(source: pathlib.Path, answer: pathlib.Path, names: list[str]) -> N
     if child.returncode:
         number, _, reason = child.stdout.decode(errors="replace").strip("\n").rpartition("\n")[2].partition(" ")
         reason = reason or f"needs more than {SECONDS} s or {MEMORY >> 30} GB, or is damaged"
-        raise CongraspError(f"{names[int(number or 0)]} {reason}.", _REMEDY)
+        name = names[int(number or 0)]
+        foreign = reason.startswith(("names", "has an array"))
+        raise CongraspError(
+            f"{name} {reason}.", _CONVERT.format(name, pathlib.Path(name).stem + ".npz") if foreign else _REMEDY
+        )

@@ -9,6 +9,7 @@ Every class that a pickle may name is a stand-in. NumPy's own `dtype.__setstate_
 turns bytes into pointers.
 """
 
+import contextlib
 import io
 import pickle
 import re
@@ -48,7 +49,10 @@ class _Dtype(_Part):
 
 
 class _Sparse(_Part):
-    """A SciPy matrix of compressed columns."""
+    """A SciPy matrix or array: its subclass names the form."""
+
+
+_SPARSE = {form: type(form, (_Sparse,), {}) for form in ("csc", "csr", "coo")}
 
 
 class _Variable(_Part):
@@ -113,7 +117,12 @@ _ALLOWED: dict[str, Any] = {
     **{f"numpy.{core}.multiarray.{name}": made for core in ("core", "_core") for name, made in _NUMPY.items()},
     **{f"numpy.{core}.numeric._frombuffer": _numbers for core in ("core", "_core")},
     **{"numpy.ndarray": _Part, "numpy.dtype": _Dtype, "_codecs.encode": _encode},
-    **{f"scipy.sparse.{module}.csc_matrix": _Sparse for module in ("csc", "_csc")},
+    **{
+        f"scipy.sparse.{mark}{form}.{form}_{kind}": made
+        for form, made in _SPARSE.items()
+        for mark in ("", "_")
+        for kind in ("matrix", "array")
+    },
     **{"chumpy.ch.Ch": _Variable, "chumpy.reordering.Select": _Selection},
     **{f"{module}._reconstructor": _rebuilt for module in ("copy_reg", "copyreg")},
     **{f"{module}.{kind.__name__}": kind for module in ("__builtin__", "builtins") for kind in (set, object)},
@@ -122,6 +131,9 @@ _ALLOWED: dict[str, Any] = {
     **{"torch.LongStorage": "<i8", "torch.IntStorage": "<i4", "torch.ShortStorage": "<i2"},
     **{"torch.ByteStorage": "<u1", "torch.BoolStorage": "?", "collections.OrderedDict": dict},
 }
+
+
+_PLAIN = (bool, int, float, str, bytes, np.generic)
 
 
 class _Unpickler(pickle.Unpickler):
@@ -152,12 +164,17 @@ def _resolved(part: Any) -> Any:
         case _Array():
             _, shape, kind, fortran, data = part.state
             if kind.arguments[0] in ("O8", "O"):
-                return data[0] if shape == () else data
+                return _resolved(data[0]) if shape == () else data
             return _numbers(data, kind, shape, "F" if fortran else "C")
         case _Sparse():
-            values, rows, starts = (_resolved(part.state[key]) for key in ("data", "indices", "indptr"))
-            dense = np.zeros(part.state["_shape"], values.dtype)
-            dense[rows, np.repeat(np.arange(len(starts) - 1), np.diff(starts))] = values
+            state, values = part.state, _resolved(part.state["data"])
+            if isinstance(part, _SPARSE["coo"]):
+                places = tuple(map(_resolved, state["coords"] if "coords" in state else (state["row"], state["col"])))
+            else:
+                inner, starts = _resolved(state["indices"]), _resolved(state["indptr"])
+                places = inner, np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+            dense = np.zeros(state["_shape"], values.dtype)
+            np.add.at(dense, places[::-1] if isinstance(part, _SPARSE["csr"]) else places, values)
             return dense
         case _Variable():
             return _resolved(part.state["x"])
@@ -172,18 +189,26 @@ def _arrays(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
     value = _resolved(value)
     if isinstance(value, dict):
         for key, item in value.items():
-            if isinstance(key, str):
-                yield from _arrays(f"{name}/{key}", item)
+            if isinstance(key, str | bytes):
+                yield from _arrays(f"{name}/{key if isinstance(key, str) else key.decode('latin-1')}", item)
         return
-    plain = (bool, int, float, str, bytes, np.generic)
     if value is None:
         yield name, np.empty(0)
-    elif isinstance(value, (np.ndarray, *plain)) or (
-        isinstance(value, (list, tuple)) and all(isinstance(item, plain) for item in value)
-    ):
-        array = np.asarray(value)
-        if array.dtype != object:
-            yield name, array
+    elif isinstance(value, (np.ndarray, list, tuple, *_PLAIN)):
+        with contextlib.suppress(ValueError):  # rows of different lengths
+            array = np.asarray(_rows(value))
+            if array.dtype != object:
+                yield name, array
+
+
+def _rows(value: Any) -> Any:
+    """Nested lists of plain values and arrays, resolved; raises a ValueError for others."""
+    value = _resolved(value)
+    if isinstance(value, (list, tuple)):
+        return [_rows(item) for item in value]
+    if not isinstance(value, (np.ndarray, *_PLAIN)):
+        raise ValueError
+    return value
 
 
 def main(pickles: str, answer: str, memory: str, seconds: str, size: str) -> None:

@@ -49,6 +49,8 @@ def _facts(obj: GraspObject) -> Iterator[str]:
         yield f"its mass is {obj.mass!r:.20}, not above 0 and at most {HEAVIEST:g} kg"
     if not (_is_number(obj.file_scale) and 0 < obj.file_scale < 1e9):
         yield f"its file_scale is {obj.file_scale!r:.20}"
+    if obj.file_up not in ("y", "z"):
+        yield f"its file_up is {obj.file_up!r:.20}, not 'y' or 'z'"
     if len(obj.origin) != 3 or not all(_is_number(x) and abs(x) < 1e9 for x in obj.origin):
         yield "its origin is not three finite numbers"
     for name in ("surface_error", "volume_error"):

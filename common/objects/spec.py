@@ -76,6 +76,9 @@ class GraspObject:
     visual_vertices: np.ndarray
     visual_faces: np.ndarray
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    file_up: Literal["y", "z"] = "z"
+    """Axis of the imported file that is this object's z axis; the y axis of a file becomes z by a quarter turn about
+    x."""
     file_scale: float = 1.0
     """Metres per unit of the imported file."""
     notes: tuple[str, ...] = ()

@@ -132,6 +132,8 @@ def _to_message(obj: GraspObject) -> Message:
         meta["origin"] = list(obj.origin)
     if obj.file_scale != 1.0:
         meta["file_scale"] = obj.file_scale
+    if obj.file_up != "z":
+        meta["file_up"] = obj.file_up
     for name in _ERRORS:
         if getattr(obj, name) is not None:
             meta[name] = getattr(obj, name)
@@ -164,6 +166,7 @@ def _from_message(message: Message) -> GraspObject:
         mass=meta["mass"],
         origin=tuple(meta.get("origin", (0.0, 0.0, 0.0))),
         file_scale=meta.get("file_scale", 1.0),
+        file_up=meta.get("file_up", "z"),
         notes=tuple(meta.get("notes", ())),
         surface_error=meta.get("surface_error"),
         volume_error=meta.get("volume_error"),

@@ -1,18 +1,23 @@
 """File of an arm: its joints, limits and flange, without a gripper."""
 
+import contextlib
 import dataclasses
 import pathlib
 import xml.etree.ElementTree as ET
+from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError, MissingPackageError
-from congrasp.services.assets.hands.compile import robot_spec
+from congrasp.common.io.npz import read_npz
+from congrasp.services.assets.hands.compile import confined, robot_spec, robot_text
 
 SPEED = 3.14
 """Default speed limit of joints, rad/s (m/s of slides); MJCF files never have one."""
 _SITES = ("attachment_site", "flange", "tool0", "ee_site")
+_ARRAYS, _BODIES = "arm.npz", "arm.xml"
 _KINDS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
@@ -75,7 +80,7 @@ def _bare_entry(names: tuple[str, ...]) -> str:
 
 
 def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
-    """Reads an arm.
+    """Reads an arm, in a confined process.
 
     Args:
       path: MJCF or URDF.
@@ -86,13 +91,23 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
       CongraspError: the file cannot be read, has no such flange, or joints that are neither hinges nor slides, or the
         speed limits are invalid.
     """
-    spec = robot_spec(path, [])
+    with confined(write_arm, path, {"flange": flange, "speed": speed}) as (answer, folder):
+        arrays = read_npz(folder / _ARRAYS, "")
+        spec = mujoco.MjSpec.from_string((folder / _BODIES).read_text())
+    name = path.parent.name if path.stem in ("robot", "scene") else path.stem
+    return Arm(name, spec, tuple(answer["joints"]), flange=answer["flange"], **arrays)
+
+
+def write_arm(path: pathlib.Path, folder: pathlib.Path, options: dict[str, Any]) -> dict[str, Any]:
+    """Does the work of `load_arm` in the confined process: writes the bodies as MJCF, and arrays."""
+    spec, _ = robot_spec(path, [])
     for i, body in enumerate(spec.bodies):
         body.name = body.name or f"body_{i}"
     for i, joint in enumerate(spec.joints):
         joint.name = joint.name or f"joint_{i}"
-    model = spec.compile()
-    body, position, quaternion = _flange(model, path, flange)
+    with contextlib.chdir(path.parent):
+        model = spec.compile()
+    body, position, quaternion = _flange(model, path, options["flange"])
     carried = [i for i in _above(model, body) if model.body_jntnum[i]]
     joints = [int(model.body_jntadr[i]) + k for i in carried for k in range(model.body_jntnum[i])]
     if not joints or any(model.jnt_type[j] not in _KINDS for j in joints):
@@ -104,20 +119,19 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
     limited = model.jnt_limited[joints].astype(bool)
     lower, upper = (np.where(limited, model.jnt_range[joints, k], end) for k, end in ((0, -np.inf), (1, np.inf)))
     postures = model.key_qpos[:, model.jnt_qposadr[joints]]
-    name = model.body(body).name
+    speed = _speeds(path, names, options["speed"])
     _strip(spec, model, body)
-    return Arm(
-        path.parent.name if path.stem in ("robot", "scene") else path.stem,
-        spec,
-        names,
-        lower,
-        upper,
-        _speeds(path, names, speed),
-        name,
-        position,
-        quaternion,
-        postures,
+    np.savez(
+        folder / _ARRAYS,
+        lower=lower,
+        upper=upper,
+        speed=speed,
+        position=position,
+        quaternion=quaternion,
+        postures=postures,
     )
+    (folder / _BODIES).write_text(spec.to_xml())
+    return {"joints": names, "flange": model.body(body).name}
 
 
 def _above(model: mujoco.MjModel, body: int) -> list[int]:
@@ -169,10 +183,22 @@ def _last_body(model: mujoco.MjModel) -> tuple[int, np.ndarray, np.ndarray]:
 
 
 def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
-    """Removes all movable parts beyond the flange, and everything but kinematics."""
-    for group in (spec.keys, spec.sensors, spec.actuators, spec.equalities, spec.tendons, spec.excludes, spec.pairs):
+    """Removes all movable parts beyond the flange and everything but kinematics; no file is needed afterwards."""
+    groups = (spec.keys, spec.actuators, spec.equalities, spec.tendons, spec.excludes, spec.pairs)
+    for group in (*groups, spec.skins, spec.flexes, spec.textures, spec.plugins):
         for element in list(group):
             spec.delete(element)
+    for material in spec.materials:
+        for i in range(len(material.textures)):
+            material.textures[i] = ""
+    for m, mesh in enumerate(spec.meshes):
+        turn = Rotation.from_quat(model.mesh_quat[m], scalar_first=True)
+        start, end = model.mesh_vertadr[m], model.mesh_vertadr[m] + model.mesh_vertnum[m]
+        first, last = model.mesh_faceadr[m], model.mesh_faceadr[m] + model.mesh_facenum[m]
+        mesh.uservert = (turn.apply(model.mesh_vert[start:end]) + model.mesh_pos[m]).ravel()
+        mesh.userface = model.mesh_face[first:last].ravel()
+        mesh.name, mesh.file, mesh.content_type, mesh.scale = model.mesh(m).name, "", "", np.ones(3)
+        mesh.refpos, mesh.refquat = np.zeros(3), [1.0, 0.0, 0.0, 0.0]
     below = {flange}
     for body in range(flange + 1, model.nbody):
         if int(model.body_parentid[body]) in below:
@@ -196,8 +222,9 @@ def _speeds(path: pathlib.Path, joints: tuple[str, ...], text: str) -> np.ndarra
             raise CongraspError(f"--arm-speed is '{text}'.", f"Write one positive number, or {len(joints)}.")
         return np.broadcast_to(given, len(joints))
     stated = {}
-    if path.suffix.lower() == ".urdf":
-        for joint in ET.fromstring(path.read_text(errors="replace")).iter("joint"):
+    text = robot_text(path)
+    if text.startswith("<robot"):
+        for joint in ET.fromstring(text).iter("joint"):
             limit = joint.find("limit")
             stated[joint.get("name")] = 0.0 if limit is None else float(limit.get("velocity", 0.0))
-    return np.array([stated.get(name) or SPEED for name in joints])
+    return np.array([speed if (speed := stated.get(name, 0.0)) > 0 else SPEED for name in joints])

@@ -108,7 +108,7 @@ def build_robot(arm: Arm, hand: Hand, mount: Pose, obj: GraspObject) -> Robot:
     turn = Rotation.from_quat(arm.quaternion, scalar_first=True)
     quaternion = (turn * mount.rotation).as_quat(scalar_first=True)
     frame = carrier.add_frame(pos=arm.position + turn.apply(mount.position), quat=quaternion)
-    frame.attach_body(_hand_spec(hand, spec.compiler.degree).body("hand_base"), _HAND, "")
+    frame.attach_body(_hand_spec(hand).body("hand_base"), _HAND, "")
     depths |= {body.name: depths[arm.flange] for body in spec.bodies if body.name.startswith(_HAND)}
     table = spec.worldbody.add_body(name=_TABLE, mocap=True)
     table.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(2.0, 2.0, 0.1), contype=_SCENE_BIT, conaffinity=0)
@@ -130,17 +130,16 @@ def build_robot(arm: Arm, hand: Hand, mount: Pose, obj: GraspObject) -> Robot:
     return Robot(arm, model, joints, fingers, _HAND + hand.links[0].name)
 
 
-def _hand_spec(hand: Hand, degrees: bool) -> mujoco.MjSpec:
-    """Returns only the hand's bodies and finger joints, in the angle unit of the parent model."""
+def _hand_spec(hand: Hand) -> mujoco.MjSpec:
+    """Returns only the hand's bodies and finger joints."""
     spec = mujoco.MjSpec()
+    spec.compiler.degree = False  # of its own, whatever the arm's is
     add_hand(spec, hand)
     for group in (spec.actuators, spec.equalities, spec.tendons, spec.excludes):
         for element in list(group):
             spec.delete(element)
     for name in WRIST_JOINTS:
         spec.delete(spec.joint(name))
-    for joint in spec.joints:
-        joint.range = np.degrees(joint.range) if degrees else joint.range
     for geom in spec.geoms:
         geom.contype, geom.conaffinity = _HAND_BIT, 0
     return spec

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, printable
 from congrasp.services.ops.logs import announced
 
 Track = Callable[[str, int | None], Callable[[int], None]]
@@ -30,11 +30,17 @@ def at_most(most: float, unit: str, **amounts: float) -> None:
             raise CongraspError(f"--{name} is {value}.", f"It must be from 0 to {most:g} {unit}.")
 
 
+def say(*lines: object) -> None:
+    """Prints lines; what a terminal would obey is written as escapes, since names in them come from files."""
+    for line in lines:
+        print(printable(str(line)))
+
+
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Prints rows under the names of their columns."""
     table = Table(*columns)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(printable, row))
     Console(markup=False, highlight=False).print(table)
 
 
@@ -42,7 +48,7 @@ def show_facts(facts: Mapping[str, str]) -> None:
     """Prints names and values."""
     table = Table(show_header=False, box=None)
     for name, text in facts.items():
-        table.add_row(name, text)
+        table.add_row(name, printable(text))
     Console(markup=False, highlight=False).print(table)
 
 

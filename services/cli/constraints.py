@@ -57,6 +57,7 @@ def generate(
       congrasp constraints generate my-objects --references policy
     """
     from congrasp.common.hands import get_hand
+    from congrasp.common.io.inputs import distinct_names
     from congrasp.common.objects.procedural import generate_many
     from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.sampling.write_sets import make_sets, save
@@ -73,6 +74,12 @@ def generate(
             path = pathlib.Path(text)
             found += objects_of(path) if path.exists() else [find_object(text, folder)]
         found += generate_many(count, first_seed, families)
+        for obj, name in zip(found, distinct_names(obj.name for obj in found), strict=True):
+            if obj.name != name:
+                raise CongraspError(
+                    f"Several of the objects are called '{obj.name}'.",
+                    "Name each once; 'congrasp objects import A B --out DIR' gives different ones different names.",
+                )
         bank = _references(known, policy, found, seed, track) if references == "policy" else None
         track("Generating constraints", None)
         for constraints in make_sets(known, TaskConfig(hand=known.name), found, seed, bank):
@@ -203,21 +210,21 @@ def _save(
 
 def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathlib.Path) -> None:
     """Prints what was kept, what each rule dropped, and the locations of the results."""
-    from congrasp.services.cli.console import show_table
+    from congrasp.services.cli.console import say, show_table
 
     kept, dropped = report.kept, report.dropped
-    print(f"{len(kept)} of {len(kept) + len(dropped)} sequences kept.")
+    say(f"{len(kept)} of {len(kept) + len(dropped)} sequences kept.")
     if dropped:
         show_table(("dropped", "why", "for example"), [(str(n), rule, example) for rule, n, example in report.rules()])
     if kept and hand != "human":
-        print(
+        say(
             f"A human's finger angles do not fit the hand '{hand}' and were dropped. Heading, affordance and wrist "
             "trajectory were kept; its fingers close around the object where the trajectory ends."
         )
     elif kept:
         worst = max(kept, key=lambda row: row["residual_rad"])
         mean = sum(row["residual_rad"] for row in kept) / len(kept)
-        print(
+        say(
             f"Finger angles differ by {mean:.3f} rad per bone on average, at most {worst['residual_rad']:.3f} rad "
             f"({worst['sequence']})."
         )
@@ -225,27 +232,27 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
         if apart := [row for row in kept if row["moved_apart_rad"]]:
             deep, moved = (max(apart, key=lambda row: row[name]) for name in ("overlap_m", "moved_apart_rad"))
             mean = sum(row["moved_apart_rad"] for row in apart) / len(apart)
-            print(
+            say(
                 f"Fingers of {len(apart)} overlapped, by up to {1e3 * deep['overlap_m']:.1f} mm "
                 f"({deep['sequence']}). They were separated: their farthest joint by {mean:.2f} rad on average, "
                 f"at most {moved['moved_apart_rad']:.2f} rad ({moved['sequence']})."
             )
         if later := [row["frames_after_touch"] for row in kept if row["frames_after_touch"]]:
-            print(
+            say(
                 f"In {len(later)} of {len(kept)}, thumb and fingers oppose only after the first touch; the "
                 f"reference is taken then, {sum(later) / len(later):.0f} frames later on average."
             )
         above = sum(row["clear_of_table"] for row in kept)
         sets = len({row["object"] for row in kept})
-        print(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")
+        say(f"The table leaves room for {above} of {len(kept)} in some resting pose of their objects.")
         for below, why in ((True, "from below, which no episode does"), (False, "too near to the table")):
             left = [row["sequence"] for row in kept if not row["clear_of_table"] and row["from_below"] == below]
             if left:
-                print(f"No episode is drawn from {len(left)}, whose hand comes {why}: {', '.join(left)}.")
+                say(f"No episode is drawn from {len(left)}, whose hand comes {why}: {', '.join(left)}.")
         training = sum(row["split"] == "training" for row in kept)
-        print(f"{training} sequences are for training, {len(kept) - training} held out.")
-        print(f"Constraint sets ({sets}) are in {out}, their objects in {objects}.")
-    print(f"{out / REPORT} holds the outcome of each sequence.")
+        say(f"{training} sequences are for training, {len(kept) - training} held out.")
+        say(f"Constraint sets ({sets}) are in {out}, their objects in {objects}.")
+    say(f"{out / REPORT} holds the outcome of each sequence.")
 
 
 def show(

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from typing_extensions import Doc
 
-from congrasp.common.errors import CongraspError, need_package
+from congrasp.common.errors import CongraspError, need_package, printable
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.arm.options import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
@@ -164,9 +164,11 @@ def _show(result: "Result") -> None:
         print(f"congrasp: error: {result.error}", file=sys.stderr)
         return
     done = " (done before)" if result.skipped else ""
-    Console(highlight=False).print(f"[bold]{escape(result.name)}[/]{done}: {escape(result.line())}", soft_wrap=True)
+    Console(highlight=False).print(
+        f"[bold]{escape(result.name)}[/]{done}: {escape(printable(result.line()))}", soft_wrap=True
+    )
     for note in result.facts["notes"]:
-        Console(highlight=False).print(f"  {escape(note)}", soft_wrap=True)
+        Console(highlight=False).print(f"  {escape(printable(note))}", soft_wrap=True)
 
 
 def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:

@@ -92,7 +92,7 @@ def import_hand(
     couplings and capsules are all in it.
 
     Args:
-      file: The hand's URDF (.urdf) or MJCF (.xml), a right or left hand of hinges.
+      file: The hand's URDF or MJCF, a right or left hand of hinges.
       name: Its name; that of the file by default.
       palm: Body of the palm; by default the one from which most fingers branch.
       thumb: The last body of the finger that opposes the others; by default one called thumb, or the one that best
@@ -126,9 +126,10 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     from congrasp.common.errors import CongraspError
     from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder
     from congrasp.common.hands.files import hand_text
+    from congrasp.common.hands.meshes import save_meshes
     from congrasp.common.io.files import write_atomically
     from congrasp.services.assets.hands.model_files import describe
-    from congrasp.services.assets.hands.visual import save_meshes
+    from congrasp.services.cli.console import say
     from congrasp.services.viz.hand_sheets import joints_sheet
     from congrasp.services.viz.sheets import save_png
 
@@ -136,15 +137,15 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     if hand.name in HANDS:
         raise CongraspError(f"'{hand.name}' is a hand of congrasp.", "Pass another --name.")
     path = out or hands_folder() / f"{hand.name}{SUFFIX}"
+    if path.exists():
+        say(f"The file {path} of an earlier import is replaced (--name or --out keeps it).")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, hand_text(hand).encode())
     save_meshes(path, proposal.meshes)
     get_hand.cache_clear()
     picture = png or path.with_suffix(".png")
     save_png(picture, joints_sheet(hand))
-    for line in describe(proposal):
-        print(line)
-    print(f"\n{path}\n{picture}")
+    say(*describe(proposal), "", path, picture)
 
 
 def check(
@@ -207,8 +208,8 @@ def train(
     Repeat the command to resume a stopped one.
 
     Args:
-      hand: The hand's URDF (.urdf) or MJCF (.xml), which is imported unless there is a custom hand of its name; or a
-        hand's name or file.
+      hand: The hand's URDF or MJCF, which is imported unless there is a custom hand of its name; or a hand's name or
+        file.
       name: As in 'congrasp hands import', like the next three.
       palm: Body of the palm.
       thumb: The last body of the finger that opposes the others.
@@ -262,11 +263,11 @@ def train(
 
 def _taken(hand: str, choices: "Choices") -> str:
     """Name of a hand in commands; that of a URDF or MJCF is imported, unless it was before."""
-    from congrasp.common.hands import own_hands
+    from congrasp.common.hands import SUFFIX, own_hands
     from congrasp.services.assets.hands.model_files import import_hand as proposed
 
     file = pathlib.Path(hand)
-    if file.suffix.lower() not in (".urdf", ".xml", ".mjcf"):
+    if not file.is_file() or file.suffix == SUFFIX:
         return hand
     proposal = proposed(file, choices)
     name = proposal.hand.name

@@ -53,7 +53,8 @@ def import_meshes(
     """Import objects from meshes: decompose and weigh them, find their resting poses, and store them in a folder.
 
     A path is a mesh file (STL, OBJ, PLY, GLB), a folder with `graspable.*` and `non_graspable.*`, a folder with convex
-    pieces `contact*`, `<name>.*` and `<name>_<part>.*`, or a folder of such files and folders.
+    pieces `contact*`, `<name>.*` and `<name>_<part>.*`, or a folder of such files and folders. The exit code is 1 if a
+    shape is unreliable: its pieces are more than 5 mm or half of its volume off.
 
     Args:
       paths: Mesh files and folders.
@@ -66,34 +67,43 @@ def import_meshes(
     """
     from congrasp.common.objects.store import Catalogue
     from congrasp.services.assets.objects.meshes import import_sources
-    from congrasp.services.assets.objects.sources import find_sources
-    from congrasp.services.cli.console import bars, report_error
+    from congrasp.services.assets.objects.sources import distinct, find_sources
+    from congrasp.services.cli.console import bars, report_error, say
 
     if not paths:
         raise CongraspError("There is nothing to import.", "Pass mesh files or folders.")
-    sources, done, failures = [], 0, 0
-    for path in paths:
+    sources, done, failures, unreliable = [], 0, 0, 0
+    for path in dict.fromkeys(paths):
         try:
             sources += find_sources(path)
         except CongraspError as error:
             report_error(error)
             failures += 1
-    catalogue = Catalogue(out)
+    catalogue, named = Catalogue(out), distinct(sources)
+    for before, source in zip(sources, named, strict=True):
+        if source.name != before.name:
+            say(f"{source.name}: that is {source.path}, for there is another {before.name}.")
     with bars() as progress:
-        task = progress.add_task("Importing", total=len(sources))
-        for _, obj in import_sources(sources, mesh):
+        task = progress.add_task("Importing", total=len(named))
+        for _, obj in import_sources(named, mesh):
             if isinstance(obj, CongraspError):
                 report_error(obj)
                 failures += 1
             else:
-                catalogue.add(obj)
+                earlier = file.read_bytes() if (file := catalogue.path(obj.name)).is_file() else None
+                if earlier not in (None, catalogue.add(obj).read_bytes()):
+                    say(f"{obj.name}: it replaced another object of that name in {out}.")
                 done += 1
                 for note in obj.notes:
-                    print(f"{obj.name}: {note}.")
+                    say(f"{obj.name}: {note}.")
+                if not obj.shape_reliable:
+                    unreliable += 1
+                    print(f"{obj.name}: its shape is unreliable. Repair the mesh, or set --time-limit or --max-pieces.")
             progress.advance(task)
     if done:
-        print(f"{done} of {done + failures} imported to {out}.")
-    return 2 if failures else 0
+        doubtful = f", {unreliable} of them with an unreliable shape" if unreliable else ""
+        print(f"{done} of {done + failures} imported to {out}{doubtful}.")
+    return 2 if failures else 1 if unreliable else 0
 
 
 def list_objects(
@@ -159,7 +169,7 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     from congrasp.common.objects.store import digest
     from congrasp.common.task.sampling.headings import sample_headings
     from congrasp.services.assets.objects.named import find_object
-    from congrasp.services.cli.console import show_facts
+    from congrasp.services.cli.console import say, show_facts
 
     obj = find_object(object, folder)
     share = obj.graspable[obj.labels].mean()
@@ -184,7 +194,7 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
             f"{100 * obj.rest_poses[i][2]:.1f} cm high; headings within reach of the human hand {texts[0]}, on the "
             f"graspable region {texts[1]}"
         )
-    print(obj.name)
+    say(obj.name)
     show_facts(facts)
     if png is not None:
         from congrasp.services.viz.object_sheet import object_sheet

@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import json
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from PIL import Image
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
-from congrasp.common.io.inputs import file_name
+from congrasp.common.io.inputs import distinct_names, file_name
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.store import Catalogue
@@ -108,20 +108,14 @@ def find_objects(paths: Sequence[pathlib.Path], folder: str = "objects") -> tupl
             found += objects_at(stored if stored.is_file() else path)
         except CongraspError as error:
             errors.append(Result(path.name, {}, str(error)))
-    return [one._replace(name=name) for one, name in zip(found, _distinct(found), strict=True)], errors
+    return [
+        one._replace(name=name) for one, name in zip(found, distinct_names(one.name for one in found), strict=True)
+    ], errors
 
 
 def _is_name(path: pathlib.Path) -> bool:
     """True if a path can be an object's name: there is no such file, and it has neither a folder nor a suffix."""
     return not path.exists() and path.name == str(path) and not path.suffix and ":" not in path.name
-
-
-def _distinct(found: Sequence[ObjectAt]) -> Iterator[str]:
-    """The names, with a number at each repetition."""
-    taken: dict[str, int] = {}
-    for name, *_ in found:
-        taken[name] = taken.get(name, 0) + 1
-        yield name if taken[name] == 1 else f"{name}-{taken[name]}"
 
 
 def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: Progress) -> Result:

@@ -29,7 +29,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import Surface, approach
 from congrasp.services.assets.captures.sequence import Dropped
 from congrasp.services.assets.captures.transfer import followed
-from congrasp.services.assets.objects.headers import check_header
+from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
 from congrasp.services.assets.objects.sizes import size_in_words
 from congrasp.services.export.motion_file import GraspMotion, load_motion
 from congrasp.services.grasp.wrist_paths import HUGE, read_csv, read_wrist_path
@@ -47,10 +47,16 @@ class Target(NamedTuple):
     waypoints: int
     """K, of wrist trajectories."""
 
-    @property
-    def origin(self) -> np.ndarray:
-        """(3,) m, origin of the object frame in the coordinates of its file."""
-        return -np.asarray(self.obj.origin)
+    def placed(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3), m, of the axes and origin of the object's file in the object frame."""
+        return upright(points, self.obj.file_up) + self.obj.origin
+
+    def turned(self, quaternions: np.ndarray) -> np.ndarray:
+        """Orientations (..., 4) in the axes of the object's file in the object frame."""
+        if self.obj.file_up == "z":
+            return quaternions
+        w, x, y, z = np.moveaxis(np.asarray(quaternions) / np.sqrt(2), -1, 0)
+        return np.stack([w - x, x + w, y - z, z + y], -1)  # after a quarter turn about x
 
 
 def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> GraspRequest:
@@ -102,14 +108,14 @@ def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]
 
 def _place(text: str, name: str, target: Target) -> np.ndarray:
     """(3,) m, object frame, of a place in the coordinates of the object's file."""
-    position = _numbers(text, 3, name) - target.origin
+    position = target.placed(_numbers(text, 3, name))
     _check_near(target.obj, position, name)
     return position
 
 
 def _direction(text: str, name: str, target: Target) -> np.ndarray:
     """(3,) unit vector."""
-    return _unit(_numbers(text, 3, name), name)
+    return _unit(upright(_numbers(text, 3, name), target.obj.file_up), name)
 
 
 def _numbers(text: str, count: int, name: str) -> np.ndarray:
@@ -157,17 +163,16 @@ def _part(text: str, name: str, target: Target) -> Part:
         return Part(text, np.where(inside, 0.0, 1.0))
     if not path.is_file():
         raise CongraspError(f"{name}: there is no file {path}.", "Check the path.")
-    check_header(path, path.suffix.lower(), "Export it as PLY.")
     try:
-        geometry: Any = trimesh.load_scene(path, process=False).to_geometry()
-        points = np.asarray(geometry.vertices, float)
-        if len(getattr(geometry, "faces", ())):
-            points = np.concatenate([points, trimesh.sample.sample_surface(geometry, 8000, seed=0)[0]])
-    except OSError as error:
-        raise CongraspError(f"{name}: {path} cannot be read: {error.strerror or error}.", "Check the path.") from None
-    except Exception as error:  # trimesh's readers raise exceptions of many types
-        raise CongraspError(f"{name}: {path} cannot be read as a mesh ({error}).", "Export it as PLY.") from None
-    points = points[np.isfinite(points).all(-1)]
+        geometry = load_geometry(path, "Export the part as PLY.")
+        up = "y" if obj.file_up == "y" else up_of(path)
+    except CongraspError as error:
+        raise CongraspError(f"{name}: {error}") from None
+    geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
+    points = np.asarray(getattr(geometry, "vertices", ()), float).reshape(-1, 3)
+    if len(getattr(geometry, "faces", ())):
+        points = np.concatenate([points, trimesh.sample.sample_surface(geometry, 8000, seed=0)[0]])
+    points = upright(points[np.isfinite(points).all(-1)], up)
     if not len(points):
         raise CongraspError(f"{name}: {path} holds no points.", "Export the part as PLY.")
     return Part(text, cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0])
@@ -175,7 +180,7 @@ def _part(text: str, name: str, target: Target) -> Part:
 
 def _pose(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
     """A reference pose from a motion, a constraint set, or JSON."""
-    hand, obj, origin = target.hand, target.obj, target.origin
+    hand, obj = target.hand, target.obj
     path, index = numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, hand, index)
@@ -192,12 +197,12 @@ def _pose(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
             raise CongraspError(f"{name}: the hand '{hand.name}' has no joint '{unknown[0]}'.", f"Known: {names}.")
         joints = [joints.get(name, 0.0) for name in names]
     q = _floats(joints, (len(names),), f"{name}: 'joints' of {path}")
-    position = _floats(given["position"], (3,), f"{name}: 'position' of {path}") - origin
+    position = target.placed(_floats(given["position"], (3,), f"{name}: 'position' of {path}"))
     _check_near(obj, position, f"{name}: the wrist of {path}")
     if np.abs(q).max() > 2 * np.pi:
         raise CongraspError(f"{name}: a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians.")
     turn = _unit(_floats(given["quaternion"], (4,), f"{name}: 'quaternion' of {path}"), f"{name}: the quaternion")
-    return _reference(coupled(hand, np.clip(q, hand.lower, hand.upper)), position, turn)
+    return _reference(coupled(hand, np.clip(q, hand.lower, hand.upper)), position, target.turned(turn))
 
 
 def _reference(q: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> dict[str, np.ndarray]:
@@ -208,7 +213,6 @@ def _reference(q: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> d
 def _path(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
     """A wrist trajectory from a motion, a constraint set, CSV, BVH, or JSON."""
     obj, hand, waypoints = target
-    origin = target.origin
     path, index = numbered(text)
     file, _, joint = text.partition(":")
     if file.lower().endswith(".bvh"):
@@ -232,15 +236,16 @@ def _path(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
         count = len(given["position"]) if isinstance(given["position"], list) else 0
         position = _floats(given["position"], (count, 3), f"{name}: 'position' of {path}")
         quaternion = _floats(given["quaternion"], (count, 4), f"{name}: 'quaternion' of {path}")
-    _check_near(obj, position[-1] - origin, f"{name}: the end of {path}")
-    return _resampled(position - origin, quaternion, waypoints, name, path)
+    position = target.placed(position)
+    _check_near(obj, position[-1], f"{name}: the end of {path}")
+    return _resampled(position, target.turned(quaternion), waypoints, name, path)
 
 
 def _recorded(path: pathlib.Path, joint: str, name: str, target: Target) -> dict[str, np.ndarray]:
     """The path of a BVH joint up to the frame in which it is nearest to the object, cut like captures."""
     recorded = read_wrist_path(path, joint=joint)
     position, rotation = followed(target.hand, recorded.position, recorded.rotation)
-    position = position - target.origin
+    position = position + target.obj.origin  # both are upright
     away = Surface(target.obj).distance(position)
     frame = int(away.argmin())
     _check_near(target.obj, position[frame], f"{name}: the joint '{joint}' of {path}")

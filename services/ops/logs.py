@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
+from congrasp.common.errors import printable
+
 LogFormat = Literal["text", "json"]
 _logger = logging.getLogger("congrasp")
 
@@ -41,6 +43,7 @@ class Lines(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Returns one line, followed by the trace of an error."""
         record.levelname = record.levelname.lower()
+        record.msg, record.args = printable(record.getMessage()), ()
         return super().format(record)
 
 

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.shapes import tessellate
 from congrasp.common.objects.spec import Colours, GraspObject
+from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.repair import with_few_faces
 from congrasp.services.assets.objects.sizes import length, size_in_words
-from congrasp.services.assets.objects.sources import Source, read_mesh
+from congrasp.services.assets.objects.sources import Source
 from congrasp.services.record.palette import AVOID, GRASPABLE, OBJECT, PIECES
 from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.scene import Shape

@@ -1,8 +1,11 @@
 """The MANO hand from a file of MANO's layout."""
 
+import pickle
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
@@ -38,6 +41,38 @@ def test_a_files_arrays_are_read_exactly(file):
     np.testing.assert_array_equal(model.regressor, expected["J_regressor"])
     np.testing.assert_array_equal(model.hand_mean, expected["hands_mean"])
     np.testing.assert_array_equal(model.components, expected["hands_components"])
+
+
+_VARIANTS = {
+    **{form: {"J_regressor": getattr(scipy.sparse, form)} for form in ("csr_matrix", "coo_matrix", "csc_array")},
+    **{form: {"J_regressor": getattr(scipy.sparse, form)} for form in ("csr_array", "coo_array")},
+    "lists": dict.fromkeys(("v_template", "shapedirs", "J_regressor", "hands_mean"), np.ndarray.tolist),
+}
+
+
+@pytest.mark.parametrize("variant", [*_VARIANTS, "bytes", "npz"])
+def test_other_kinds_of_its_arrays_are_read_as_well(variant, tmp_path):
+    values = {name: value for name, value in content().items() if isinstance(value, np.ndarray)}
+    path = tmp_path / "hand.pkl"
+    if variant == "npz":
+        inside = np.array(scipy.sparse.csc_matrix(values["J_regressor"]), object)
+        np.savez(tmp_path / "hand.npz", **values | {"J_regressor": inside})
+        path = tmp_path / "hand.npz"
+    elif variant == "bytes":
+        path.write_bytes(pickle.dumps({name.encode(): value for name, value in values.items()}))
+    else:
+        changed = {name: change(values[name]) for name, change in _VARIANTS[variant].items()}
+        path.write_bytes(pickle.dumps(values | changed))
+    model = read_mano(path)
+    np.testing.assert_array_equal(model.regressor, content()["J_regressor"])
+    np.testing.assert_array_equal(model.shape_directions, content()["shapedirs"])
+
+
+def test_a_variant_that_cannot_be_read_is_named_with_its_conversion(tmp_path):
+    values = content() | {"J_regressor": scipy.sparse.lil_matrix(content()["J_regressor"])}
+    (tmp_path / "hand.pkl").write_bytes(pickle.dumps(values))
+    with pytest.raises(CongraspError, match=r"names 'scipy\.sparse\._lil\.lil_matrix'.*python -c .*hand\.npz"):
+        read_mano(tmp_path / "hand.pkl")
 
 
 def test_the_skeleton_is_that_of_the_file_about_the_wrist(hand):

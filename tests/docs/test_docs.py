@@ -72,6 +72,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     commands = (tmp_path / "reference" / "commands.html").read_text()
     assert all(f"congrasp {name}" in commands for name in main.COMMANDS)
+    assert "tall.glb" in (tmp_path / "files.html").read_text()
     assert "--ppo.learning-rate" in (tmp_path / "reference" / "configuration.html").read_text()
 
 

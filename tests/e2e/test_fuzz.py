@@ -33,7 +33,7 @@ from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
-from congrasp.services.assets.objects.sources import read_mesh
+from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.grasp.wrist_paths import read_bvh, read_wrist_path
 from congrasp.services.record.entries import Converter
 from congrasp.services.record.reader import read_episodes, read_metrics

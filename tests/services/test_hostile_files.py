@@ -15,7 +15,7 @@ from congrasp.common.config import NetworkConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text, read_hand
-from congrasp.common.io.inputs import file_name, read_file
+from congrasp.common.io.inputs import distinct_names, file_name, read_file, safe_name
 from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
 from congrasp.common.policy import bundle as bundles
@@ -45,6 +45,15 @@ def test_names_are_names(name):
 def test_paths_and_anything_else_are_not(name):
     with pytest.raises(CongraspError, match="cannot name an object"):
         file_name(name, "an object")
+
+
+def test_letters_of_any_script_stay_in_names_and_equal_names_become_distinct():
+    for text, name in (("कटोरी 1/2", "कटोरी_1_2"), ("e\u0301", "é"), ("..\x1b[1m", "1m"), ("☕", "object")):
+        assert safe_name(text) == name
+        file_name(name, "an object")
+    long = [safe_name(letter * 150 + end) for letter in "x碗" for end in "ab"]
+    assert len({file_name(name, "an object") for name in long}) == 4
+    assert distinct_names(["mug", "Mug", "mug", "mug-2", "cup"]) == ["mug", "Mug-3", "mug-4", "mug-2", "cup"]
 
 
 def test_an_object_that_names_another_folder_is_not_read(tmp_path):

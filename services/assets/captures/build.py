@@ -15,6 +15,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.outline import CENTER, outline
 from congrasp.common.hands.spec import Hand
+from congrasp.common.io.inputs import distinct_names, safe_name
 from congrasp.common.objects import store
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
@@ -39,7 +40,6 @@ from congrasp.services.assets.captures.sequence import Dropped, Sequence
 from congrasp.services.assets.captures.transfer import demonstrated_headings, transferred
 from congrasp.services.assets.objects.affordance import near_points, relabelled, two_parts
 from congrasp.services.assets.objects.meshes import UNLABELLED
-from congrasp.services.assets.objects.sources import safe_name
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
 _Shapes = dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
@@ -120,7 +120,7 @@ def import_sets(
         progress(f"Reading {item.name}")
         read.append(item)
     shapes = _shapes([item for item in read if isinstance(item, Sequence)], progress)
-    groups: dict[str, _Group] = {}
+    groups: dict[tuple[str, bytes, bytes], _Group] = {}
     beyond, scale = options.beyond if hand is HUMAN else np.inf, object_scale(hand, TaskConfig(hand=hand.name))
     for item in read:
         try:
@@ -131,9 +131,12 @@ def import_sets(
             demonstration = extract(item, obj, surface, options.waypoints, beyond)
             check_reference(hand, demonstration, obj, scale)
             labelled = _labelled(item, obj, demonstration, options.affordance)
-            groups.setdefault(labelled.name, _Group(labelled)).demonstrations.append(demonstration)
+            key = labelled.name, labelled.labels.tobytes(), labelled.graspable.tobytes()
+            groups.setdefault(key, _Group(labelled)).demonstrations.append(demonstration)
         except Dropped as dropped:
             report.drop(dropped)
+    for group, name in zip(groups.values(), distinct_names(name for name, *_ in groups), strict=True):
+        group.obj = dataclasses.replace(group.obj, name=name)
     objects, sets = [], []
     # Sets may hold a single sequence each: 80 % refers to all sequences, not to each set.
     splits = _split(groups.values(), options.seed)
@@ -196,9 +199,11 @@ def _split(groups: Collection[_Group], seed: int) -> list[np.ndarray]:
 
 def _shapes(sequences: list[Sequence], progress: Callable[[str], None]) -> _Shapes:
     """Imports the sequences' meshes once each; returns objects and surfaces, or the reasons for failures."""
-    names = {sequence.mesh: safe_name(sequence.object_name) for sequence in reversed(sequences)}
+    names = {sequence.mesh: sequence.object_name for sequence in sequences}
+    distinct = distinct_names(safe_name(name) for name in names.values())
     shapes: _Shapes = {}
-    for mesh, obj in import_meshes(names, lambda name: progress(f"Mesh of {name}")).items():
+    imported = import_meshes(dict(zip(names, distinct, strict=True)), lambda name: progress(f"Mesh of {name}"))
+    for mesh, obj in imported.items():
         if isinstance(obj, CongraspError):
             shapes[mesh] = obj
         else:

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.mano import VARIABLE, ManoModel
 from congrasp.common.io.inputs import file_name, read_file
+from congrasp.common.io.pickles import read_archive
 from congrasp.services.assets.captures import mano
-from congrasp.services.assets.captures.archive import read_archive
 from congrasp.services.assets.captures.objects import Meshes
 from congrasp.services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
 

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.mano import ManoModel
+from congrasp.common.io.pickles import read_archive
 from congrasp.services.assets.captures import mano
-from congrasp.services.assets.captures.archive import read_archive
 from congrasp.services.assets.captures.objects import Meshes
 from congrasp.services.assets.captures.sequence import FINGERS, Dropped, Sequence, array_of, read_or_drop
 

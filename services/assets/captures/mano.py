@@ -15,7 +15,7 @@ from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.mano import MANO_FINGERS, TIP_VERTICES, ManoModel
 from congrasp.services.assets.captures.fit import joint_positions
 from congrasp.services.assets.captures.sequence import FINGERS
-from congrasp.services.assets.objects.sources import load_geometry
+from congrasp.services.assets.objects.mesh_files import load_geometry
 
 TO_HUMAN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Vectors of MANO's wrist frame in that of the human hand."""

@@ -23,7 +23,7 @@ from congrasp.common.io.pickles import MAX_BYTES, read_pickles
 from congrasp.services.assets.captures import mano
 from congrasp.services.assets.captures.objects import Meshes
 from congrasp.services.assets.captures.sequence import Dropped, Part, Sequence, read_or_drop
-from congrasp.services.assets.objects.sources import read_mesh
+from congrasp.services.assets.objects.mesh_files import read_mesh
 
 HOLDS = "anno/seq_all.json"
 _LARGEST_JSON = 256 << 20
@@ -135,7 +135,7 @@ def _shaped(
 @functools.lru_cache(maxsize=64)
 def _middle(mesh: pathlib.Path) -> np.ndarray:
     """Centre (3,) of the bounding box of a mesh."""
-    return np.asarray(read_mesh(mesh).bounds, float).mean(0)
+    return np.asarray(read_mesh(mesh, up="z").bounds, float).mean(0)
 
 
 @functools.lru_cache(maxsize=64)

@@ -8,9 +8,10 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.captures.sequence import Dropped
+from congrasp.services.assets.objects.mesh_files import SUFFIXES
 from congrasp.services.assets.objects.meshes import import_sources
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.sources import SUFFIXES, Source, find_sources
+from congrasp.services.assets.objects.sources import Source, find_sources
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Meshes:
 def import_meshes(
     meshes: Mapping[pathlib.Path, str], progress: Callable[[str], None]
 ) -> dict[pathlib.Path, GraspObject | CongraspError]:
-    """Imports meshes in metres, one per core at a time; imports are cached.
+    """Imports meshes in metres, one per core at a time, with their files' axes, to which captured poses refer.
 
     Args:
       meshes: files or folders, with the data set's names of their objects.
@@ -77,7 +78,7 @@ def import_meshes(
         except CongraspError as error:
             found[mesh] = error
     paths = list(sources)
-    made = import_sources([sources[path] for path in paths], ImportOptions(unit="m"))
+    made = import_sources([sources[path] for path in paths], ImportOptions(unit="m", up="z"))
     for done, (i, outcome) in enumerate(made, 1):
         found[paths[i]] = outcome
         progress(f"{meshes[paths[i]]} ({done} of {len(paths)})")

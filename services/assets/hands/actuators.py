@@ -88,7 +88,10 @@ def couplings(model: mujoco.MjModel, hand: set[int], driven: set[int], notes: li
     """
     found: dict[int, Follow] = {}
     for a, b, ratio, offset in (*_equalities(model, notes), *_limited_tendons(model, driven)):
-        if a not in hand or b not in hand or not ratio:
+        if a not in hand or b not in hand:
+            continue
+        if not ratio:
+            notes.append(f"'{model.joint(a).name}' follows '{model.joint(b).name}' with the ratio 0: that is dropped")
             continue
         if (a in driven and b not in driven) or a in found:
             a, b, ratio, offset = b, a, 1.0 / ratio, -offset / ratio
@@ -112,7 +115,9 @@ def couplings(model: mujoco.MjModel, hand: set[int], driven: set[int], notes: li
 
 
 def _fits(model: mujoco.MjModel, link: Follow) -> bool:
-    """True if a follower's limits leave its leader a part of its range."""
+    """True if a follower's limits leave its leader a part of its range; a follower without limits takes all of it."""
+    if not model.jnt_limited[link.a]:
+        return True
     lower, upper = _limits(model, link.b)
     ends = sorted((limit - link.offset) / link.ratio for limit in _limits(model, link.a))
     return bool(min(upper, ends[1]) - max(lower, ends[0]) > _ROOM * (upper - lower))
@@ -240,6 +245,15 @@ class Drive:
         return tuple(
             Coupling(self._names[x.a], self._names[x.b], round(x.ratio, 6), round(x.offset, 6)) for x in self.links
         )
+
+    def limits(self, j: int) -> np.ndarray | None:
+        """Limits (2,) of a joint relative to the file's pose, or those that its leader's give it; None without any."""
+        if self._model.jnt_limited[j]:
+            return _limits(self._model, j)
+        link = self._leaders.get(j)
+        if link is None or not self._model.jnt_limited[link.b]:
+            return None
+        return np.sort(link.offset + link.ratio * _limits(self._model, link.b))
 
     def joint(self, j: int, lower: float, upper: float, joint: Joint) -> Joint:
         """Returns a joint with the gains of its motor, zeros if it has none, within the motor's range."""

@@ -1,19 +1,27 @@
-"""Compiles robot descriptions with MuJoCo in a child process, since a few lines can exceed a machine's resources.
+"""Reads robot descriptions with MuJoCo, in a child process, since a few lines can exceed a machine's resources.
 
-`python -m congrasp.services.assets.hands.compile FILE RESULT` is that process. It writes the compiled model to RESULT,
-and its omissions, or the reason for a failure, to RESULT.json.
+`python -m congrasp.services.assets.hands.compile FUNCTION FILE FOLDER` is that process. FUNCTION ("module:name") uses
+the file, writes its arrays into FOLDER and returns what goes to FOLDER/answer.json.
 """
 
+import contextlib
+import importlib
 import json
+import math
 import os
 import pathlib
 import re
 import resource
 import signal
+import stat
 import subprocess
 import sys
 import tempfile
+import urllib.parse
 import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -21,6 +29,7 @@ import trimesh
 
 import congrasp
 from congrasp.common.errors import CongraspError
+from congrasp.services.assets.objects.mesh_files import load_geometry
 
 MEMORY = 3 << 30
 """Limit of the address space for reading a file, bytes."""
@@ -34,210 +43,384 @@ LIMITS = {"nbody": 1000, "nv": 500, "ngeom": 10_000, "nmesh": 1000, "nmeshvert":
 """Limits of a model's parts, by MuJoCo's names."""
 LEAST = 1e-3, 1e-7
 """Mass (kg) and inertia (kg m2) of moving links without mass."""
+_START = 30  # s, for the child's imports on a busy machine
+_MOST_FILES = 300  # that a description names
 _COUNTS = re.compile(r"""\bcount\s*=\s*["']([^"']*)["']""")
+_NAMED = re.compile(r"""<(\w+)[^<>]*?\bfile\w*\s*=\s*["']([^"']+)["']""")
+_FOLDERS = re.compile(r"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']+)["']""")
+_CLASSES = re.compile(r"""<default\b[^<>]*?\bclass\s*=\s*["']([^"']+)["']""")
+_OPENING = re.compile(r"opening file '([^']*)'")
+_XACRO = re.compile(r"<xacro:|\$\{|\$\((?:find|arg|eval)\b")
 _FINITE = (
-    *(
-        "body_pos",
-        "body_quat",
-        "body_mass",
-        "body_inertia",
-        "jnt_pos",
-        "jnt_axis",
-        "jnt_range",
-        "geom_pos",
-        "geom_size",
-    ),
-    *("geom_quat", "mesh_vert", "dof_armature", "dof_damping", "actuator_biasprm", "actuator_forcerange"),
+    *("body_pos", "body_quat", "body_mass", "body_inertia", "jnt_pos", "jnt_axis", "jnt_range", "geom_pos"),
+    *("geom_size", "geom_quat", "mesh_vert", "dof_armature", "dof_damping", "actuator_biasprm"),
+    "actuator_forcerange",
 )
 _NATIVE = (".stl", ".obj", ".msh")
+_FACES = 200_000  # most triangles of a mesh in MuJoCo
+_ANSWER = "answer.json"
 _ROOT = pathlib.Path(congrasp.__file__).parents[1]
 _REMEDY = "MuJoCo must be able to load it."
 
 
-def compiled_model(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
-    """Compiles a URDF or MJCF file, without missing meshes.
+@contextlib.contextmanager
+def confined(
+    function: Callable[[pathlib.Path, pathlib.Path, dict[str, Any]], dict[str, Any]],
+    path: pathlib.Path,
+    options: dict[str, Any],
+) -> Iterator[tuple[dict[str, Any], pathlib.Path]]:
+    """Calls a function of a module with a robot description, in a child process under limits.
 
     Args:
-      path: the file.
-      notes: omissions are appended.
+      function: called as function(path, folder, options); writes arrays into the folder, and returns what JSON takes.
+      path: the description.
+      options: further arguments, as JSON takes them.
+
+    Yields:
+      The function's answer, and the folder.
 
     Raises:
-      CongraspError: it cannot be read, or not within `MEMORY` and `SECONDS`, or it has more parts than `LIMITS`.
+      CongraspError: of the function; or the file is missing, or takes more than `MEMORY` or `SECONDS`.
     """
-    if path.suffix.lower() not in (".xml", ".urdf", ".mjcf"):
-        raise CongraspError(f"{path} is neither URDF nor MJCF.", "Pass a file that ends in .urdf or .xml.")
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Check the path.")
     if path.stat().st_size > MAX_FILE:
         raise CongraspError(f"{path} has more than {MAX_FILE >> 20} MB.", "Pass a robot description.")
-    with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
-        result = pathlib.Path(folder, "model.mjb")
+    with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
+        folder = pathlib.Path(name)
         search = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
-        command = [sys.executable, "-m", "congrasp.services.assets.hands.compile", str(path.resolve()), str(result)]
+        own = {"PYTHONPATH": search, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+        called = f"{function.__module__}:{function.__name__}"
         try:
             subprocess.run(
-                command,
-                timeout=SECONDS,
-                stdin=subprocess.DEVNULL,
+                [sys.executable, "-m", "congrasp.services.assets.hands.compile", called, str(path.resolve()), name],
+                input=json.dumps(options).encode(),
+                timeout=SECONDS + _START,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 cwd=folder,
-                env={**os.environ, "PYTHONPATH": search, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+                env={**os.environ, **own},
                 check=False,
             )
         except subprocess.TimeoutExpired:
             raise CongraspError(f"{path} was not read within {SECONDS} s.", _REMEDY) from None
         try:
-            said = json.loads(result.with_suffix(".json").read_text())
+            answer = json.loads((folder / _ANSWER).read_text())
         except (OSError, ValueError):
-            why = f"reading it takes more than {MEMORY >> 30} GB, or MuJoCo fails on it"
+            why = f"reading it takes more than {SECONDS} s or {MEMORY >> 30} GB, or MuJoCo fails on it"
             raise CongraspError(f"{path} cannot be read: {why}.", _REMEDY) from None
-        if "error" in said:
-            raise CongraspError(f"{path} cannot be read: {said['error']}.", _REMEDY)
-        notes += said["notes"]
-        return mujoco.MjModel.from_binary_path(str(result))
+        if "error" in answer:
+            raise CongraspError(answer["error"].replace(str(path.resolve()), str(path)))
+        yield answer, folder
 
 
-def robot_spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
-    """Returns the modifiable model of a URDF or MJCF file, after `compiled_model` has read it; raises the same
-    errors.
-    """
-    compiled_model(path, notes)
-    return _spec(path, [])
-
-
-def _child(source: str, result: str) -> None:
-    """Compiles a file into another; ends a few seconds after `SECONDS`, even if the parent is gone."""
-    signal.alarm(SECONDS + 5)
+def _child(called: str, source: str, folder: str) -> None:
+    """Calls the function; ends after `SECONDS`, even if the parent is gone."""
+    module, _, name = called.partition(":")
+    function, options = getattr(importlib.import_module(module), name), json.load(sys.stdin)
+    signal.alarm(SECONDS)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    path, notes = pathlib.Path(source), list[str]()
     try:
-        model = _compiled(path, notes)
+        answer = function(pathlib.Path(source), pathlib.Path(folder), options)
+    except MemoryError:
+        answer = {"error": f"{source} cannot be read: it takes more than {MEMORY >> 30} GB. {_REMEDY}"}
+    except (CongraspError, mujoco.FatalError) as error:
+        answer = {"error": str(error) if isinstance(error, CongraspError) else _unread(pathlib.Path(source), error)}
+    pathlib.Path(folder, _ANSWER).write_text(json.dumps(answer))
+
+
+def robot_spec(path: pathlib.Path, notes: list[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """Reads a URDF or MJCF file, whose root element determines which it is.
+
+    Args:
+      path: the file. A stranger's belongs into a function of `confined`.
+      notes: omissions are appended.
+
+    Returns:
+      The modifiable model, without reserves of memory, and the compiled one.
+
+    Raises:
+      CongraspError: it cannot be read, or has more parts than `LIMITS`.
+    """
+    mujoco.set_mju_user_warning(lambda text: None)  # otherwise they go to MUJOCO_LOG.TXT
+    try:
+        with contextlib.chdir(path.parent):  # an attached model's files are searched from there
+            spec = _spec(pathlib.Path.cwd() / path.name, notes)
+            model = _compiled(spec, notes)
         for name, most in LIMITS.items():
             if getattr(model, name) > most:
                 raise ValueError(f"it has {getattr(model, name)} parts of the kind {name}, more than {most}")
-        _check_values(model)
-        mujoco.mj_saveModel(model, result)
-        said: dict[str, object] = {"notes": notes}
-    except MemoryError:
-        said = {"error": f"it takes more than {MEMORY >> 30} GB"}
-    except (ValueError, mujoco.FatalError) as error:
-        said = {"error": (str(error).strip().splitlines() or ["MuJoCo gives no reason"])[0].rstrip(".")[:300]}
-    pathlib.Path(result).with_suffix(".json").write_text(json.dumps(said))
+        for name in _FINITE:
+            if not np.isfinite(getattr(model, name)).all():
+                raise ValueError(f"its {name} holds numbers that are not finite")
+        for name in ("body_mass", "body_inertia"):
+            if (getattr(model, name) < 0).any():
+                raise ValueError(f"its {name} holds numbers below zero")
+    except (ValueError, OSError) as error:
+        raise CongraspError(_unread(path, error)) from None
+    return spec, model
 
 
-def _check_values(model: mujoco.MjModel) -> None:
-    """Raises a ValueError if a body or a joint has impossible values; a mass of zero means that the file omits it."""
-    for name in _FINITE:
-        values = getattr(model, name)
-        if not np.isfinite(values).all():
-            raise ValueError(f"its {name} holds numbers that are not finite")
-    for name in ("body_mass", "body_inertia"):
-        if (getattr(model, name) < 0).any():
-            raise ValueError(f"its {name} holds numbers below zero")
+def _unread(path: pathlib.Path, error: Exception) -> str:
+    """One line about an error of reading; MuJoCo's begins with its kind, and names the element in the second line."""
+    lines = [line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()]
+    reason = re.sub(r"^(?:(?:XML )?Error: )+", "", ", ".join(lines)) or "MuJoCo gives no reason"
+    return f"{path} cannot be read: {reason[:400]}." + ("" if isinstance(error, _Known) else f" {_REMEDY}")
+
+
+class _Known(ValueError):
+    """A fault with its remedy."""
 
 
 def _spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
-    """Returns the model of a file, not compiled; raises a ValueError or MuJoCo's error if it cannot be read."""
-    for count in _COUNTS.findall(path.read_text(errors="replace")):
-        if any(float(number) > MAX_COUNT for number in count.split()):
-            raise ValueError(f"it repeats a part {count[:40]} times, more than {MAX_COUNT}")
-    urdf = path.suffix.lower() == ".urdf"
-    spec = _urdf(path, notes) if urdf else mujoco.MjSpec.from_file(str(path))
+    """The model of a file, not compiled; raises a ValueError or an OSError if it cannot be read."""
+    text, included, attached = _texts(path)
+    texts = [text, *included.values(), *attached.values()]
+    for other in texts:
+        for count in _COUNTS.findall(other):
+            if any(float(number) > MAX_COUNT for number in count.split()):
+                raise ValueError(f"it repeats a part {count[:40]} times, more than {MAX_COUNT}")
+    root = re.search(r"<\s*([A-Za-z_][\w:.-]*)", text)
+    kind = root[1] if root else ""
+    if kind == "robot" and _XACRO.search(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)):
+        stem = path.name.partition(".")[0]
+        plain = f"{stem}.urdf" if path.suffix == ".xacro" else f"{stem}_plain.urdf"
+        raise _Known(f"this is xacro, of which ROS makes a URDF. Run 'xacro {path.name} > {plain}' and import that")
+    if kind == "robot":
+        spec = _urdf(path, text, notes)
+    elif kind in ("mujoco", "mujocoinclude"):
+        try:
+            files = {name: other.encode() for name, other in included.items()}
+            spec = mujoco.MjSpec.from_string(text, include=files)
+        except ValueError as error:
+            raise ValueError(f"{error} {_repeated_classes(texts, str(error))}") from None
+        spec.modelfiledir = str(path.parent)
+    else:
+        what = f"its root element is '{kind[:40]}'" if kind else "it is no XML"
+        raise _Known(f"{what}, not robot (URDF) or mujoco (MJCF). Export the robot as one of these")
     spec.compiler.fusestatic = False
+    # What the file reserves is of no use here, and may be more than there is.
+    spec.memory, spec.nuserdata, spec.nkey = -1, 0, 0
+    for name in ("njmax", "nconmax", "nstack", *(name for name in dir(spec) if name.startswith("nuser_"))):
+        setattr(spec, name, -1)
+    for group in (spec.sensors, spec.cameras, spec.lights, spec.numerics, spec.texts, spec.tuples):
+        for element in list(group):
+            spec.delete(element)
     for body in spec.bodies:
         if body.explicitinertial and body.mass < 0:
             raise ValueError(f"the body '{body.name[:60]}' has the mass {body.mass:g} kg")
-    missing = [mesh for mesh in spec.meshes if not urdf and mesh.file and not _found(path, spec, mesh.file)]
-    if missing:
-        names = {mesh.name for mesh in missing}
-        for geom in [geom for geom in spec.geoms if geom.meshname in names]:
-            spec.delete(geom)
-        for mesh in missing:
-            spec.delete(mesh)
-        notes.append(_missing(len(missing)))
+    for asset in (*spec.meshes, *spec.textures, *spec.hfields, *spec.skins):
+        if "\\" in asset.file:
+            asset.file = asset.file.replace("\\", "/")
     return spec
 
 
-def _compiled(path: pathlib.Path, notes: list[str]) -> mujoco.MjModel:
-    """Returns the compiled model of a file; raises like `_spec`."""
-    spec = _spec(path, notes)
+def _texts(path: pathlib.Path) -> tuple[str, dict[str, str], dict[str, str]]:
+    """The texts of a description and of the XML files that it includes, and attaches, by their names in it.
+
+    Raises:
+      ValueError: it names a pipe or a device, which would block, or too many files.
+    """
+    todo, found = [("", robot_text(path))], {"include": dict[str, str](), "model": dict[str, str]()}
+    for name, text in todo:
+        folders = {"", *_FOLDERS.findall(text), str(pathlib.PurePath(name).parent)}
+        for tag, file in _NAMED.findall(text):
+            file = file.replace("\\", "/")
+            for folder in folders:
+                there = path.parent / folder / file
+                if there.exists() and not stat.S_ISREG(there.stat().st_mode):
+                    raise _Known(f"the file '{file}' that it names is no regular file. Name one that is")
+            if tag in found and file not in found[tag] and (path.parent / file).is_file():
+                found[tag][file] = robot_text(path.parent / file)
+                todo.append((file, found[tag][file]))
+                if len(todo) > _MOST_FILES:
+                    raise ValueError(f"it names more than {_MOST_FILES} files")
+    return todo[0][1], found["include"], found["model"]
+
+
+def robot_text(path: pathlib.Path) -> str:
+    """The text of an XML file from its first element on, in whatever encoding."""
+    if path.stat().st_size > MAX_FILE:
+        raise ValueError(f"{path.name} has more than {MAX_FILE >> 20} MB")
+    data = path.read_bytes()
+    named = re.match(rb"""[^>]{0,200}?encoding\s*=\s*["']([\w-]+)""", data)
+    wide = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"<\0": "utf-16-le", b"\0<": "utf-16-be"}.get(data[:2])
+    encoding = wide or (named[1].decode() if named else "utf-8-sig")
     try:
-        return spec.compile()
-    except ValueError as error:
-        if "mass and inertia" not in str(error):
-            raise
-    spec.compiler.boundmass, spec.compiler.boundinertia = LEAST
-    model = spec.compile()
-    light = [model.body(i).name for i in np.flatnonzero(model.body_mass == LEAST[0])]
-    notes.append(f"links without mass get {1e3 * LEAST[0]:g} g ('<inertial>' in the file): {', '.join(light)}")
+        text = data.decode("utf-8-sig" if encoding.lower() in ("utf-8", "utf8") else encoding, errors="replace")
+    except LookupError:
+        raise ValueError(f"{path.name} has the unknown encoding '{encoding[:30]}'") from None
+    text = re.sub(r"<\?xml.*?\?>", "", text, count=1, flags=re.DOTALL).lstrip("\ufeff \t\r\n")
+    while text.startswith(("<!--", "<!DOCTYPE", "<?")):
+        _, _, text = text.partition("-->" if text.startswith("<!--") else ">")
+        text = text.lstrip()
+    return text
+
+
+def _repeated_classes(texts: list[str], error: str) -> str:
+    """Names of default classes that occur more than once, if the error is about them."""
+    if "repeated default class" not in error:
+        return ""
+    counts = Counter(name for text in texts for name in _CLASSES.findall(text))
+    return "repeated: " + ", ".join(f"'{name}'" for name, count in counts.items() if count > 1)
+
+
+def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
+    """The compiled model, without the files that are missing; raises a ValueError."""
+    missing, bounded = list[str](), False
+    for _ in range(_MOST_FILES):
+        try:
+            model = spec.compile()
+            break
+        except ValueError as error:
+            opened = _OPENING.search(str(error))
+            if "mass and inertia" in str(error) and not bounded:
+                spec.compiler.boundmass, spec.compiler.boundinertia = LEAST
+                bounded = True
+            elif opened and _left_out(spec, opened[1]):
+                missing.append(opened[1])
+            else:
+                raise
+    if missing:
+        notes.append(_missing(missing))
+    if bounded:
+        light = [model.body(i).name for i in np.flatnonzero(model.body_mass == LEAST[0])]
+        notes.append(f"links without mass get {1e3 * LEAST[0]:g} g ('<inertial>' in the file): {', '.join(light)}")
     return model
 
 
-def _urdf(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
+def _left_out(spec: mujoco.MjSpec, file: str) -> bool:
+    """Removes the asset of a missing file, and what shows it; False if there is none."""
+    for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins):
+        files = [asset.file, *getattr(asset, "cubefiles", ())]
+        if not any(name and file.endswith(pathlib.PurePosixPath(name).name) for name in files):
+            continue
+        for geom in [geom for geom in spec.geoms if asset.name and asset.name in (geom.meshname, geom.hfieldname)]:
+            spec.delete(geom)
+        for material in spec.materials:
+            for i, name in enumerate(material.textures):
+                if name == asset.name and isinstance(asset, mujoco.MjsTexture):
+                    material.textures[i] = ""
+        spec.delete(asset)
+        return True
+    return False
+
+
+def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     """Returns the model of a URDF file; searches its meshes as ROS does, and converts formats that MuJoCo lacks."""
     try:
-        robot = ET.fromstring(path.read_text(errors="replace"))
+        robot = ET.fromstring(text)
     except ET.ParseError as error:
         raise ValueError(f"XML Error: {error}") from None
-    extension = robot.find("mujoco") or ET.SubElement(robot, "mujoco")
+    extension = robot.find("mujoco")
+    extension = ET.SubElement(robot, "mujoco") if extension is None else extension
     compiler = extension.find("compiler")
     compiler = ET.SubElement(extension, "compiler") if compiler is None else compiler
     compiler.attrib |= {"strippath": "false", "discardvisual": "false", "balanceinertia": "true", "meshdir": ""}
-    assets, lacking = dict[str, bytes](), set[str]()
+    names = Counter(link.get("name") for link in robot.findall("link"))
+    if repeated := [name for name, count in names.items() if count > 1]:
+        raise _Known(f"several links are called '{repeated[0]}'. Rename all but one")
+    _check_joints(robot, notes)
+    assets, lacking = dict[str, bytes](), dict[str, None]()
     for link in robot.iter("link"):
         for again in link.findall("inertial")[1:]:
             link.remove(again)
         for shape in (*link.findall("visual"), *link.findall("collision")):
             for mesh in shape.iter("mesh"):
                 file = _mesh_file(path, mesh.get("filename", ""))
-                content = _readable(file) if file else b""
-                if file is None or not content:
-                    lacking.add(mesh.get("filename", ""))
+                content, kind = _readable(file) if file else (b"", "")
+                if not content:
+                    lacking[mesh.get("filename", "")] = None
                     link.remove(shape)
                     break
-                name = f"{len(assets)}.{'stl' if file.suffix.lower() not in _NATIVE else file.suffix[1:].lower()}"
+                name = f"{len(assets)}.{kind}"
                 assets[name] = content
                 mesh.set("filename", name)
     if lacking:
-        notes.append(_missing(len(lacking)))
+        notes.append(_missing(list(lacking)))
     return mujoco.MjSpec.from_string(ET.tostring(robot, "unicode"), assets=assets)
+
+
+def _check_joints(robot: ET.Element, notes: list[str]) -> None:
+    """Refuses limits in the wrong order; removes limits of effort below zero, and mimics that MuJoCo would drop."""
+    kinds = {joint.get("name"): joint.get("type") for joint in robot.findall("joint")}
+    for joint in robot.findall("joint"):
+        name, limit, mimic = joint.get("name", ""), joint.find("limit"), joint.find("mimic")
+        if limit is not None:
+            lower, upper = (_value(limit, end, name) for end in ("lower", "upper"))
+            if lower > upper:
+                raise _Known(f"the lower limit {lower:g} of the joint '{name}' is above the upper {upper:g}. Swap them")
+            for bound in ("effort", "velocity"):
+                if _value(limit, bound, name) < 0:
+                    limit.set(bound, "0")
+        if mimic is None:
+            continue
+        leader = mimic.get("joint", "")
+        why = {None: "which does not exist", "fixed": "which is fixed"}.get(kinds.get(leader), "")
+        if leader == name:
+            why = "which is itself"
+        elif not _value(mimic, "multiplier", name, 1.0):
+            why = "with the multiplier 0"
+        if why:
+            joint.remove(mimic)
+            notes.append(f"'{name}' mimics '{leader}', {why}: it has a motor of its own ('couplings' in the hand file)")
+
+
+def _value(element: ET.Element, name: str, joint: str, missing: float = 0.0) -> float:
+    """A number of an element of a joint."""
+    text = element.get(name, str(missing))
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise _Known(f"{name} of the joint '{joint}' is '{text[:40]}', not a finite number. Correct it")
+    return value
 
 
 def _mesh_file(path: pathlib.Path, name: str) -> pathlib.Path | None:
     """Path of a mesh named in a URDF file, relative to it or to a parent folder; None if there is none."""
-    plain = name.removeprefix("file://").removeprefix("package://").removeprefix("model://")
+    plain = urllib.parse.unquote(re.sub(r"^(?:file|package|model)://", "", name.strip())).replace("\\", "/")
     above = [path.parent, *path.parent.parents[:3]]
     parts = pathlib.PurePosixPath(plain).parts
     within = [plain, *("/".join(parts[i:]) for i in range(1, len(parts)))] if parts else []
-    return next((file for folder in above for part in within if (file := folder / part).is_file()), None)
+    return next((file for folder in above for part in within if (file := _there(folder / part))), None)
 
 
-def _readable(file: pathlib.Path) -> bytes:
-    """Content of a mesh in a format that MuJoCo reads, or nothing."""
+def _there(path: pathlib.Path) -> pathlib.Path | None:
+    """The file at a path, or one whose name differs in upper and lower case alone; None if there is none."""
+    if path.is_file() or not path.parent.is_dir():
+        return path if path.is_file() else None
+    alike = (file for file in path.parent.iterdir() if file.name.lower() == path.name.lower() and file.is_file())
+    return next(alike, None)
+
+
+def _readable(file: pathlib.Path) -> tuple[bytes, str]:
+    """Content of a mesh in a format that MuJoCo reads, and its suffix; nothing if it cannot be read."""
+    suffix = file.suffix.lower()
     if file.stat().st_size > MAX_FILE:
-        return b""
-    if file.suffix.lower() in _NATIVE:
-        return file.read_bytes()
+        return b"", ""
+    if suffix in _NATIVE and suffix != ".stl":
+        return file.read_bytes(), suffix[1:]
     try:
-        scene = trimesh.load_scene(file)
-        # COLLADA states its unit. Its upward axis is ignored, as in ROS.
-        scene = scene.convert_units("meters") if file.suffix.lower() == ".dae" else scene
-        return trimesh.exchange.stl.export_stl(scene.to_mesh())
+        if suffix == ".stl":  # MuJoCo reads binary ones of exact size
+            mesh = load_geometry(file, "")
+        else:
+            scene = trimesh.load_scene(file)
+            # COLLADA states its unit. Its upward axis is ignored, as in ROS.
+            mesh = (scene.convert_units("meters") if suffix == ".dae" else scene).to_mesh()
+        if len(mesh.faces) > _FACES:
+            mesh = mesh.simplify_quadric_decimation(face_count=_FACES // 10)
+        return trimesh.exchange.stl.export_stl(mesh), "stl"
     except Exception:  # readers of many formats raise arbitrary errors
-        return b""
+        return b"", ""
 
 
-def _missing(count: int) -> str:
-    """Note on missing meshes."""
-    return f"{count} meshes were not found or cannot be read: results without them are approximate"
-
-
-def _found(path: pathlib.Path, spec: mujoco.MjSpec, file: str) -> bool:
-    """True if a mesh file is at the model's path, or next to the model."""
-    folder = path.parent / (spec.compiler.meshdir or "")
-    return (folder / file).exists() or (folder / pathlib.Path(file).name).exists()
+def _missing(files: list[str]) -> str:
+    """Note on missing files."""
+    some = ", ".join(files[:5]) + (f" and {len(files) - 5} more" if len(files) > 5 else "")
+    return f"not found or not readable, results without them are approximate: {some}"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Capsules for a link's geometry: collision geometry, else visual geometry, else its inertia."""
+"""A link's geometry: capsules for its collision shapes, else visual shapes, else its inertia; and its visual mesh."""
 
 from typing import Literal
 
@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import trimesh
 
+from congrasp.common.hands.meshes import MAX_FACES
 from congrasp.common.hands.spec import Capsule, Solid, vector
 from congrasp.services.assets.hands.compile import LEAST
 
@@ -73,6 +74,28 @@ def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
         ball.vertices *= size
         return ball
     return None
+
+
+def link_mesh(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Visual mesh of bodies; None if there is none."""
+    parts = []
+    for body in bodies:
+        mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
+        drawn = [g for g in mine if not model.geom_contype[g] | model.geom_conaffinity[g]] or mine
+        for g in drawn:
+            if (mesh := geom_mesh(model, g)) is not None:
+                placed = np.asarray(mesh.vertices) @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+                parts.append(trimesh.Trimesh(placed, mesh.faces, process=False))
+    if not parts:
+        return None
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
+    whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), faces)
+    if len(whole.faces) > MAX_FACES:
+        whole = whole.simplify_quadric_decimation(face_count=MAX_FACES)
+    if not 0 < len(whole.faces) <= MAX_FACES:  # many separate parts cannot be simplified that far
+        whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts])).convex_hull
+    return np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32)
 
 
 def inertia_box(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:

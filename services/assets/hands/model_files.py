@@ -1,11 +1,12 @@
 """A hand from a URDF or MJCF file: its content is used, and missing values are proposed.
 
-MuJoCo reads the file. Bodies of the hand: `tree`. Capsules of links: `geometry`. Motors, couplings and tendons:
-`actuators`. Open and closed poses, from kinematics: `poses`.
+MuJoCo reads the file in a confined process (`compile`). Bodies of the hand: `tree`. Capsules of links: `geometry`.
+Motors, couplings and tendons: `actuators`. Open and closed poses, from kinematics: `poses`.
 """
 
 import dataclasses
 import pathlib
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,19 +15,37 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.files import TAKEN_JOINTS, faults, hand_from_text, hand_text
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.measures import fitting_scale
-from congrasp.common.hands.meshes import MAX_DISTANCE, Meshes
+from congrasp.common.hands.meshes import MAX_DISTANCE, Meshes, load_meshes, save_meshes
 from congrasp.common.hands.motors import motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from congrasp.services.assets.hands.actuators import Drive
-from congrasp.services.assets.hands.compile import compiled_model
-from congrasp.services.assets.hands.geometry import bare, far_end, fit_capsules, inertia_box, solids_of, surface
+from congrasp.services.assets.hands.compile import LEAST, confined, robot_spec
+from congrasp.services.assets.hands.geometry import (
+    bare,
+    far_end,
+    fit_capsules,
+    inertia_box,
+    link_mesh,
+    solids_of,
+    surface,
+)
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
 from congrasp.services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
-from congrasp.services.assets.hands.visual import link_mesh
+from congrasp.services.assets.objects.sizes import METRES, length
 
 _LEVER = 0.02  # least distance of a joint from the tip that it moves, m
 _TURN = np.deg2rad(10)  # largest range of a joint below which grasping is impossible
 _SMALL = 0.03  # opening below which a hand is doubtful, m
+_LINK = 5e-4, 0.5  # m, sizes of a link
+_FAR = 1.0  # m, distance of a joint from the palm's origin
+_RANGE = 7.0  # rad, largest limit of a joint
+_HEAVY = 5.0  # kg, mass of a link
+_HAND = "hand.json"
+
+
+_TWICE = "Has a scale such as 0.001 been applied twice? Lengths are in metres."
+_DEGREES = 'Are its limits in degrees? A URDF has radians; an MJCF has degrees, unless <compiler angle="radian"/>.'
+_GRAMS = "Is its mass in grams? Masses are in kg."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,17 +76,33 @@ _GUESSED = Choices()
 
 
 def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
-    """Imports the hand of a file.
+    """Imports the hand of a file, which a confined process reads; see `propose`."""
+    with confined(write_proposal, path, dataclasses.asdict(choices)) as (answer, folder):
+        hand = hand_from_text(answer["hand"], str(path))
+        meshes = load_meshes(folder / _HAND, hand)
+    return Proposal(hand, answer["palm"], tuple(answer["notes"]), meshes)
+
+
+def write_proposal(path: pathlib.Path, folder: pathlib.Path, options: dict[str, Any]) -> dict[str, Any]:
+    """Does the work of `import_hand` in the confined process: writes the meshes, returns the rest."""
+    proposal = propose(path, Choices(**options))
+    save_meshes(folder / _HAND, proposal.meshes)
+    return {"hand": hand_text(proposal.hand), "palm": proposal.palm, "notes": list(proposal.notes)}
+
+
+def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
+    """Reads the hand of a file in this process.
 
     Args:
-      path: URDF (.urdf), whose meshes are searched as ROS does, or MJCF (.xml).
+      path: URDF, whose meshes are searched as ROS does, or MJCF; its root element determines which.
       choices: name, body of the palm, last body of the thumb and object scale, which are otherwise guessed; collision.
 
     Raises:
-      CongraspError: the file cannot be read, or is not a hand of hinges with at least two fingers.
+      CongraspError: the file cannot be read, is not a hand of hinges with at least two fingers, or has sizes, ranges or
+        masses of another unit.
     """
     notes: list[str] = []
-    model = compiled_model(path, notes)
+    _, model = robot_spec(path, notes)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     tree = hand_tree(model, choices.palm, notes)
@@ -77,7 +112,13 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
             "Pass another --palm.",
         )
     _to_palm(data, tree.palm)
-    links, drive = _links(model, data, tree, notes)
+    wide = np.sqrt(model.body_inertia.max(1) / np.maximum(model.body_mass, LEAST[0])) > _LINK[1]
+    if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
+        said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"
+        notes.append(f"{said}: {', '.join(doubtful)}")
+    sizes: dict[str, float] = {}
+    links, drive = _links(model, data, tree, sizes, notes)
+    _check_units(path, links, sizes)
     if choices.own_collision:
         links = _with_solids(model, data, tree, links, notes)
     hand = Hand(
@@ -117,6 +158,36 @@ def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
             raise CongraspError(
                 f"{path}: {fault}.", "Correct the file, or write a hand file by hand (docs/add-a-hand.md)."
             )
+
+
+def _check_units(path: pathlib.Path, links: list[Link], sizes: dict[str, float]) -> None:
+    """Raises a CongraspError for lengths, angles and masses that no hand has, with the unit that they seem to have.
+
+    Args:
+      path: the file.
+      links: the links.
+      sizes: sides of those with geometry in the file, m.
+    """
+    for link in links:
+        size = sizes.get(link.name, _LINK[1])
+        away = max((float(np.linalg.norm(joint.anchor)) for joint in link.joints), default=0.0)
+        turn = max(((max(-joint.lower, joint.upper), joint.name) for joint in link.joints), default=(0.0, ""))
+        for wrong, what, remedy in (
+            (size > _LINK[1], f"the link '{link.name}' is {length(size)} long", _smaller_unit(size)),
+            (size < _LINK[0], f"the link '{link.name}' is {length(size)} long", _TWICE),
+            (away > _FAR, f"the link '{link.name}' turns {length(away)} from the palm", _smaller_unit(away)),
+            (turn[0] > _RANGE, f"the joint '{turn[1]}' turns to {turn[0]:.4g} rad", _DEGREES),
+            (link.mass > _HEAVY, f"the link '{link.name}' weighs {link.mass:.4g} kg", _GRAMS),
+        ):
+            if wrong:
+                raise CongraspError(f"{path}: {what}, which is no hand's.", remedy)
+
+
+def _smaller_unit(size: float) -> str:
+    """Remedy for a length of a hand, in what should be m, that is too large."""
+    units = [f"{unit} ({length(size * factor)})" for unit, factor in METRES.items() if size * factor < _LINK[1]]
+    question = f"Are its lengths in {' or '.join(units)}? " if units else ""
+    return f'{question}Give meshes a scale such as "0.001 0.001 0.001", and offsets in metres.'
 
 
 def describe(proposal: Proposal) -> list[str]:
@@ -164,8 +235,10 @@ def _to_palm(data: mujoco.MjData, palm: int) -> None:
         frames[:] = (turn.T @ frames.reshape(-1, 3, 3)).reshape(-1, 9)
 
 
-def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[str]) -> tuple[list[Link], Drive]:
-    """Returns the links and their drive; proposals are added to `notes`."""
+def _links(
+    model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, sizes: dict[str, float], notes: list[str]
+) -> tuple[list[Link], Drive]:
+    """Returns the links and their drive; sides of their geometry (m) are added to `sizes`, proposals to `notes`."""
     names = {link: "palm" if link == tree.palm else body_name(model, link) for link in tree.groups}
     above = {link: tree.owner[int(model.body_parentid[link])] for link in tree.groups if link != tree.palm}
     at = {link: np.zeros(3) if link == tree.palm else data.xanchor[hinges(model, link)[0]] for link in tree.groups}
@@ -174,7 +247,9 @@ def _links(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[s
     empty: list[str] = []
     for link, bodies in tree.groups.items():
         points = [p for body in bodies for p in surface(model, data, body)]
-        if not points:
+        if points:
+            sizes[names[link]] = float(np.ptp(points, axis=0).max())
+        else:
             points = [p for body in bodies for p in inertia_box(model, data, body)]
             (boxed if points else empty).append(names[link])
         shapes[link] = fit_capsules(np.array(points or bare(at[link], *(at[x] for x in above if above[x] == link))))
@@ -253,8 +328,9 @@ def _joint(model: mujoco.MjModel, data: mujoco.MjData, j: int, name: str, drive:
     """Returns a hinge."""
     if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
         raise CongraspError(f"The joint '{name}' is not a hinge.", "Only hands of hinges can be imported.")
-    if not model.jnt_limited[j]:
+    limits = drive.limits(j)
+    if limits is None:
         raise CongraspError(f"The joint '{name}' has no limits.", "Give it a range.")
-    lower, upper = model.jnt_range[j] - model.qpos0[model.jnt_qposadr[j]]
+    lower, upper = limits
     axis, anchor = vector(data.xaxis[j]), vector(data.xanchor[j])
     return drive.joint(j, lower, upper, Joint(name, axis, anchor, 0.0, 0.0, 0.0, 0.0, 0.0))

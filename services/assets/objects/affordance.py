@@ -1,26 +1,35 @@
 """New partitions of an object into graspable region and avoid region.
 
-They come from a mesh of one part, painted vertices, a half-space, or touched points. They relabel the object's surface
-points and pieces; nothing else about the object changes.
+They come from a mesh of one part, painted vertices, a half-space, touched points, or cuts into halves that a hand can
+hold. They relabel the object's surface points and pieces; nothing else about the object changes.
 """
 
 import dataclasses
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.outline import outline
 from congrasp.common.objects.spec import GraspObject
-from congrasp.services.assets.objects.sources import load_geometry, read_mesh
+from congrasp.common.objects.surface import halves
+from congrasp.common.task.sampling.headings import max_width, sample_headings, within_reach
+from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh, upright
 
 LEAST_SHARE = 0.10
 """Least share of the surface that the graspable region must have (paper, section Constraint Setup)."""
 _ON_PART = 0.003  # m; a surface point this near to a part's mesh belongs to the part
 _SAME_BOX = 0.1  # tolerance of the bounding box of a painted file, as a share of the object's length
 _COLOUR_TOLERANCE = 60  # largest distance of two colours in RGB that count as one
+
+
+_CUTS = (0.5, 0.65, 0.35, 0.8, 0.2)
+"""Shares of the surface points on the near side of a cut, in the order in which they are tried."""
+UNCOVERED = "none of its halves can be held without the other: it has no affordance"
 
 
 def relabelled(
@@ -96,7 +105,8 @@ def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
     Raises:
       CongraspError: the mesh cannot be read, or lies elsewhere.
     """
-    dense, _ = trimesh.sample.sample_surface(read_mesh(path), 8000, seed=0)
+    part = read_mesh(path, up="y" if obj.file_up == "y" else "auto")
+    dense, _ = trimesh.sample.sample_surface(part, 8000, seed=0)
     distance = cKDTree(np.asarray(dense) * obj.file_scale + obj.origin).query(obj.points)[0]
     if distance.min() > _ON_PART:
         raise CongraspError(
@@ -126,7 +136,7 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
         colours = mesh.colors if len(mesh.colors) else None
     if colours is None:
         raise CongraspError(f"{path} has no coloured vertices.", "Paint them and export as PLY with colours.")
-    vertices = np.asarray(mesh.vertices, float) * obj.file_scale + obj.origin
+    vertices = upright(np.asarray(mesh.vertices, float), obj.file_up) * obj.file_scale + obj.origin
     finite = np.isfinite(vertices).all(-1)
     vertices, rgb = vertices[finite], np.asarray(colours)[finite, :3].astype(int)
     _check_box(obj, path, vertices)
@@ -156,6 +166,46 @@ def near_points(obj: GraspObject, points: np.ndarray, radius: float) -> np.ndarr
     if len(points) == 0:
         return np.zeros(len(obj.points), bool)
     return cKDTree(points).query(obj.points)[0] <= radius
+
+
+def cut_to_hold(obj: GraspObject) -> GraspObject:
+    """An object of two halves with the first partition that is covered in all resting poses, or in the most.
+
+    Its current halves come first, then their exchange, then cuts across the longest axis that make the graspable half
+    larger or smaller. If no half can be held in any resting pose, a note is added.
+    """
+    most = int(covered(obj, use_affordance=False).sum())
+    best, score = obj, -1
+    for candidate in _cuts(obj):
+        found = int(covered(candidate).sum())
+        if found > score:
+            best, score = candidate, found
+        if score >= most:
+            break
+    return best if score > 0 else dataclasses.replace(best, notes=(*best.notes, UNCOVERED))
+
+
+def covered(obj: GraspObject, *, use_affordance: bool = True) -> np.ndarray:
+    """(R,) bool, resting poses in which the human hand has a heading on the graspable region, or the whole surface."""
+    hand = outline(HUMAN)
+    found = sample_headings(
+        obj, np.random.default_rng(0), use_affordance=use_affordance, max_width=max_width(hand, HUMAN.object_scale)
+    )
+    if found is None:
+        return np.zeros(len(obj.rest_poses), bool)
+    avoid = obj.non_graspable_points if use_affordance else None
+    return np.asarray(within_reach(found, obj, obj.rest_poses, hand, avoid)[1].any(-1))
+
+
+def _cuts(obj: GraspObject) -> Iterator[GraspObject]:
+    """Yields the object with its current partition, then with others."""
+    yield obj
+    first = int(np.flatnonzero(obj.graspable)[0])
+    for cut in _CUTS:
+        labels = halves(obj.points, cut)
+        for half in (first, 1 - first):
+            if cut != 0.5 or half != first:
+                yield relabelled(obj, labels, obj.part_names, [half == 0, half == 1])
 
 
 def _commonest(rgb: np.ndarray) -> np.ndarray:

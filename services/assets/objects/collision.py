@@ -38,7 +38,8 @@ class Collision(NamedTuple):
 def convex_pieces(
     source: Source,
     meshes: Sequence[trimesh.Trimesh],
-    whole: trimesh.Trimesh,
+    triangles: np.ndarray,
+    volume: float | None,
     given: Sequence[np.ndarray],
     options: ImportOptions,
     notes: list[str],
@@ -48,7 +49,8 @@ def convex_pieces(
     Args:
       source: the object's files.
       meshes: its surface, m: one of the whole, or one of each part.
-      whole: all of them as one.
+      triangles: (F, 3, 3) of all of them.
+      volume: volume that they enclose (`fidelity.enclosed`), m^3; None for an open surface.
       given: vertices (V, 3) of the convex pieces in its folder, m; the surface if that has no file.
       options: options of the import.
       notes: the selected pieces and their errors are appended.
@@ -56,13 +58,12 @@ def convex_pieces(
     Raises:
       CongraspError: the object has no volume.
     """
-    triangles, closed = np.asarray(whole.triangles), all(mesh.is_volume for mesh in meshes)
     try:
         if not given:
-            found = _cut(source, meshes, triangles, closed, options, notes)
+            found = _cut(source, meshes, triangles, volume, options, notes)
             notes.append(str(found))
             return found
-        own = _merged(given, triangles, float(whole.volume) if closed else None, options, notes)
+        own = _merged(given, triangles, volume, options, notes)
     except QhullError:
         raise CongraspError(
             f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
@@ -72,7 +73,7 @@ def convex_pieces(
         return own
     with contextlib.suppress(QhullError):
         said: list[str] = []
-        cut = _cut(source, meshes, triangles, closed, options, said)
+        cut = _cut(source, meshes, triangles, volume, options, said)
         if cut.errors.excess < own.errors.excess:
             notes.extend(said)
             notes.append(f"{cut}; they were cut from its mesh, for its own {len(own.hulls)} are coarser: {own.errors}")
@@ -100,7 +101,7 @@ def _cut(
     source: Source,
     meshes: Sequence[trimesh.Trimesh],
     triangles: np.ndarray,
-    closed: bool,
+    volume: float | None,
     options: ImportOptions,
     notes: list[str],
 ) -> Collision:
@@ -110,17 +111,29 @@ def _cut(
     hulls, owners = list[np.ndarray](), list[int]()
     for owner, (mesh, limit) in enumerate(zip(meshes, limits, strict=True)):
         small = repair.with_few_faces(mesh)
+        closed = volume is not None and (small is mesh or repair.encloses(small))
         found = decompose.decompose(
             np.asarray(small.vertices),
             np.asarray(small.faces),
-            volume=float(mesh.volume) if closed and small.is_volume else None,
+            volume=(volume if len(meshes) == 1 else float(mesh.volume)) if closed else None,
             time_limit=options.time_limit,
             max_pieces=limit,
         )
         hulls.extend(found.pieces)
         owners.extend([owner if source.parts_are_pieces else 0] * len(found.pieces))
         notes.extend(found.notes)
-    return _fitted(triangles, hulls, owners, closed)
+    cut = _fitted(triangles, hulls, owners, closed=volume is not None)
+    if cut.errors.excess <= 1 or len(hulls) == len(meshes):
+        return cut
+    whole = [shapes.hull_of(mesh.vertices) for mesh in meshes]
+    owners = list(range(len(meshes))) if source.parts_are_pieces else [0] * len(meshes)
+    filled = _fitted(triangles, [hull.points[hull.vertices] for hull in whole], owners, volume is not None)
+    if filled.errors.excess < cut.errors.excess:
+        notes.append(
+            f"its convex hull is closer to its shape than {len(hulls)} pieces ({cut.errors}): hollows are filled"
+        )
+        return filled
+    return cut
 
 
 def _fitted(triangles: np.ndarray, found: list[np.ndarray], owners: list[int], closed: bool) -> Collision:

@@ -10,26 +10,33 @@ from trimesh.visual.color import uv_to_interpolated_color
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import COLOUR_POINTS, Colours
-from congrasp.services.assets.objects.sources import kind_of, load_geometry
+from congrasp.services.assets.objects.mesh_files import kind_of, load_geometry, up_of, upright
+from congrasp.services.assets.objects.sizes import Up
 
 _UNSAID = (102, 102, 102)  # default colour of a material in trimesh
 
 
-def sample_colours(paths: Sequence[pathlib.Path], seed: int) -> Colours | None:
+def sample_colours(
+    paths: Sequence[pathlib.Path], seed: int, up: Up = "auto", notes: list[str] | None = None
+) -> Colours | None:
     """Samples points evenly over the surfaces of mesh files, with their colours.
 
     Args:
       paths: the files.
       seed: seed of the points.
+      up: axis that points up in the files (`read_mesh`).
+      notes: names of missing pictures are appended.
 
     Returns:
-      `COLOUR_POINTS` of them, in the files' frame and unit; None if no file has any colour.
+      `COLOUR_POINTS` of them, in the files' unit, z up; None if no file has any colour.
 
     Raises:
       CongraspError: a file cannot be read with its colours.
     """
     try:
-        meshes = [mesh for path in paths if kind_of(path) != ".stl" for mesh in _meshes(path)]  # STL has no colours
+        meshes = [
+            mesh for path in paths if kind_of(path) != ".stl" for mesh in _meshes(path, up, notes)
+        ]  # STL has no colours
         if not any(_has_colours(mesh.visual) for mesh in meshes):
             return None
         rng = np.random.default_rng(seed)
@@ -43,11 +50,14 @@ def sample_colours(paths: Sequence[pathlib.Path], seed: int) -> Colours | None:
     return Colours(points.astype(np.float32), colours)
 
 
-def _meshes(path: pathlib.Path) -> list[trimesh.Trimesh]:
-    """Meshes of a file's scene, placed as in the scene."""
-    loaded = load_geometry(path, "Export it without textures.", file_type=kind_of(path)[1:])
+def _meshes(path: pathlib.Path, up: Up, notes: list[str] | None) -> list[trimesh.Trimesh]:
+    """Meshes of a file's scene, placed as in the scene, with z up."""
+    loaded = load_geometry(path, "Export it without textures.", notes=notes)
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
-    return [part for part in parts if isinstance(part, trimesh.Trimesh) and part.area > 0]
+    meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and part.area > 0]
+    for mesh in meshes:
+        mesh.vertices = upright(mesh.vertices, up_of(path, up))
+    return meshes
 
 
 def _has_colours(visual: Any) -> bool:

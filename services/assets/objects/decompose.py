@@ -17,13 +17,16 @@ import time
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_PIECES
 from congrasp.common.runtime.parallel import cores, memory
+from congrasp.services.assets.objects.fidelity import enclosed
 from congrasp.services.assets.objects.pieces import DEPTH, GROWTH, deepest, merge, solid_hull
+from congrasp.services.assets.objects.repair import bodies, is_manifold
 
 FALLBACK_LIMIT = 30.0
 """Limit of V-HACD's processor time, s."""
@@ -60,7 +63,8 @@ def decompose(
     Args:
       vertices: (V, 3), m, not all in a plane.
       faces: (F, 3).
-      volume: volume of a closed mesh, m^3; one close to that of the hull needs no decomposition.
+      volume: volume that a closed mesh encloses (`fidelity.enclosed`), m^3; one close to that of the hull needs no
+        decomposition.
       time_limit: processor time for CoACD, s; V-HACD gets half a minute after it.
       max_pieces: most pieces.
 
@@ -69,7 +73,7 @@ def decompose(
     """
     hull = shapes.hull_of(vertices)
     whole = [hull.points[hull.vertices]]
-    if volume is not None and volume > (1 - GROWTH) * hull.volume and deepest(hull, vertices[faces]) < DEPTH:
+    if volume is not None and _convex(hull, vertices[faces], volume):
         return Decomposition(whole, "convex", [])
     notes: list[str] = []
     for method, limit in (("coacd", time_limit), ("vhacd", FALLBACK_LIMIT)):
@@ -125,26 +129,42 @@ def _child(method: str, mesh: str, result: str, max_pieces: str, limit: str) -> 
     with np.load(mesh) as arrays:
         vertices, faces, volume = arrays["vertices"], arrays["faces"], float(arrays["volume"])
     if method == "coacd":
-        import coacd
-
-        found = coacd.run_coacd(
-            coacd.Mesh(vertices, faces),
-            threshold=min(1.0, max(_FINEST, 2 * DEPTH / np.ptp(vertices, axis=0).max())),
-            preprocess_mode="off" if volume else "auto",
-            # Measured: fine cuts that are joined afterwards are as faithful as a longer search, in a tenth of the time.
-            merge=False,
-            mcts_iterations=20,
-            mcts_nodes=10,
-            mcts_max_depth=2,
-            seed=0,
-        )
+        # A closed mesh may be of several bodies that intersect, which CoACD cuts forever.
+        parts = bodies(vertices, faces) if volume else [(vertices, faces)]
+        found = [piece for part in parts for piece in _by_coacd(*part, closed=bool(volume))]
     else:
         import vhacdx
 
-        found = vhacdx.compute_vhacd(vertices, faces.astype(np.uint32), maxConvexHulls=int(max_pieces))
-    solid = [hull for hull in (solid_hull(np.asarray(piece[0], np.float64)) for piece in found) if hull is not None]
+        rows = np.insert(faces, 0, 3, axis=1).astype(np.uint32)  # the number of corners comes first, as in VTK
+        found = [piece[0] for piece in vhacdx.compute_vhacd(vertices, rows, maxConvexHulls=int(max_pieces))]
+    solid = [hull for hull in (solid_hull(np.asarray(piece, np.float64)) for piece in found) if hull is not None]
     volume = volume or sum(hull.volume for hull in solid)
     np.savez(result, *merge([hull.points for hull in solid], int(max_pieces), vertices[faces], volume))
+
+
+def _by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[np.ndarray]:
+    """Vertices of the pieces of one body."""
+    import coacd
+
+    if closed and _convex(hull := shapes.hull_of(vertices), vertices[faces], enclosed(vertices[faces]).volume):
+        return [hull.points[hull.vertices]]
+    found = coacd.run_coacd(
+        coacd.Mesh(vertices, faces),
+        threshold=min(1.0, max(_FINEST, 2 * DEPTH / np.ptp(vertices, axis=0).max())),
+        preprocess_mode="off" if closed and is_manifold(faces) else "auto",
+        # Measured: fine cuts that are joined afterwards are as faithful as a longer search, in a tenth of the time.
+        merge=False,
+        mcts_iterations=20,
+        mcts_nodes=10,
+        mcts_max_depth=2,
+        seed=0,
+    )
+    return [piece[0] for piece in found]
+
+
+def _convex(hull: ConvexHull, triangles: np.ndarray, volume: float) -> bool:
+    """True if the hull of a closed mesh (F, 3, 3) of this volume may stand for it."""
+    return volume > (1 - GROWTH) * hull.volume and deepest(hull, triangles) < DEPTH
 
 
 def _end_with(parent: int) -> None:

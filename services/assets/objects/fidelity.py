@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from trimesh.triangles import mass_properties
 
 from congrasp.common.objects import shapes
 
@@ -22,6 +23,7 @@ REACH = 2e-3
 """Radius of the ball, m."""
 _RAYS = 256  # along the longest side of the box around both bodies
 _SEAM = 4e-4  # m
+_OVERLAP = 1e-3  # share of its volume that a mesh may count twice
 _FACING = 0.5  # cosine; walls that face one another within `_SEAM` are a crack, too
 _TOUCHES = 0.8  # of the ball's radius: samples are not where the ball is nearest
 _OFF_GRID = np.array([0.1236068, 0.4142136, 0.7320508])  # of the rays' spacing: corners at round numbers miss the rays
@@ -94,6 +96,66 @@ def _farthest(surface: _Surface, other: _Surface) -> float:
     apart = np.isinf(tree.query(points + REACH * normals, distance_upper_bound=_TOUCHES * REACH)[0])
     touched = ~in_crack.any(-1) & apart
     return float(cKDTree(other.points[other.outer]).query(points[touched])[0].max(initial=0.0))
+
+
+class Enclosed(NamedTuple):
+    """Measures of the space inside a closed mesh; bodies that overlap count once."""
+
+    volume: float
+    """m^3."""
+    area: float
+    """Of the outer surface, m^2; faces that touch are not part of it."""
+    center: np.ndarray
+    """(3,) m, centroid."""
+    inertia: np.ndarray
+    """(3, 3) m^5 about the centroid, at a density of 1."""
+    overlaps: bool
+    """True if bodies overlap: the other fields are then estimates, and exact otherwise."""
+
+
+def enclosed(triangles: np.ndarray) -> Enclosed:
+    """Measures the space inside the outward triangles (F, 3, 3) of a closed mesh, m.
+
+    What lies in several of its bodies, by rays along each axis, is taken off the mesh's integrals.
+    """
+    exact = mass_properties(triangles, density=1.0)
+    volume, center = float(exact["volume"]), np.asarray(exact["center_mass"])
+    first, second = volume * center, _second_moment(exact["inertia"]) + volume * np.outer(center, center)
+    crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area, twice = float(np.linalg.norm(crosses, axis=-1).sum() / 2), 0.0
+    corners = triangles.reshape(-1, 3)
+    low, spacing = corners.min(0), float(np.ptp(corners, axis=0).max()) / _RAYS
+    for axis in range(3):
+        order = [(axis + 1) % 3, (axis + 2) % 3, axis]
+        shift = np.array([*_OFF_GRID[order[:2]], 0.0])
+        rays, place, owner, normal = _crossings((triangles[..., order] - low[order]) / spacing + shift)
+        change = -np.sign(normal[owner, 2])
+        along = np.lexsort((-change, np.round(place, 4), rays[:, 1], rays[:, 0]))  # entries before exits in one place
+        winding = np.cumsum(change[along])
+        points = np.empty((len(along), 3))
+        points[:, order] = (np.column_stack([rays, place])[along] - shift) * spacing + low[order]
+        start = np.flatnonzero(winding > 1.5)  # up to the next crossing, it lies in two bodies or more
+        length = points[start + 1, axis] - points[start, axis]
+        weight = (winding[start] - 1) * length * spacing**2 / 3
+        middle = (points[start] + points[start + 1]) / 2
+        twice += weight.sum()
+        first -= weight @ middle
+        second -= (weight[:, None] * middle).T @ middle
+        second[axis, axis] -= weight @ length**2 / 12
+        # Rays along the axis k meet a patch in proportion to |n_k|: each crossing stands for 1 / sum |n_k|.
+        inner = np.minimum(winding, np.r_[0, winding[:-1]]) > 0.5
+        area -= float((spacing**2 / np.abs(normal[owner[along[inner]]]).sum(-1)).sum())
+    if twice < _OVERLAP * volume:
+        return Enclosed(volume, area, center, np.asarray(exact["inertia"]), False)
+    volume -= twice
+    center = first / volume
+    second -= volume * np.outer(center, center)
+    return Enclosed(volume, area, center, np.trace(second) * np.eye(3) - second, True)
+
+
+def _second_moment(inertia: np.ndarray) -> np.ndarray:
+    """The integral (3, 3) of x x^T of a body with this inertia."""
+    return np.trace(inertia) / 2 * np.eye(3) - inertia
 
 
 def _cut(triangles: np.ndarray, low: np.ndarray, spacing: float) -> tuple[float, _Surface]:

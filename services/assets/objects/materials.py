@@ -10,6 +10,8 @@ import trimesh
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.shapes import tessellate
 from congrasp.common.objects.spec import GraspObject
+from congrasp.services.assets.objects.fidelity import enclosed
+from congrasp.services.assets.objects.repair import encloses
 
 DENSITIES = (500.0, 2500.0)
 """Limits of the density of an object of unknown material, kg/m^3."""
@@ -102,7 +104,7 @@ def mean_thickness(mesh: trimesh.Trimesh) -> float:
 def hollow(mesh: trimesh.Trimesh, material: Material) -> bool:
     """True for a body whose mass is that of its wall: thicker than objects of its material are, or a sheet."""
     thickness = mean_thickness(mesh)
-    return thickness > material.thickest or (not mesh.is_volume and thickness < _SHEET)
+    return thickness > material.thickest or (not encloses(mesh) and thickness < _SHEET)
 
 
 def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> Weight:
@@ -125,13 +127,12 @@ def weigh(bodies: Sequence[trimesh.Trimesh], materials: Sequence[Material]) -> W
 def _weigh(mesh: trimesh.Trimesh, material: Material) -> Weight:
     """Mass properties of one body; those of an open one are distributed over its surface."""
     if hollow(mesh, material):
-        return _on_surface(mesh, material.wall * material.density * float(mesh.area))
-    if not mesh.is_volume:
+        area = enclosed(np.asarray(mesh.triangles)).area if encloses(mesh) else float(mesh.area)
+        return _on_surface(mesh, material.wall * material.density * area)
+    if not encloses(mesh):
         return _on_surface(mesh, mean_thickness(mesh) * float(mesh.area) / 2 * material.density)
-    properties = mesh.mass_properties
-    mass = material.density * float(properties["volume"])
-    inertia = np.asarray(properties["inertia"]) * (mass / float(properties["mass"]))
-    return Weight(mass, np.asarray(properties["center_mass"]), inertia)
+    solid = enclosed(np.asarray(mesh.triangles))
+    return Weight(material.density * solid.volume, solid.center, material.density * solid.inertia)
 
 
 def _on_surface(mesh: trimesh.Trimesh, mass: float) -> Weight:

@@ -8,6 +8,7 @@ import pathlib
 import queue
 import threading
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -21,17 +22,21 @@ from congrasp.common.objects.spec import Colours, GraspObject, Piece
 from congrasp.common.objects.surface import halves, mass_properties, sample_mesh
 from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects import decompose, repair
+from congrasp.services.assets.objects.affordance import cut_to_hold
 from congrasp.services.assets.objects.collision import convex_pieces
 from congrasp.services.assets.objects.colours import sample_colours
+from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import Weight, guessed_mass, materials_of, weigh
+from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
 from congrasp.services.assets.objects.options import ImportOptions, check_options
-from congrasp.services.assets.objects.regions import cut_to_hold
-from congrasp.services.assets.objects.sizes import metres_per_unit
-from congrasp.services.assets.objects.sources import Source, read_mesh
+from congrasp.services.assets.objects.repair import encloses
+from congrasp.services.assets.objects.sizes import Up, metres_per_unit
+from congrasp.services.assets.objects.sources import Source
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
-_CACHE_VERSION = 8
+_CACHE_VERSION = 9
+_DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
 
@@ -45,9 +50,9 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
       CongraspError: an option is invalid, or a mesh cannot be used; the message names it, its fault and the remedy.
     """
     check_options(options)
-    key = _cache_key(source, options)
+    key = _key(source, options)
     folder = pathlib.Path(options.cache_dir) if options.cache_dir else cache_folder("objects")
-    cached = folder / f"{key}{store.SUFFIX}"
+    cached = folder / f"{key}-{_CACHE_VERSION}-{options.up}{store.SUFFIX}"
     if cached.is_file():
         try:
             return store.load(cached)
@@ -100,10 +105,10 @@ def import_sources(
         todo.clear()
 
 
-def _cache_key(source: Source, options: ImportOptions) -> str:
-    """24 hex digits of everything that an import depends on."""
+def _key(source: Source, options: ImportOptions) -> str:
+    """24 hex digits of the files and options of an import, which are also the seed of its surface points."""
     settings = dataclasses.replace(options, cache_dir="")
-    content = hashlib.sha256(f"{_CACHE_VERSION} {source.name} {settings}".encode())
+    content = hashlib.sha256(f"{_DRAWS} {source.name} {settings}".encode())
     for file in source.files():
         content.update(f" {file.path.name} {file.role} {file.part} ".encode())
         content.update(hashlib.sha256(file.path.read_bytes()).digest())
@@ -113,37 +118,37 @@ def _cache_key(source: Source, options: ImportOptions) -> str:
 def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     """The object of a source; the seed draws its surface points."""
     notes: list[str] = []
-    given = [np.asarray(read_mesh(file.path).vertices, np.float64) for file in source.pieces]
-    visuals = [read_mesh(file.path, notes) for file in source.visuals] or [shapes.triangulate(piece) for piece in given]
-    if not (given or source.parts):
-        visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
-    if not source.parts:
-        visuals = [repair.closed(mesh, notes) for mesh in visuals]
+    given, visuals, up = _read(source, options.up, notes)
     sides = tuple(_joined(visuals).extents.tolist())
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
     meshes = [_scaled(mesh, factor) for mesh in visuals]
     whole = _joined(meshes)
-    closed = all(mesh.is_volume for mesh in meshes)
+    closed = all(encloses(mesh) for mesh in meshes)
     if not (closed or options.material):
         notes.append(
             f"its surface is open: mass and inertia are those of its convex {'pieces' if source.pieces else 'hull'} "
             "(--material weighs its wall, and --mass sets the mass)"
         )
-    hulls, owners, errors = convex_pieces(source, meshes, whole, [factor * piece for piece in given], options, notes)
-    mass, center, inertia = _weighed(source, meshes, factor, hulls if source.pieces else None, options)
+    solid = enclosed(np.asarray(whole.triangles)) if closed else None
+    if solid and solid.overlaps:
+        notes.append("its bodies overlap: what lies in several of them weighs once")
+    hulls, owners, errors = convex_pieces(
+        source, meshes, np.asarray(whole.triangles), solid and solid.volume, [factor * x for x in given], options, notes
+    )
+    mass, center, inertia = _weighed(source, meshes, factor, solid, hulls if source.pieces else None, options)
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
     whole.apply_translation(-center)
     points, normals, face = sample_mesh(
         np.asarray(whole.triangles), pieces, np.random.default_rng(seed), oriented=closed
     )
-    part_names, graspable, labels = _labels(source, meshes, factor, center, points, face)
+    part_names, graspable, labels = _labels(source, meshes, factor, center, points, face, options.up)
     share = graspable[labels].mean()
     if not 0.1 <= share <= 0.9:
         notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
     if not source.parts_are_pieces:
         pieces = _labelled(pieces, points, labels)
     picture = repair.with_few_faces(whole)
-    colours = _colours(source, factor, center, seed, notes)
+    colours = _colours(source, factor, center, seed, options.up, notes)
     obj = GraspObject(
         name=source.name,
         family="imported",
@@ -160,7 +165,8 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         visual_faces=np.asarray(picture.faces, np.int32),
         origin=tuple((-center).tolist()),
         file_scale=factor,
-        notes=tuple(notes),
+        file_up=up,
+        notes=tuple(dict.fromkeys(notes)),
         surface_error=errors.surface,
         volume_error=errors.volume,
         colours=colours,
@@ -169,10 +175,27 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     return obj if source.parts else cut_to_hold(obj)
 
 
-def _colours(source: Source, factor: float, center: np.ndarray, seed: int, notes: list[str]) -> Colours | None:
+def _read(
+    source: Source, up: Up, notes: list[str]
+) -> tuple[list[np.ndarray], list[trimesh.Trimesh], Literal["y", "z"]]:
+    """The convex pieces (V, 3) in a source's folder, its repaired surfaces, z up, and the files' axis that was up."""
+    given = [np.asarray(read_mesh(file.path, up=up).vertices, np.float64) for file in source.pieces]
+    visuals = [read_mesh(file.path, notes, up) for file in source.visuals]
+    visuals = visuals or [shapes.triangulate(piece) for piece in given]
+    found = up_of(source.files()[0].path, up)
+    if found == "y":
+        notes.append("its y axis, which points up in the file, became its z axis (--up z leaves the axes)")
+    if not (given or source.parts):
+        visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
+    if not source.parts:
+        visuals = [repair.closed(mesh, notes) for mesh in visuals]
+    return given, visuals, found
+
+
+def _colours(source: Source, factor: float, center: np.ndarray, seed: int, up: Up, notes: list[str]) -> Colours | None:
     """Colours of the files, in the object frame; None if they have none, or cannot be read."""
     try:
-        found = sample_colours([file.path for file in source.visuals], seed)
+        found = sample_colours([file.path for file in source.visuals], seed, up, notes)
     except CongraspError as error:
         notes.append(f"its colours are left out: {error}")
         return None
@@ -195,10 +218,16 @@ def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
     return mesh
 
 
+def _scaled_parts(source: Source, factor: float, up: Up) -> list[trimesh.Trimesh]:
+    """Meshes of the part files in metres."""
+    return [_scaled(read_mesh(part.path, up=up), factor) for part in source.parts]
+
+
 def _weighed(
     source: Source,
     meshes: Sequence[trimesh.Trimesh],
     factor: float,
+    solid: Enclosed | None,
     hulls: Sequence[np.ndarray] | None,
     options: ImportOptions,
 ) -> Weight:
@@ -208,25 +237,25 @@ def _weighed(
       source: the object's files.
       meshes: its surface, m.
       factor: metres per unit of the files.
+      solid: measures of what the surface encloses; None for an open one.
       hulls: vertices (V, 3) of the convex solids that replace an open surface, m; the surface's hull if None.
       options: material, density and mass.
     """
     whole, text = _joined(meshes), options.material
     if "=" in text:
-        bodies = meshes if source.parts_are_pieces else [_scaled(read_mesh(part.path), factor) for part in source.parts]
+        bodies = meshes if source.parts_are_pieces else _scaled_parts(source, factor, options.up)
         found = weigh(bodies, materials_of(text, [part.part for part in source.parts]))
     elif text:
         found = weigh(meshes, materials_of(text, [""] * len(meshes)))
     else:
-        if all(mesh.is_volume for mesh in meshes):
-            properties = whole.mass_properties
-            volume, center = float(properties["volume"]), np.asarray(properties["center_mass"])
-            inertia = np.asarray(properties["inertia"])
+        area = float(whole.area)
+        if solid:
+            volume, area, center, inertia, _ = solid
         else:
             solids = [np.asarray(whole.vertices)] if hulls is None else hulls
             pieces = tuple(Piece("mesh", (0, 0, 0), vertices=solid) for solid in solids)
             volume, center, inertia = mass_properties(pieces, np.ones(len(pieces)))
-        mass = guessed_mass(volume, float(whole.area)) if options.density is None else options.density * volume
+        mass = guessed_mass(volume, area) if options.density is None else options.density * volume
         found = Weight(mass, center, inertia * mass / volume)
     mass = found.mass if options.mass is None else options.mass
     return Weight(mass, found.center, found.inertia * (mass / found.mass))
@@ -255,6 +284,7 @@ def _labels(
     center: np.ndarray,
     points: np.ndarray,
     face: np.ndarray,
+    up: Up,
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names of the parts, which of them form the graspable region, and the part (N,) of each surface point."""
     if source.parts_are_pieces:
@@ -262,10 +292,9 @@ def _labels(
         labels = np.searchsorted(ends, face, side="right")
     elif source.parts:
         distances = []
-        for file in source.parts:
-            part = read_mesh(file.path)
+        for part in _scaled_parts(source, factor, up):
             dense, _ = trimesh.sample.sample_surface(part, 4000, seed=0)
-            distances.append(cKDTree(dense * factor - center).query(points)[0])
+            distances.append(cKDTree(dense - center).query(points)[0])
         labels = np.argmin(distances, axis=0)
     else:
         labels = halves(points, 0.5)

@@ -12,9 +12,10 @@ from congrasp.common.objects import store
 from congrasp.common.objects.procedural import family_turns, generate
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.parallel import parallel_map
+from congrasp.services.assets.objects.mesh_files import SUFFIXES
 from congrasp.services.assets.objects.meshes import import_source, import_sources
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.sources import SUFFIXES, Source, find_sources
+from congrasp.services.assets.objects.sources import Source, find_sources
 
 _log = logging.getLogger(__name__)
 _METRES_OR_ASK = ImportOptions()

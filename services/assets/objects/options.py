@@ -6,7 +6,7 @@ import pathlib
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import can_cache
 from congrasp.common.objects.spec import MAX_MESH_PIECES
-from congrasp.services.assets.objects.sizes import Unit
+from congrasp.services.assets.objects.sizes import Unit, Up
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +30,8 @@ class ImportOptions:
     """Seconds for the convex decomposition (CoACD) of one mesh; V-HACD takes over after it."""
     max_pieces: int = MAX_MESH_PIECES
     """Largest number of convex pieces of an object; more are merged."""
+    up: Up = dataclasses.field(default="auto", repr=False)  # and so not in the seed of surface points
+    """Axis that points up in the files, which becomes z: auto takes y for GLB, as glTF prescribes, and z for others."""
     cache_dir: str = ""
     """Folder that caches finished imports; the user's cache folder if empty."""
 

@@ -76,6 +76,80 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices[used], faces.reshape(-1, 3), process=False)
 
 
+def bodies(vertices: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Vertices (V, 3) and faces (F, 3) of each body of a closed mesh, with the hollows inside of it."""
+    count, labels = _components(faces, len(vertices))
+    owner = labels[faces[:, 0]]
+    shells = [faces[owner == i] for i in range(count)]
+    solid = [shell for shell in shells if len(shell) and np.linalg.det(vertices[shell]).sum() > 0]
+    for shell in shells:
+        if not len(shell) or np.linalg.det(vertices[shell]).sum() > 0:
+            continue
+        low, high = vertices[shell].min((0, 1)), vertices[shell].max((0, 1))
+        around = [
+            i
+            for i, body in enumerate(solid)
+            if (vertices[body].min((0, 1)) <= low).all() and (vertices[body].max((0, 1)) >= high).all()
+        ]
+        if around:
+            i = min(around, key=lambda i: float(np.ptp(vertices[solid[i]].reshape(-1, 3), axis=0).prod()))
+            solid[i] = np.concatenate([solid[i], shell])
+    parts = [np.unique(body, return_inverse=True) for body in solid]
+    return [(vertices[used], places.reshape(-1, 3)) for used, places in parts]
+
+
+def encloses(mesh: trimesh.Trimesh) -> bool:
+    """True if a mesh encloses a volume: its triangles pass each edge as often forwards as backwards.
+
+    Bodies of it may touch along edges, or intersect.
+    """
+    edges = np.asarray(mesh.edges)
+    _, group = np.unique(_codes(edges), return_inverse=True)
+    passes = np.bincount(group.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    return not passes.any() and float(np.linalg.det(mesh.triangles).sum()) > 0
+
+
+def is_manifold(faces: np.ndarray) -> bool:
+    """True if each edge of triangles (F, 3) belongs to two of them."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return bool((np.unique(_codes(edges), return_counts=True)[1] == 2).all())
+
+
+def _codes(edges: np.ndarray) -> np.ndarray:
+    """(E,) numbers of edges (E, 2), the same in both directions."""
+    return edges.min(1).astype(np.int64) * (int(edges.max(initial=0)) + 1) + edges.max(1)
+
+
+def without_repeats(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+    """The mesh with each triangle once.
+
+    Of triangles that coincide and face one another, both are left out if the mesh is closed without them (bodies that
+    touch); otherwise one remains (a sheet with two sides).
+    """
+    faces = np.asarray(mesh.faces)
+    corners, group = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
+    if len(corners) == len(faces):
+        return mesh
+    group = group.reshape(-1)
+    ahead = _even(faces).astype(int)
+    net = np.bincount(group, 2 * ahead - 1, len(corners))
+    first = np.full((2, len(corners)), -1)
+    for side in (0, 1):
+        rows = np.flatnonzero(ahead == side)[::-1]
+        first[side, group[rows]] = rows
+    kept = np.where(net > 0, first[1], np.where(net < 0, first[0], np.minimum(first[0], first[1])))
+    single = trimesh.Trimesh(mesh.vertices, faces[np.sort(kept)], process=False)
+    without = trimesh.Trimesh(mesh.vertices, faces[np.sort(kept[net != 0])], process=False)
+    best = without if (net != 0).any() and without.is_watertight else single
+    notes.append(f"{len(faces) - len(best.faces)} of its triangles were repeated and were left out")
+    return best
+
+
+def _even(faces: np.ndarray) -> np.ndarray:
+    """(F,) bool: triangles (F, 3) whose corners are an even permutation of their order."""
+    return ((faces[:, 0] < faces[:, 1]).astype(int) + (faces[:, 1] < faces[:, 2]) + (faces[:, 2] < faces[:, 0])) == 2
+
+
 def _components(faces: np.ndarray, count: int) -> tuple[int, np.ndarray]:
     """Connected components of triangles (F, 3) over `count` vertices: their number, and that of each vertex."""
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])

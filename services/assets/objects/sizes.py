@@ -8,6 +8,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 
 Unit = Literal["auto", "guess", "m", "cm", "mm", "in"]
+Up = Literal["auto", "y", "z"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _PLAUSIBLE = (0.01, 0.6)  # m, longest side for which metres are assumed

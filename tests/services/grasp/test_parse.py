@@ -83,6 +83,27 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
         asked(block, affordance=str(tmp_path / "metres.ply"))
 
 
+def test_what_refers_to_a_file_with_y_up_turns_with_it(block, tmp_path):
+    """The quarter turn takes (x, y, z) to (x, -z, y)."""
+    turned = dataclasses.replace(block, file_up="y")
+    x, y, z = CENTER
+    given = asked(turned, heading="0 -2 0", at=f"{x} {z + 0.04} {-y}")
+    np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
+    np.testing.assert_allclose(given.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
+    upper = trimesh.creation.box((0.04, 0.05, 0.05)).apply_translation(np.add(CENTER, [0, 0, 0.035])).apply_scale(1000)
+    upper.vertices = upper.vertices[:, [0, 2, 1]] * [1, 1, -1]
+    high, clear = block.points[:, 2] > 0.01, np.abs(block.points[:, 2] - 0.01) > 0.005
+    for suffix in ("ply", "glb", "stl"):
+        upper.export(tmp_path / f"upper.{suffix}")
+        avoid = asked(turned, avoid=tmp_path / f"upper.{suffix}").avoid
+        np.testing.assert_array_equal(avoid[clear], high[clear])
+    wrist = {"position": [x, z + 0.2, -y], "quaternion": [1, 0, 0, 0], "joints": {}}
+    (tmp_path / "pose.json").write_text(json.dumps(wrist))
+    pose = asked(turned, pose=str(tmp_path / "pose.json")).constraints["pose"]
+    np.testing.assert_allclose(pose["position"], [0, 0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(pose["quaternion"], [np.sqrt(0.5), np.sqrt(0.5), 0, 0])
+
+
 def test_references_come_from_motions_json_and_csv(block, tmp_path):
     motion = motion_of_episode(episode())
     save_motion(tmp_path / "grasp.npz", motion)

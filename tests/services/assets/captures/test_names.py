@@ -1,10 +1,12 @@
 """Names in the files of data sets lead nowhere else."""
 
 import pathlib
+import types
 
 import pytest
 
 from congrasp.common.errors import CongraspError
+from congrasp.services.assets.captures import build
 from congrasp.services.assets.captures.dexycb import _betas, _yaml
 from congrasp.services.assets.captures.grab import _template
 from congrasp.services.assets.captures.objects import Meshes
@@ -25,6 +27,14 @@ def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folder
     inside, outside = ({"rhand/vtemp": name} for name in ("y.obj", "../x.obj"))
     assert _template(tmp_path / "in", inside) == pathlib.Path(tmp_path / "in" / "y.obj")
     assert _template(tmp_path / "in", outside) is None
+
+
+def test_objects_of_one_name_and_different_meshes_get_different_names(monkeypatch):
+    named = {}
+    monkeypatch.setattr(build, "import_meshes", lambda names, progress: named.update(names) or {})
+    files = [pathlib.Path(folder, "cup.obj") for folder in "aba"]
+    build._shapes([types.SimpleNamespace(mesh=file, object_name="cup") for file in files], print)
+    assert named == {files[0]: "cup", files[1]: "cup-2"}
 
 
 @pytest.mark.parametrize("text", ["[" * 50_000, "a: " * 5, "\x00", "- a", "a: &x [1]\nb: [*x, *x]"])

@@ -13,12 +13,12 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import faults, hand_text
 from congrasp.services.assets.hands import check, servos
 from congrasp.services.assets.hands.check import check_hand
-from congrasp.services.assets.hands.model_files import import_hand
+from congrasp.services.assets.hands.model_files import propose
 from congrasp.services.cli import main
 from congrasp.services.train.recipe import recipe
 from congrasp.services.viz import check_sheet
 
-CLAW = import_hand(pathlib.Path(__file__).parents[3] / "hands" / "claw.urdf").hand
+CLAW = propose(pathlib.Path(__file__).parents[3] / "hands" / "claw.urdf").hand
 HANDS = {"claw": CLAW, **{name: get_hand(name) for name in ("human", "allegro", "sharpa")}}
 SLOW = ("allegro", "sharpa")
 

@@ -21,7 +21,7 @@ import pytest
 
 from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
 from congrasp.common.hands.spec import chain_of
-from congrasp.services.assets.hands.model_files import Proposal, import_hand
+from congrasp.services.assets.hands.model_files import Proposal, propose
 
 VARIABLE = "CONGRASP_TEST_HANDS"
 SHADOW = "gymnasium_robotics/envs/assets/hand/reach.xml"
@@ -118,7 +118,7 @@ def _find(file: str) -> pathlib.Path:
 
 @functools.cache
 def _imported(file: str) -> Proposal:
-    return import_hand(_find(file))
+    return propose(_find(file))
 
 
 def _tips(hand, q):

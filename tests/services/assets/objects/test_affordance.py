@@ -1,4 +1,6 @@
-"""Partitions from part meshes, painted vertices and half-spaces: the known halves of a box, and what is refused."""
+"""Partitions from part meshes, painted vertices, half-spaces and cuts that a hand can hold; and what is refused."""
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -6,7 +8,10 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import store
+from congrasp.common.objects.procedural import generate
+from congrasp.services.assets.objects import affordance
 from congrasp.services.assets.objects.affordance import in_half_space, on_part_mesh, painted, two_parts
+from congrasp.services.assets.objects.meshes import UNLABELLED
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
@@ -103,3 +108,56 @@ def test_the_command_stores_the_new_object(box, folder, tmp_path, capsys):
         load("objects")([*run, "--half-space", "0", "0", "1"])()
     with pytest.raises(CongraspError, match="nothing is divided"):
         load("objects")([*run, "--half-space", "0", "0", "1", "-0.062"])()
+
+
+@pytest.fixture
+def imported(tmp_path, quick_import):
+    """Imports a mesh, without a decomposition and its errors."""
+
+    def run(mesh):
+        mesh.export(tmp_path / "thing.stl")
+        (obj,) = objects_of(tmp_path / "thing.stl", ImportOptions(cache_dir=str(tmp_path / "cache")))
+        return affordance.cut_to_hold(obj)
+
+    return run
+
+
+def test_halves_that_can_be_held_stay(imported):
+    obj = imported(trimesh.creation.cylinder(0.02, 0.2))
+    assert obj.part_names == UNLABELLED and 0.45 < obj.graspable[obj.labels].mean() < 0.55
+    assert affordance.covered(obj).all() and affordance.UNCOVERED not in obj.notes
+
+
+def test_halves_that_cannot_be_held_are_cut_elsewhere(imported):
+    """A can of 4 x 4 cm: of neither half fingers keep a centimetre off the other, as they are that thick."""
+    obj = imported(trimesh.creation.cylinder(0.02, 0.04))
+    assert affordance.covered(obj).any()
+    halved = obj.points[:, 2] > 0
+    for half in (halved, ~halved):
+        plain = dataclasses.replace(obj, labels=np.where(half, 0, 1), graspable=np.array([True, False]))
+        assert affordance.covered(plain).sum() < affordance.covered(obj).sum()
+    # The pieces follow the labels.
+    assert {piece.part for piece in obj.pieces} <= {0, 1}
+
+
+def test_an_object_without_a_graspable_half_has_a_note(monkeypatch):
+    free = affordance.covered
+
+    def never(obj, *, use_affordance=True):
+        return np.zeros(len(obj.rest_poses), bool) if use_affordance else free(obj, use_affordance=False)
+
+    monkeypatch.setattr(affordance, "covered", never)
+    obj = generate(3, "cylinder")
+    cut = affordance.cut_to_hold(obj)
+    assert cut.notes == (*obj.notes, affordance.UNCOVERED)
+    np.testing.assert_array_equal(cut.labels, obj.labels)
+
+
+@pytest.mark.parametrize("family", ["ball", "prism", "box", "lathed"])
+@pytest.mark.parametrize("seed", [1_000_000, *(pytest.param(1_000_000 + i, marks=pytest.mark.slow) for i in (1, 2))])
+def test_a_cut_covers_no_fewer_resting_poses(family, seed):
+    obj = generate(seed, family)
+    cut = affordance.cut_to_hold(obj)
+    assert affordance.covered(cut).sum() >= affordance.covered(obj).sum()
+    assert 0.1 <= cut.graspable[cut.labels].mean() <= 0.9
+    np.testing.assert_array_equal(cut.points, obj.points)

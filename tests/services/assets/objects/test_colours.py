@@ -62,7 +62,7 @@ def test_colours_of_corners_are_mixed_in_between(suffix, tmp_path):
     colours = np.where(box.vertices[:, 2:] > SIDE / 2, GREEN, RED)
     box.visual = trimesh.visual.ColorVisuals(box, vertex_colors=np.c_[colours, np.full(36, 255)])
     box.export(tmp_path / f"cube.{suffix}")
-    found = sample_colours([tmp_path / f"cube.{suffix}"], seed=0)
+    found = sample_colours([tmp_path / f"cube.{suffix}"], seed=0, up="z")
     assert found is not None
     np.testing.assert_allclose(found.values[:, 1], 255 * found.points[:, 2] / SIDE, atol=1.5)
 

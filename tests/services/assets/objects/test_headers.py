@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.assets.objects.sources import read_mesh
+from congrasp.services.assets.objects.mesh_files import read_mesh
 from tests.limits import limited
 
 _PLY = (
@@ -46,7 +46,7 @@ def _twice(tree):
         pytest.param("a.ply", _PLY % 0 + _FACES % 4_000_000_000 + bytes(99), "announces 4000000000", id="PLY faces"),
         pytest.param("a.ply", b"ply\nformat ascii 1.0\nelement vertex -5\nend_header\n", "without values", id="PLY -5"),
         pytest.param("a.ply", b"ply\n" + b"comment\n" * 10_000, "does not end", id="PLY without an end"),
-        pytest.param("a.stl", bytes(80) + b"\xff" * 4 + bytes(50), "no triangles", id="STL"),
+        pytest.param("a.stl", bytes(80) + b"\xff" * 4 + bytes(50), "only 0 proper triangles", id="STL"),
         pytest.param("a.glb", _glb(lambda t: t["accessors"][0].update(count=1 << 33)), "has a count", id="GLB count"),
         pytest.param(
             "a.glb",

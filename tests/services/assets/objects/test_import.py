@@ -62,24 +62,6 @@ def test_pieces_and_halves_of_a_block(tmp_path, options):
     assert obj.non_graspable_points.mean() == pytest.approx(0.35, abs=0.01)
 
 
-def test_units_scale_density_and_mass(tmp_path, options, quick_import):
-    block(1000 * SIDES).export(tmp_path / "block.stl")
-    with pytest.raises(CongraspError, match=r"block\.stl is 80 m long .*too large.*--unit mm' \(8 cm\)") as error:
-        objects_of(tmp_path / "block.stl", options)
-    assert "\n" not in str(error.value)
-    with pytest.raises(CongraspError, match=r"is 0\.08 mm long.*too small.*--scale 0\.00125"):
-        objects_of(tmp_path / "block.stl", ImportOptions("m", 1e-6, cache_dir=options.cache_dir))
-    made = ImportOptions("mm", 0.5, density=3000.0, cache_dir=options.cache_dir)
-    (obj,) = objects_of(tmp_path / "block.stl", made)
-    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), SIDES / 2, rtol=1e-5)
-    np.testing.assert_allclose(obj.mass, 3000 * np.prod(SIDES / 2), rtol=1e-5)
-    (heavy,) = objects_of(tmp_path / "block.stl", ImportOptions("mm", mass=0.7, cache_dir=options.cache_dir))
-    assert heavy.mass == 0.7
-    (light,) = objects_of(tmp_path / "block.stl", ImportOptions("mm", density=1.0, cache_dir=options.cache_dir))
-    np.testing.assert_allclose(light.mass, np.prod(SIDES), rtol=1e-5)
-    np.testing.assert_allclose(light.inertia / light.mass, heavy.inertia / 0.7, rtol=1e-6)
-
-
 def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import, monkeypatch):
     path = tmp_path / "block.stl"
     block().export(path)
@@ -96,32 +78,6 @@ def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import,
     for cached in (tmp_path / "cache").iterdir():
         cached.write_bytes(b"damaged")
     assert digest(objects_of(path, options)[0]) == digest(larger)
-
-
-@pytest.mark.parametrize("names", [("graspable", "non_graspable"), ("top_watertight_tiny", "bottom_watertight_tiny")])
-def test_part_files_become_the_parts(tmp_path, options, quick_import, names):
-    folder = tmp_path / "tool"
-    folder.mkdir()
-    block((0.02, 0.02, 0.1), (0, 0, 0.05)).export(folder / f"{names[0]}.obj")
-    block((0.06, 0.02, 0.03), (0, 0, 0.115)).export(folder / f"{names[1]}.obj")
-    (obj,) = objects_of(folder, options)
-    assert (obj.name, obj.part_names) == ("tool", ("graspable", "non-graspable"))
-    assert obj.graspable.tolist() == [True, False]
-    top = 0.115 - 0.015 - (0.02 * 0.02 * 0.1 * 0.05 + 0.06 * 0.02 * 0.03 * 0.115) / (0.02**2 * 0.1 + 0.06 * 0.02 * 0.03)
-    clear = np.abs(obj.points[:, 2] - top) > 1e-4
-    np.testing.assert_array_equal(obj.non_graspable_points[clear], obj.points[clear, 2] > top)
-    assert [piece.part for piece in obj.pieces] == [0, 1]
-
-
-def test_a_tiny_part_mesh_is_ignored(tmp_path, options, quick_import):
-    folder = tmp_path / "ball"
-    folder.mkdir()
-    block().export(folder / "top.obj")
-    block((0.01,) * 3, (0.346408,) * 3).export(folder / "bottom.obj")
-    (obj,) = objects_of(folder, options)
-    assert obj.part_names == ("graspable",)
-    assert not obj.non_graspable_points.any()
-    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), SIDES, rtol=1e-5)
 
 
 def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import):
@@ -194,38 +150,6 @@ def test_an_open_mesh_counts_its_hull(tmp_path, options, hull_alone):
     assert any("surface is open" in note and "convex hull" in note for note in obj.notes)
     assert (obj.volume_error, obj.notes[-1].endswith("because the mesh is open")) == (None, True)
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-4)
-
-
-def far_obj(path):
-    path.write_text("v 1e200 0 0\nv -1e200 0 0\nv 0 1e200 0\nv 0 0 1e200\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
-
-
-def slanted_obj(path):
-    path.write_text("v 0 0 0\nv .1 0 .1\nv .1 .1 .1\nv 0 .1 0\nv .05 .05 .05\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n")
-
-
-BAD = {
-    "text.stl": (lambda path: path.write_text("not a mesh"), "no triangles"),
-    "text.ply": (lambda path: path.write_text("not a mesh"), "cannot be read as PLY"),
-    "text.glb": (lambda path: path.write_text("not a mesh"), "cannot be read as GLB"),
-    "far.obj": (far_obj, r"coordinate of 1e\+200. 1e\+12 is the most"),
-    "slanted.obj": (slanted_obj, "points lie in a plane"),
-    "triangle.obj": (lambda path: path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "only 1 proper triangles"),
-    "drawing.step": (lambda path: path.write_text("ISO"), "not an STL, OBJ, PLY or GLB"),
-    "folder": (lambda path: path.mkdir(), "holds no STL, OBJ, PLY or GLB"),
-    "missing.stl": (lambda path: None, "no file or folder"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_meshes_are_one_line(tmp_path, options, name):
-    make, expected = BAD[name]
-    make(tmp_path / name)
-    with pytest.raises(CongraspError, match=expected) as error:
-        objects_of(tmp_path / name, options)
-    assert name in str(error.value)
-    assert "\n" not in str(error.value)
-    assert not list((tmp_path / "cache").glob("*"))
 
 
 @pytest.mark.parametrize("bad", [{"scale": 0.0}, {"density": -1.0}, {"mass": 0.0}, {"time_limit": float("nan")}])
@@ -306,7 +230,8 @@ def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert result.method == "vhacd"
     assert result.notes == ["coacd took longer than 0.01 s of processor time"]
-    assert sum(shapes.hull_of(piece).volume for piece in result.pieces) < 1.2 * mesh.volume
+    volume = sum(shapes.hull_of(piece).volume for piece in result.pieces)
+    assert 0.8 * mesh.volume < volume < 1.2 * mesh.volume
     monkeypatch.setattr(decompose, "FALLBACK_LIMIT", 0.01)
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert (result.method, len(result.pieces)) == ("hull", 1)

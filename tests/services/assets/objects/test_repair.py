@@ -1,18 +1,13 @@
 """Broken meshes: each is repaired with a note, or rejected with the remedy."""
 
-import struct
-import zipfile
-
 import numpy as np
 import pytest
 import trimesh
 
-from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects import repair
-from congrasp.services.assets.objects.meshes import import_source
+from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.repair import closed, largest_body, reduced
-from congrasp.services.assets.objects.sources import find_sources
 
 RADIUS = 0.03
 
@@ -21,163 +16,28 @@ def ball(**options):
     return trimesh.creation.icosphere(subdivisions=2, radius=RADIUS, **options)
 
 
-@pytest.fixture
-def brought(tmp_path, quick_import):
-    """Imports a mesh, or bytes, from a file of a name; returns the object and its notes."""
-
-    def bring(content, name="thing.stl", **options):
-        path = tmp_path / name
-        if isinstance(content, bytes):
-            path.write_bytes(content)
-        else:
-            content.export(path)
-        (source,) = find_sources(path)
-        obj = import_source(source, ImportOptions(unit="guess", cache_dir=str(tmp_path / "cache"), **options))
-        return obj, obj.notes
-
-    return bring
-
-
-def test_a_sound_mesh_has_no_notes(brought):
-    _, notes = brought(ball())
-    assert [note for note in notes if "convex piece stands for it" not in note] == []
-
-
-def test_millimetres_for_metres(brought):
-    mesh = ball()
-    mesh.apply_scale(1000)
-    obj, notes = brought(mesh)
-    assert notes[0] == (
-        "it would be 60 m long in metres, so its numbers are taken as millimetres: 6 cm "
-        "(if that is wrong, add --unit or --scale)"
-    )
-    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), 2 * RADIUS, rtol=0.01)
-    mesh.apply_scale(0.1)  # 6 of what may be centimetres or inches
-    with pytest.raises(CongraspError, match=r"'--unit cm' \(6 cm\); if inches, add '--unit in' \(15.2 cm\)"):
-        brought(mesh, "unclear.stl")
-
-
-def test_inside_out(brought):
-    mesh = ball()
-    mesh.invert()
-    obj, notes = brought(mesh)
-    assert "it was inside out and was turned" in notes
-    assert (obj.normals * obj.points).sum(-1).min() > 0
-
-
-def test_some_triangles_inside_out(brought):
-    mesh = ball()
-    mesh.faces[::7] = np.asarray(mesh.faces)[::7, ::-1]
-    obj, notes = brought(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
-    assert "some of its triangles faced inwards and were turned" in notes
-    assert (obj.normals * obj.points).sum(-1).min() > 0
-
-
-def test_a_small_hole_is_closed_and_an_opening_is_left(brought):
-    mesh = ball()
-    mesh.update_faces(np.arange(len(mesh.faces)) > 1)  # two triangles that meet in one corner
-    obj, notes = brought(mesh)
-    assert "2 holes in its surface were closed" in notes
-    np.testing.assert_allclose(obj.mass, max(500 * ball().volume, 0.05), rtol=0.02)
-    half = ball()
+def test_an_opening_is_left_and_bodies_that_touch_stay_together():
+    half, said = ball(), list[str]()
     half.update_faces(half.triangles_center[:, 2] < 0)
-    said: list[str] = []
     assert len(closed(half, said).faces) == len(half.faces) and not said  # a bowl stays a bowl
-
-
-def test_empty(brought):
-    with pytest.raises(CongraspError, match=r"thing.stl is empty \(0 bytes\). Export or download it again."):
-        brought(b"")
-    with pytest.raises(CongraspError, match=r"points.obj has no triangles: it holds nothing that can be read as"):
-        brought(b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "points.obj")
-
-
-def test_planar(brought):
-    grid = trimesh.Trimesh([(0, 0, 0), (0.1, 0, 0), (0.1, 0.1, 0), (0, 0.1, 0), (0.05, 0.05, 0)],
-                           [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)])  # fmt: skip
-    with pytest.raises(CongraspError, match=r"thing.stl is flat: it is 0 mm thick. Give it a thickness in a modelling"):
-        brought(grid)
-
-
-def test_two_bodies(brought):
-    far = ball()
-    far.apply_scale(0.5)
-    far.apply_translation([0.2, 0, 0])
-    obj, notes = brought(trimesh.util.concatenate([far, ball()]))
-    assert notes[0].startswith("it holds 2 separate bodies; the largest was taken (80% of the surface)")
-    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), 2 * RADIUS, rtol=0.01)
-    touching = ball()
-    touching.apply_translation([2 * RADIUS, 0, 0])
-    said: list[str] = []
-    assert len(largest_body(trimesh.util.concatenate([touching, ball()]), said).faces) == 2 * len(ball().faces)
-    assert not said
+    pair = trimesh.util.concatenate([ball(), ball().apply_translation([2 * RADIUS, 0, 0])])
+    assert len(largest_body(pair, said).faces) == 2 * len(ball().faces) and not said
 
 
 @pytest.mark.slow
-def test_millions_of_triangles(brought, monkeypatch):
+def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
     monkeypatch.setattr(repair, "_REDUCED", 20_000)
     monkeypatch.setattr(repair, "MAX_FACES", 2_000)
     fine = trimesh.creation.icosphere(subdivisions=6, radius=RADIUS)
-    obj, notes = brought(fine)
+    fine.export(tmp_path / "fine.stl")
+    obj = one_object(tmp_path / "fine.stl", ImportOptions(cache_dir=str(tmp_path / "cache")))
+    notes = obj.notes
     assert notes[0] == "its 81,920 triangles were reduced to 2,000: a hand does not feel the rest"
     assert len(obj.visual_faces) <= 2_000 and not [note for note in notes if "open" in note]
     np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.02)
     soup = fine.vertices[fine.faces].reshape(-1, 3)  # as STL files have it: no triangle shares a corner
     vertices, faces = reduced(soup, np.arange(len(soup)).reshape(-1, 3), [])
     assert trimesh.Trimesh(vertices, faces).is_watertight
-
-
-def test_points_that_are_not_finite(brought):
-    mesh = ball()
-    mesh.vertices[3] = np.nan
-    obj, notes = brought(mesh, "thing.ply")
-    assert notes[0] == "1 of its points is not a number and was left out"
-    assert "1 hole in its surface was closed" in notes and np.isfinite(obj.visual_vertices).all()
-    mesh.vertices[:40] = np.nan
-    with pytest.raises(CongraspError, match=r"bad.ply has 40 vertices that are not finite numbers. Repair or export"):
-        brought(mesh, "bad.ply")
-
-
-def test_a_wrong_extension(brought):
-    for name in ("thing.obj", "thing.txt", "thing"):
-        _, notes = brought(ball().export(file_type="stl"), name)
-        assert notes[0] == "its content is STL, whatever its name says, and was read as that"
-    text = ball().export(file_type="stl_ascii")
-    assert "STL" in brought(text if isinstance(text, bytes) else text.encode(), "text.ply")[1][0]
-    assert "GLB" in brought(ball().export(file_type="glb"), "thing.stl")[1][0]
-    for start, complaint in (
-        (b"Kaydara FBX Binary  \x00", "is an FBX file. Open it in Blender and export it as GLB or OBJ."),
-        (b"<!DOCTYPE html><html>", "is a web page, not a mesh. Download the file itself again."),
-        (b"ISO-10303-21;\n", "is a STEP file (surfaces, no triangles). Open it in FreeCAD and export it as STL."),
-        (b"anything else", "is not an STL, OBJ, PLY or GLB file. Convert it to STL, OBJ, PLY or GLB."),
-    ):
-        with pytest.raises(CongraspError) as caught:
-            brought(start, "thing.xyz")
-        assert str(caught.value).endswith(f"thing.xyz {complaint}")
-
-
-def test_a_zip(brought, tmp_path):
-    with zipfile.ZipFile(tmp_path / "made.zip", "w") as archive:
-        archive.writestr("models/mug.obj", "v 0 0 0")
-        archive.writestr("licence.txt", "free")
-    data = (tmp_path / "made.zip").read_bytes()
-    for name in ("mug.zip", "mug.stl"):
-        with pytest.raises(CongraspError, match=rf"{name} is a zip archive with models/mug.obj in it. Unpack it and"):
-            brought(data, name)
-
-
-def test_notes_come_back_from_the_cache(brought):
-    mesh = ball()
-    mesh.invert()
-    assert brought(mesh)[1] == brought(mesh)[1] != []
-
-
-def test_a_binary_stl_may_begin_with_solid(brought):
-    data = ball().export(file_type="stl")
-    (count,) = struct.unpack("<I", data[80:84])
-    assert count == len(ball().faces)
-    obj, notes = brought(b"solid ".ljust(80) + data[80:])
-    assert obj.name == "thing" and not [note for note in notes if "content" in note]
 
 
 def test_a_surface_without_an_outside_is_unchanged():

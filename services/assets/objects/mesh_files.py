@@ -1,0 +1,397 @@
+"""Mesh files: their kind by content, limits before they are read, and what the readers of trimesh leave to the caller.
+
+STL is read here, by its content and size. Before trimesh reads them, an OBJ's relative indices become absolute, and a
+GLB's integers the numbers that they stand for (`gltf`).
+"""
+
+import array
+import io
+import pathlib
+import re
+import stat
+import zipfile
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.inputs import read_file
+from congrasp.services.assets.objects import repair
+from congrasp.services.assets.objects.gltf import MAX_FACES, plain_glb
+from congrasp.services.assets.objects.sizes import Up
+
+SUFFIXES = (".stl", ".obj", ".ply", ".glb")
+CONVERT = "Convert it to STL, OBJ, PLY or GLB."
+MAX_BYTES = 512 << 20
+"""Bytes of a mesh file."""
+_AGAIN = "Export it again, or convert it."
+_BLENDER = "Open it in Blender and export it as GLB or OBJ."
+_UNPACK = "Unpack it and name the mesh inside."
+_SURFACE = "Make a surface of it (in MeshLab: Filters, Remeshing, Screened Poisson) and export that."
+_FREECAD = "Open it in FreeCAD and export it as STL."
+_FOREIGN = (
+    (b"Kaydara FBX", "an FBX file", _BLENDER),
+    (b"; FBX", "an FBX file", _BLENDER),
+    (b"BLENDER", "a Blender file", _BLENDER),
+    (b"ISO-10303-21", "a STEP file (surfaces, no triangles)", _FREECAD),
+    (b"DBRep_DrawableShape", "a BREP file (surfaces, no triangles)", _FREECAD),
+    (b"CASCADE Topology", "a BREP file (surfaces, no triangles)", _FREECAD),
+    (b"\xd0\xcf\x11\xe0", "a document of a CAD program", "Open it there and export it as STL."),
+    (b"3D Geometry File", "a Rhino file", "Open it in Rhino and export it as STL."),
+    (b"AC10", "a DWG drawing", _FREECAD),
+    (b"MM", "a 3DS file", _BLENDER),
+    (b"PXR-USDC", "a USD scene", "Open it in Blender and export it as GLB."),
+    (b"#usda", "a USD scene", "Open it in Blender and export it as GLB."),
+    (b"OFF", "an OFF file", "Open it in MeshLab and export it as STL."),
+    (b"#VRML", "a VRML file", _BLENDER),
+    (b"# vtk", "a VTK file", "Open it in ParaView and export it as STL."),
+    (b"# .PCD", "a point cloud (PCD)", _SURFACE),
+    (b"LASF", "a point cloud (LAS)", _SURFACE),
+    (b"ASTM-E57", "a point cloud (E57)", _SURFACE),
+    (b"\x1f\x8b", "a gzip archive", _UNPACK),
+    (b"\x28\xb5\x2f\xfd", "a zstd archive", _UNPACK),
+    (b"7z\xbc\xaf", "a 7z archive", _UNPACK),
+    (b"Rar!", "a RAR archive", _UNPACK),
+    (b"BZh", "a bzip2 archive", _UNPACK),
+    (b"\xfd7zXZ", "an xz archive", _UNPACK),
+    (b"\x89PNG", "a picture", "Name the mesh."),
+    (b"\xff\xd8\xff", "a picture", "Name the mesh."),
+    (b"%PDF", "a PDF document", "Name the mesh."),
+    (b"version https://git-lfs", "a Git LFS pointer, not the mesh itself", "Fetch it with 'git lfs pull'."),
+    (b"<!doctype html", "a web page, not a mesh", "Download the file itself again."),
+    (b"<html", "a web page, not a mesh", "Download the file itself again."),
+)
+"""Beginnings of files that are no meshes, or of other formats."""
+_XML = (
+    (b"<collada", "a COLLADA file (.dae)", _BLENDER),
+    (b"<x3d", "an X3D file", _BLENDER),
+    (b"<amf", "an AMF file", "Open it in a slicer and export it as STL."),
+    (b"<robot", "a robot description (URDF)", "Name its mesh, or import a hand with 'congrasp hands import'."),
+    (b"<mujoco", "a robot description (MJCF)", "Name its mesh, or import a hand with 'congrasp hands import'."),
+    (b"<svg", "a drawing (SVG)", "Name the mesh."),
+)
+_STL_HEADER, _STL_TRIANGLE = 84, 50  # bytes
+_STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+_RELATIVE = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t/]-\d")
+_ZERO = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t]0+(?=[/\s]|$)")
+_COMMA = re.compile(rb"(?m)^[ \t]*v[ \t]+-?\d+,\d")
+_START = 4096
+_FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and products are finite
+_PLY_HEADER = 1 << 16  # bytes
+_SIZES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
+_SIZES |= {"int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8}
+
+
+@np.errstate(all="ignore")  # of numbers that are refused, or far out
+def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto") -> trimesh.Trimesh:
+    """Reads one mesh, in the file's own unit, with merged vertices and each proper triangle once.
+
+    Args:
+      path: the file; its content determines the kind, not its name.
+      notes: repairs are appended.
+      up: axis that points up in the file; a y axis becomes z. `auto` is y for GLB and z for others.
+
+    Raises:
+      CongraspError: not a mesh, empty, or not finite.
+    """
+    said = [] if notes is None else notes
+    suffix = kind_of(path)
+    kind = suffix[1:].upper()
+    if suffix != path.suffix.lower():
+        said.append(f"its content is {kind}, whatever its name says, and was read as that")
+    mesh = load_geometry(path, _AGAIN, notes=said, skip_materials=True)
+    mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
+    if not len(getattr(mesh, "faces", ())):
+        raise CongraspError(*_without_triangles(path, len(getattr(mesh, "vertices", ())), kind))
+    if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+        raise CongraspError(f"{path} has points that are not of three numbers.", _AGAIN)
+    if len(mesh.faces) > MAX_FACES or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise CongraspError(f"{path} has triangles without vertices, or too many.", _AGAIN)
+    finite = repair.without_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), said)
+    if finite is None:
+        bad = int((~np.isfinite(mesh.vertices)).any(-1).sum())
+        raise CongraspError(f"{path} has {bad} vertices that are not finite numbers.", "Repair or export it again.")
+    if (farthest := np.abs(finite[0]).max(initial=0.0)) > _FARTHEST:
+        raise CongraspError(f"{path} has a coordinate of {farthest:.3g}.", f"{_FARTHEST:g} is the most, in any unit.")
+    vertices, faces = repair.reduced(*finite, said)
+    apart = trimesh.Trimesh(upright(vertices, up_of(path, up)), faces, process=False)
+    mesh = apart.copy()
+    mesh.merge_vertices()
+    if len(mesh.faces):
+        mesh.update_faces(mesh.nondegenerate_faces())
+        mesh = repair.without_repeats(mesh, said)
+        mesh.remove_unreferenced_vertices()
+    if apart.is_watertight and not mesh.is_watertight:  # bodies that touch along an edge
+        mesh = apart
+    if len(mesh.faces) < 4:
+        raise CongraspError(f"{path} has no volume: only {len(mesh.faces)} proper triangles.", "Export a closed mesh.")
+    return mesh
+
+
+def up_of(path: pathlib.Path, up: Up = "auto") -> Literal["y", "z"]:
+    """The axis that points up in a mesh file: y in GLB by the standard of glTF, z in others, unless it is given."""
+    return up if up != "auto" else "y" if kind_of(path) == ".glb" else "z"
+
+
+def upright(points: np.ndarray, up: Literal["y", "z"]) -> np.ndarray:
+    """Points or vectors (..., 3) of a file whose `up` axis points up, turned so that z does."""
+    return points if up == "z" else np.asarray(points)[..., [0, 2, 1]] * [1, -1, 1]
+
+
+def load_geometry(path: pathlib.Path, remedy: str, *, notes: list[str] | None = None, **options: Any) -> Any:
+    """Loads a file with trimesh, as a mesh, a point cloud or a scene, in the file's axes and unit.
+
+    Args:
+      path: the file; its content determines the kind, not its name.
+      remedy: remedy for the error message.
+      notes: what was left out of it, or is missing, is appended.
+      **options: of `trimesh.load`.
+
+    Raises:
+      CongraspError: it cannot be read; the line ends with the remedy.
+    """
+    said = [] if notes is None else notes
+    kind = kind_of(path)
+    data = read_file(path, MAX_BYTES, remedy)
+    try:
+        if kind == ".stl":
+            return _stl(data, said)
+        prepared = {".ply": _checked_ply, ".glb": plain_glb, ".obj": _plain_obj}[kind](data, said)
+        files = _Files(path, said)
+        return trimesh.load(io.BytesIO(prepared), file_type=kind[1:], resolver=files, process=False, **options)
+    except CongraspError as error:
+        raise CongraspError(f"{path} {error}") from None
+    except Exception as error:  # the readers raise whatever they stumble over
+        reason = (str(error) or type(error).__name__).splitlines()[0][:200].rstrip(" .!")
+        raise CongraspError(f"{path} cannot be read as {kind[1:].upper()}: {reason}.", remedy) from None
+
+
+class _Files(trimesh.resolvers.FilePathResolver):
+    """Finds materials and pictures that a mesh file names, also by paths of Windows; notes those that are missing."""
+
+    def __init__(self, path: pathlib.Path, notes: list[str]):
+        super().__init__(str(path))
+        self._folder, self._notes = path.parent, notes
+
+    def get(self, name: str) -> bytes:
+        """Content of a file next to the mesh."""
+        plain = str(name).strip().replace("\\", "/")
+        for file in (self._folder / plain, self._folder / pathlib.PurePosixPath(plain).name):
+            if file.is_file():
+                return read_file(file, MAX_BYTES)
+        note = f"the file '{name}' that it names is missing"
+        if note not in self._notes:
+            self._notes.append(note)
+        raise FileNotFoundError(note)
+
+
+def kind_of(path: pathlib.Path) -> str:
+    """Returns the suffix for a file's content, or that of its name if the content is ambiguous.
+
+    Raises:
+      CongraspError: it cannot be read, is empty, or is not a mesh; the remedy describes how to get one.
+    """
+    try:
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode):
+            raise CongraspError(f"{path} is no regular file.", "Name a mesh file.")
+        with path.open("rb") as file:
+            start = file.read(_START)
+    except OSError as error:
+        raise CongraspError(
+            f"{path} cannot be read: {error.strerror}.", "Check the path and its permissions."
+        ) from None
+    if not start:
+        raise CongraspError(f"{path} is empty (0 bytes).", "Export or download it again.")
+    suffix, text = path.suffix.lower(), start.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if found := _supported(start, about.st_size):
+        return found
+    if start.startswith(b"PK\x03\x04"):
+        raise CongraspError(f"{path} {_zip(path)[0]}.", _zip(path)[1])
+    for magic, what, remedy in _FOREIGN:
+        if text.startswith(magic) or text.lower().startswith(magic) or start.startswith(magic):
+            raise CongraspError(f"{path} is {what}.", remedy)
+    if text.startswith(b"<"):
+        what, remedy = next((row[1:] for row in _XML if row[0] in text.lower()), ("an XML file", CONVERT))
+        raise CongraspError(f"{path} is {what}.", remedy)
+    if text.startswith(b"{") and b'"asset"' in text:
+        raise CongraspError(f"{path} is a glTF scene in several files.", "Export it as GLB, which is a single file.")
+    if suffix not in SUFFIXES:
+        if _rows_of_numbers(text):
+            raise CongraspError(f"{path} holds rows of numbers: a point cloud.", _SURFACE)
+        raise CongraspError(f"{path} is not an STL, OBJ, PLY or GLB file.", CONVERT)
+    return suffix
+
+
+def _supported(start: bytes, size: int) -> str | None:
+    """The suffix of a mesh file with this beginning and size in bytes, if it is one."""
+    if start.startswith(b"glTF"):
+        return ".glb"
+    if start.startswith((b"ply\n", b"ply\r", b"ply ")):
+        return ".ply"
+    if len(start) >= _STL_HEADER:
+        count = int.from_bytes(start[_STL_HEADER - 4 : _STL_HEADER], "little")
+        if size == _STL_HEADER + _STL_TRIANGLE * count:
+            return ".stl"
+    if _is_text_stl(start) or _holds_records(start):
+        return ".stl"
+    lines = [line.split() for line in start.splitlines()]
+    points = sum(len(words) >= 4 and words[0] == b"v" for words in lines)
+    return ".obj" if points >= 3 else None
+
+
+def _is_text_stl(start: bytes) -> bool:
+    """True for the beginning of an STL file of text; some writers use capitals, or write a mark of the encoding."""
+    text = start[:_START].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    return text.startswith(b"solid") and re.search(rb"\bfacet\s", text) is not None
+
+
+@np.errstate(all="ignore")
+def _holds_records(start: bytes) -> bool:
+    """True if binary STL records with unit normals follow the header, whatever count it announces."""
+    whole = max(len(start) - _STL_HEADER, 0) // _STL_TRIANGLE
+    if whole < 4 or start.isascii():
+        return False
+    rows = np.frombuffer(start, _STL_ROW, whole, _STL_HEADER)
+    unit = np.abs(np.linalg.norm(rows["normal"].astype(float), axis=-1) - 1) < 1e-3
+    return bool(unit.all()) and _plausible(rows, rows)
+
+
+def _rows_of_numbers(text: bytes) -> bool:
+    """True if the first lines hold three or more numbers each."""
+    lines = [line for line in text.splitlines()[:10] if line.strip()]
+    return len(lines) > 2 and all(re.fullmatch(rb"\s*([-+.\deE]+[\s,;]*){3,}", line) for line in lines[:-1])
+
+
+def _zip(path: pathlib.Path) -> tuple[str, str]:
+    """Kind of a zip archive, and the remedy."""
+    try:
+        names = zipfile.ZipFile(path).namelist()
+    except (OSError, zipfile.BadZipFile):
+        return "is a zip archive that is damaged", "Download it again."
+    if any(name.lower().endswith("3dmodel.model") for name in names):
+        return "is a 3MF file", "Export it as STL."
+    if any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names):
+        return "is a USDZ scene", "Export it as GLB."
+    inside = [name for name in names if name.lower().endswith(SUFFIXES)]
+    if not inside:
+        return "is a zip archive without a mesh in it", CONVERT
+    return f"is a zip archive with {', '.join(inside[:3])}{' …' if len(inside) > 3 else ''} in it", _UNPACK
+
+
+def _without_triangles(path: pathlib.Path, points: int, kind: str) -> tuple[str, str]:
+    """Fault and remedy of a file without triangles."""
+    start = read_file(path, MAX_BYTES)[:_START]
+    if b"property float f_dc_0" in start:
+        return f"{path} is a Gaussian splat of {points} points: it has no triangles.", _SURFACE
+    if points:
+        return f"{path} has no triangles: it holds only {points} points.", _SURFACE
+    fault = f"{path} has no triangles: it holds nothing that can be read as a mesh."
+    return fault, f"Export it as a triangle mesh ({kind})."
+
+
+def _stl(data: bytes, notes: list[str]) -> trimesh.Trimesh:
+    """The triangles of an STL file, each with corners of its own; raises a ValueError if there are none."""
+    corners = _text_stl(data) if _is_text_stl(data) and not _is_exact(data) else _binary_stl(data, notes)
+    if not len(corners):
+        raise ValueError("it has no triangles")
+    return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+
+
+def _is_exact(data: bytes) -> bool:
+    """True for a binary STL file with as many triangles as its header announces, whatever its header says."""
+    return len(data) == _STL_HEADER + _STL_TRIANGLE * int.from_bytes(data[80:84], "little")
+
+
+def _text_stl(data: bytes) -> np.ndarray:
+    """Corners (F, 3, 3) of text."""
+    numbers = array.array("d", (_number(word) for row in _VERTEX.finditer(data) for word in row.groups()))
+    if len(numbers) % 9:
+        raise ValueError("it ends within a triangle, or its facets are not triangles")
+    return np.frombuffer(numbers).reshape(-1, 3, 3)
+
+
+def _number(word: bytes) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise ValueError(f"'{ascii(word.decode(errors='replace'))[1:31]}' is not a number") from None
+
+
+def _binary_stl(data: bytes, notes: list[str]) -> np.ndarray:
+    """Corners (F, 3, 3) of records; where the header's count is wrong, the whole and plausible ones."""
+    announced, whole = int.from_bytes(data[80:84], "little"), max(len(data) - _STL_HEADER, 0) // _STL_TRIANGLE
+    if not whole:
+        raise ValueError("it has no triangles: neither text with 'facet' in it, nor whole binary records")
+    rows = np.frombuffer(data, _STL_ROW, whole, _STL_HEADER)
+    if announced < whole and not _plausible(rows[announced:], rows[: announced or whole]):
+        whole = announced
+    if whole != announced:
+        notes.append(f"its header announces {announced} triangles, but it holds {whole}, which were read")
+    elif len(data) > _STL_HEADER + _STL_TRIANGLE * whole:
+        notes.append(f"{len(data) - _STL_HEADER - _STL_TRIANGLE * whole} bytes after its triangles were ignored")
+    return rows["corners"][:whole].astype(float)
+
+
+@np.errstate(all="ignore")
+def _plausible(rows: np.ndarray, sound: np.ndarray) -> bool:
+    """True if records have the values of triangles: not degenerate, and of the size of sound ones."""
+    corners, known = rows["corners"].astype(float), sound["corners"].astype(float)
+    if not (np.isfinite(corners).all() and np.isfinite(known).all()):
+        return False
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    return bool((area > 0).mean() > 0.5 and np.abs(corners).max() < 100 * np.abs(known).max())
+
+
+def _plain_obj(data: bytes, notes: list[str]) -> bytes:
+    """Text with absolute indices: negative ones count back from the points so far.
+
+    Raises:
+      ValueError: an index is 0, or the numbers have decimal commas.
+    """
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if _ZERO.search(data):
+        raise ValueError("a face has the index 0, but OBJ counts from 1")
+    if _COMMA.search(data):
+        raise ValueError("its numbers have commas for decimal points")
+    if not _RELATIVE.search(data):
+        return data
+    counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
+    for line in re.sub(rb"\\\r?\n", b" ", data).splitlines():
+        words = line.split()
+        if words and words[0] in counts:
+            counts[words[0]] += 1
+        elif words and words[0] == b"f":
+            line = b" ".join([b"f", *(_absolute(word, list(counts.values())) for word in words[1:])])
+        lines.append(line)
+    return b"\n".join(lines)
+
+
+def _absolute(corner: bytes, counts: list[int]) -> bytes:
+    """A corner of a face, such as -1//-1, by absolute indices into so many points, texture coordinates and normals."""
+    indices = corner.split(b"/")
+    pairs = zip(indices, counts, strict=False)
+    return b"/".join(b"%d" % (int(index) + 1 + count) if index.startswith(b"-") else index for index, count in pairs)
+
+
+def _checked_ply(data: bytes, notes: list[str]) -> bytes:
+    """The data, if every element has at least the bytes of its numbers, a list those of its length; in text two."""
+    header, end, _ = data[:_PLY_HEADER].partition(b"end_header")
+    if not end:
+        raise ValueError(f"its header does not end within {_PLY_HEADER} bytes")
+    is_text, elements = b"ascii" in header, list[tuple[int, int]]()
+    for line in header.decode("latin-1").splitlines():
+        match line.split():
+            case ["element", _, count]:
+                elements.append((int(count), 0))
+            case ["property", *words]:
+                least = 2 if is_text else _SIZES[words[1] if words[0] == "list" else words[0]]
+                elements[-1] = elements[-1][0], elements[-1][1] + least
+    for rows, width in elements:
+        if rows < 0 or (rows and not width):
+            raise ValueError(f"it announces an element of {rows} rows without values")
+    if sum(rows * width for rows, width in elements) > len(data):
+        raise ValueError(f"it announces {max(elements)[0]} rows, but has {len(data)} bytes")
+    return data

@@ -1,0 +1,200 @@
+"""Files as strangers have them: each folder of `tests/cases` is run by its command, and says what was wrong.
+
+`case.json` of a folder:
+
+* `command`, run in a copy of the folder, as after `congrasp`, and `status`, its exit code.
+* `says`, patterns in what it prints, and `never`, patterns that are not in it.
+* `objects`: the objects in `out` by name, with `size_cm`, `mass_g`, most `pieces` and their `volume_cm3`, `parts`, and
+  `outwards` for normals that point away from the middle, where they matter.
+* `files`: further inputs by name: a `text`, a `copy` of another case's, or one `from` `_hand` with `replace`, what
+  comes `before` it, and its `encoding`.
+* `sign` and `remedy`: a row of the page "My file does not load".
+* `full`: shapes are cut as for users, which takes seconds.
+
+`make.py` writes binary inputs. A case is added by adding a folder.
+"""
+
+import contextlib
+import json
+import os
+import pathlib
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.objects import shapes, store
+from congrasp.services.arm.description import load_arm
+from congrasp.services.assets.hands import compile as compiling
+from congrasp.services.assets.hands import model_files
+from congrasp.services.assets.hands.model_files import import_hand
+from congrasp.services.cli import main
+from congrasp.services.viz import hand_sheets
+from tests.services.conftest import quick_imports
+
+ROOT = pathlib.Path(__file__).parents[3]
+CASES = ROOT / "tests" / "cases"
+SHARED = ROOT.parent / "shared" / "cases"
+NAMES = sorted(folder.parent.name for folder in CASES.glob("*/case.json"))
+
+
+def prepared(name: str, folder: pathlib.Path) -> dict[str, Any]:
+    """Copies a case to a folder, with the inputs that it makes from others; returns its description."""
+    shutil.copytree(CASES / name, folder, dirs_exist_ok=True)
+    case = json.loads((folder / "case.json").read_text())
+    for file, how in case.get("files", {}).items():
+        if "copy" in how:
+            shutil.copy(CASES / how["copy"], folder / file)
+            continue
+        text = how["text"] if "text" in how else (CASES / "_hand" / how["from"]).read_text()
+        for old, new in how.get("replace", {}).items():
+            assert old in text, f"{name}: {old}"
+            text = text.replace(old, new)
+        if "before" in how:
+            text = how["before"] + text.partition("?>")[2] if text.startswith("<?xml") else how["before"] + text
+        (folder / file).write_bytes(text.encode(how.get("encoding", "utf-8")))
+    return case
+
+
+@contextlib.contextmanager
+def here(function, path, options):
+    """Does what a confined process does in this one, which is faster."""
+    folder = path.resolve().parent
+    try:
+        yield function(path.resolve(), folder, options), folder
+    except CongraspError as error:
+        raise CongraspError(str(error).replace(str(path.resolve()), str(path))) from None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_case_ends_as_it_should(name, tmp_path, monkeypatch, capsys):
+    case = prepared(name, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(model_files, "confined", here)
+    monkeypatch.setattr(hand_sheets, "joints_sheet", lambda hand: np.zeros((4, 4, 3), np.uint8))
+    with contextlib.nullcontext() if case.get("full") else quick_imports():
+        try:
+            status = main.run(shlex.split(case["command"]))
+        except CongraspError as error:
+            print(error)
+            status = error.exit_code
+    printed = capsys.readouterr()
+    said = printed.out + printed.err
+    assert status == case["status"], said
+    for pattern in case["says"]:
+        assert re.search(pattern, said, re.DOTALL), said
+    for pattern in case.get("never", ()):
+        assert not re.search(pattern, said), said
+    assert "Traceback" not in said and "Warning" not in said and "\x1b" not in said
+    if status == 2:
+        assert len(said.splitlines()) == 1, said
+    objects = {path.stem: store.load(path) for path in (tmp_path / "out").glob("*.safetensors")}
+    assert objects.keys() == case.get("objects", objects).keys()
+    for key, facts in case.get("objects", {}).items():
+        obj = objects[key]
+        if "size_cm" in facts:
+            np.testing.assert_allclose(100 * np.ptp(obj.visual_vertices, axis=0), facts["size_cm"], atol=0.01)
+        if "mass_g" in facts:
+            assert 1000 * obj.mass == pytest.approx(facts["mass_g"], rel=0.01)
+        if "pieces" in facts:
+            assert len(obj.pieces) <= facts["pieces"] and obj.shape_reliable
+        if "outwards" in facts:
+            assert (obj.normals * obj.points).sum(-1).min() > 0
+        if "parts" in facts:
+            assert list(obj.part_names) == facts["parts"]
+        if "volume_cm3" in facts:
+            assert 1e6 * sum(shapes.volume(piece) for piece in obj.pieces) == pytest.approx(
+                facts["volume_cm3"], rel=0.2
+            )
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+_HELD = {
+    "01_names": (0, "2 of 2"),
+    "04_draco": (2, "Draco. Export it without"),
+    "05_meshopt": (2, "meshopt .*Export it without"),
+    "05_quantised_int16": (0, "1 of 1"),
+    "06_no_position": (0, "were left out"),
+    "08_negative": (0, "1 of 1"),
+    "09_missing_image": (0, r"\.\.\\tex\\a b\.png"),
+    "10_short_count": (0, "announces 11 triangles, but it holds 12"),
+    "10_trailing": (0, "bytes after its triangles"),
+    "11_capitals": (0, "its content is STL"),
+    "12_cloud": (2, "only 500 points.*Make a surface"),
+    "13_fallback": (0, "3 convex pieces.*0.[0-9]% too"),
+    "15_double": (0, "1 of 1"),
+    "15_two_bodies": (0, "2 convex pieces"),
+    "16_containers": (2, "3MF file. Export it as STL"),
+    "17_hand_urdf_xacro": (2, "xacro.*Run 'xacro"),
+    "17_undeclared_urdf": (2, "xacro.*Run 'xacro"),
+    "18_comment": (0, "4 joints"),
+    "18_newline": (0, "4 joints"),
+    "19_mjcf_called_urdf": (0, "4 joints"),
+    "19_urdf_called_xml": (0, "4 joints"),
+    "20_attached_meshdir": (0, "4 joints"),
+    "20_classes": (2, "repeated.*'finger'"),
+    "20_texture": (0, r"wood\.png"),
+    "21_mm": (2, "'palm' is 100 m long.*mm"),
+    "22_fixed": (0, "'thumb_j0' mimics .*fixed"),
+    "23_inside": (0, "3 motors"),
+    "24_minus_one": (0, "15 N at the fingertip"),
+    "25_swapped": (2, "lower limit.*above.*Swap"),
+    "26_grams": (2, "'thumb_0' weighs 30 kg.*grams"),
+    "30_backslash": (0, "4 joints"),
+    "33_degrees_urdf": (2, "90 rad.*degrees"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", _HELD)
+def test_a_case_of_public_bug_reports_ends_as_it_should(name, tmp_path):
+    """As a user runs it, with processes and pictures."""
+    if not (SHARED / name).is_dir():
+        pytest.skip(f"{SHARED} is not on this machine")
+    shutil.copytree(SHARED / name, tmp_path / "case")
+    command = json.loads((tmp_path / "case" / "case.json").read_text())["command"].partition("&&")[0]
+    cli = [sys.executable, "-m", "congrasp.services.cli.main", *shlex.split(command)[1:]]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(cli, cwd=tmp_path / "case", env=env, capture_output=True, text=True, check=False)
+    status, pattern = _HELD[name]
+    assert done.returncode == status and re.search(pattern, done.stdout + done.stderr, re.DOTALL), done
+
+
+@pytest.mark.parametrize("name", ["hand_plain", "hand_swapped"])
+def test_a_confined_process_reads_what_this_one_does(name, tmp_path):
+    prepared(name, tmp_path)
+    found = []
+    for read in (import_hand, model_files.propose):
+        try:
+            proposal = read(tmp_path / "hand.urdf")
+            found.append((proposal.hand, proposal.palm, proposal.notes, sorted(proposal.meshes)))
+        except CongraspError as error:
+            found.append(str(error))
+    assert found[0] == found[1]
+
+
+def test_a_description_that_takes_all_time_or_memory_is_refused(tmp_path, monkeypatch):
+    """The limits are those of the confined process; its start counts as well here."""
+    monkeypatch.setattr(compiling, "SECONDS", 2)
+    monkeypatch.setattr(compiling, "_START", 4)
+    geom = '<body><geom size="0.1"/></body>'
+    nested = '<replicate count="999">' * 3 + geom + "</replicate>" * 3
+    (tmp_path / "a.xml").write_text(f"<mujoco><worldbody>{nested}</worldbody></mujoco>")
+    for read in (import_hand, load_arm):
+        with pytest.raises(CongraspError, match=r"a\.xml (was not read within 2 s|cannot be read: .* 3 GB)"):
+            read(tmp_path / "a.xml")
+
+
+def test_a_pipe_among_the_files_of_a_description_is_not_opened(tmp_path):
+    prepared("hand_include", tmp_path)
+    (tmp_path / "more.xml").unlink()
+    os.mkfifo(tmp_path / "more.xml")
+    with pytest.raises(CongraspError, match=r"'more\.xml' that it names is no regular file\. Name one"):
+        model_files.propose(tmp_path / "hand.xml")
