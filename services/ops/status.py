@@ -53,7 +53,7 @@ def warnings(status: Mapping[str, Any]) -> list[str]:
             found.append(f"The counters are inconsistent: {total} {counters[total]} is not {_sum(counters, parts)}.")
     if counters["queued"] != queue["length"]:
         found.append(f"{counters['queued']} rollouts are counted as queued, but the queue holds {queue['length']}.")
-    return found + [status["trouble"]] * bool(status.get("trouble"))
+    return [*found, *filter(None, [status.get("trouble")])]  # a learner of an earlier version tells none
 
 
 def _sum(counters: Mapping[str, int], parts: tuple[str, ...]) -> str:
