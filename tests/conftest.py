@@ -17,6 +17,7 @@ if os.environ["JAX_PLATFORMS"] == "cpu":
     flags += "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
     os.environ.setdefault("XLA_FLAGS", flags)
 
+import gc
 import pathlib
 
 import psutil
@@ -26,6 +27,8 @@ from hypothesis import settings
 # The same examples every time, so that a red run tells of a change; HYPOTHESIS_PROFILE=search looks for new ones.
 settings.register_profile("same", derandomize=True, deadline=None)
 settings.register_profile("search", derandomize=False, deadline=None)
+# Tracing makes millions of objects that live on: looking through them often takes a twentieth of the time.
+gc.set_threshold(200_000, 20, 100)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent

@@ -87,6 +87,7 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
         congrasp.grasp(mesh, fingers="thumb index", attempts=4, policy=paper_policy)
 
 
+@pytest.mark.slow
 def test_the_first_example_of_grasp_runs_on_the_policy_that_comes_with_congrasp(capsys: pytest.CaptureFixture) -> None:
     assert congrasp.grasp.__doc__ is not None
     example = congrasp.grasp.__doc__.partition("Example:")[2].partition("Args:")[0]

@@ -120,6 +120,7 @@ def _closing(hand):
     return model, data
 
 
+@pytest.mark.slow
 def test_warp_couples_joints_as_mujoco_c_does(hand):
     model, native = _closing(hand)
     theirs, data = mujoco_warp.put_model(model), mujoco_warp.put_data(model, native)

@@ -17,7 +17,6 @@ from congrasp.learner.hub.ranges import task_ranges
 from tests import task as suite
 
 TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, approach_steps=50, hold_steps_max=40)
-RANGES = task_ranges(TASK, CurriculumConfig())
 
 
 def _rollouts(*spreads):
@@ -48,17 +47,22 @@ def test_whatever_an_engine_produces_is_within_the_ranges():
             admission.check(Message({**rollout.arrays, name: array.astype(np.float32)}))
 
 
-def test_names_and_bounds_follow_from_the_task():
-    assert set(RANGES.episodes) == set(episode_fields(TASK))
-    assert RANGES.episodes["episode/success"] == RANGES.episodes["episode/mask_trajectory"] == (0.0, 1.0)
-    assert RANGES.episodes["episode/length"] == (0.0, 90.0)
+@pytest.fixture(scope="module")
+def ranges():
+    return task_ranges(TASK, CurriculumConfig())
+
+
+def test_names_and_bounds_follow_from_the_task(ranges):
+    assert set(ranges.episodes) == set(episode_fields(TASK))
+    assert ranges.episodes["episode/success"] == ranges.episodes["episode/mask_trajectory"] == (0.0, 1.0)
+    assert ranges.episodes["episode/length"] == (0.0, 90.0)
     # An action's contact earns at most 1, everywhere, and is given twice the room: 90 steps of 2.
-    assert RANGES.episodes["term/contact"][1] == pytest.approx(180.0, rel=1e-3)
-    assert RANGES.episodes["term/drop"] == (-180.0, 180.0)
-    assert 30.0 < RANGES.reward < 300.0 and RANGES.observation.max() < 1500.0
-    assert np.isfinite(RANGES.observation).all()
+    assert ranges.episodes["term/contact"][1] == pytest.approx(180.0, rel=1e-3)
+    assert ranges.episodes["term/drop"] == (-180.0, 180.0)
+    assert 30.0 < ranges.reward < 300.0 and ranges.observation.max() < 1500.0
+    assert np.isfinite(ranges.observation).all()
 
 
-def test_a_curriculum_widens_the_reward_by_its_weights():
+def test_a_curriculum_widens_the_reward_by_its_weights(ranges):
     heavy = CurriculumConfig(ramp=(0, 10), reward=RewardWeights(contact=11.0))
-    assert task_ranges(TASK, heavy).reward == pytest.approx(RANGES.reward + 2.0 * 10.0, rel=1e-3)
+    assert task_ranges(TASK, heavy).reward == pytest.approx(ranges.reward + 2.0 * 10.0, rel=1e-3)
