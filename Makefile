@@ -59,7 +59,7 @@ $(VENV)/.$(EXTRA): pyproject.toml constraints.txt
 	@test -x $(VENV)/bin/python || { echo "Making $(VENV) with $(PYTHON)"; $(PYTHON) -m venv $(VENV); } || \
 	  { echo "Python's venv module does not work here. On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 2; }
 	@echo "Installing congrasp[$(EXTRA)] into $(VENV): some minutes the first time (dev: about 3 GB)"
-	$(PIP) install --quiet --no-compile --constraint constraints.txt --editable '.[$(EXTRA)]'
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[$(EXTRA)]'
 	@touch $@
 
 clean:
