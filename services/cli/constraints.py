@@ -58,7 +58,6 @@ def generate(
     """
     from congrasp.common.hands import get_hand
     from congrasp.common.io.inputs import distinct_names
-    from congrasp.common.objects import store
     from congrasp.common.objects.procedural import generate_many
     from congrasp.common.task.config import TaskConfig
     from congrasp.common.task.sampling.write_sets import make_sets, save
@@ -75,7 +74,6 @@ def generate(
             path = pathlib.Path(text)
             found += objects_of(path) if path.exists() else [find_object(text, folder)]
         found += generate_many(count, first_seed, families)
-        found = list({store.digest(obj): obj for obj in found}.values())  # one may be named twice
         for obj, name in zip(found, distinct_names(obj.name for obj in found), strict=True):
             if obj.name != name:
                 raise CongraspError(

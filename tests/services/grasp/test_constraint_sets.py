@@ -1,5 +1,7 @@
 """Constraint sets: what the files hold, and the two commands."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -93,10 +95,11 @@ def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     )
     store.Catalogue(tmp_path / "objects").add(BOX)
     folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]
-    file = tmp_path / "objects" / "box_0.safetensors"
+    file = tmp_path / "crate.safetensors"
+    store.save(dataclasses.replace(BOX, name="crate"), file)
     arguments = ["box_0", "mug:7", str(file), "--count", "1", "--families", "ball"]
     assert load("constraints")(["generate", *arguments, *folder])() == 0
-    assert made == ["box_0", "mug_7", "ball_0"]
+    assert made == ["box_0", "mug_7", "crate", "ball_0"]
     with pytest.raises(CongraspError, match="no object for which to generate constraints"):
         load("constraints")(["generate"])()
     with pytest.raises(CongraspError, match="no object 'nothing'"):
