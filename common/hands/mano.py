@@ -82,8 +82,11 @@ def read_mano(path: pathlib.Path) -> ManoModel:
     Raises:
       CongraspError: the file is missing, is not a MANO file, or is that of a left hand.
     """
-    zipped = path.is_file() and path.read_bytes()[:4] == b"PK\x03\x04"
-    content = read_archive(path) if zipped else read_pickle(path)
+    start = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            start = file.read(4)
+    content = read_archive(path) if start == b"PK\x03\x04" else read_pickle(path)
     arrays = []
     for name, shape in _SHAPES.items():
         array = content.get(name)

@@ -6,16 +6,9 @@ import pytest
 from congrasp.common.config import NetworkConfig
 from congrasp.common.policy import network
 from congrasp.learner.algorithms import losses
+from tests.learner import toy
 
-LAYOUT = (
-    ("state", 3),
-    ("heading", 1),
-    ("affordance", 1),
-    ("pose_finger", 1),
-    ("pose_wrist", 1),
-    ("trajectory", 1),
-    ("mask", 4),
-)
+LAYOUT = (("state", 3), *toy.LAYOUT[1:])
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ class GoalArray:
     meaning: str
     """Unit, frame and meaning."""
     kind: Literal["real", "position", "direction", "quaternion", "flag"] = "real"
-    """Kind of value. Positions, directions and quaternions are in the object frame, and the latter two must be unit
+    """Kind of value: positions, directions and quaternions are in the object frame, and the latter two must be unit
     vectors; flags are booleans."""
     neutral: tuple[float, ...] = ()
     """Last axis of the value used where no request gives one; zeros by default."""
@@ -126,7 +126,7 @@ class Option(NamedTuple):
     name: str
     help: str
     kind: Literal["text", "direction", "place", "part", "pose", "path"] = "text"
-    """Kind of the parsed value, a text; three numbers in the axes of the object's file, normalised; three numbers in
+    """Kind of the parsed value: a text; three numbers in the axes of the object's file, normalised; three numbers in
     the coordinates of the file, converted to a position (3,) in the object frame; a `Part`; a wrist pose with finger
     angles, or a wrist path of K waypoints, from a file: dicts of `q`, `position` and `quaternion`, object frame."""
     words: tuple[str, ...] = ()

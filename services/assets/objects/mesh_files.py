@@ -231,11 +231,7 @@ def _supported(start: bytes, size: int) -> str | None:
         return ".glb"
     if start.startswith((b"ply\n", b"ply\r", b"ply ")):
         return ".ply"
-    if len(start) >= _STL_HEADER:
-        count = int.from_bytes(start[_STL_HEADER - 4 : _STL_HEADER], "little")
-        if size == _STL_HEADER + _STL_TRIANGLE * count:
-            return ".stl"
-    if _is_text_stl(start) or _holds_records(start):
+    if _is_exact(start, size) or _is_text_stl(start) or _holds_records(start):
         return ".stl"
     lines = [line.split() for line in start.splitlines()]
     points = sum(len(words) >= 4 and words[0] == b"v" for words in lines)
@@ -294,15 +290,20 @@ def _without_triangles(path: pathlib.Path, points: int, kind: str) -> tuple[str,
 
 def _stl(data: bytes, notes: list[str]) -> trimesh.Trimesh:
     """The triangles of an STL file, each with corners of its own; raises a ValueError if there are none."""
-    corners = _text_stl(data) if _is_text_stl(data) and not _is_exact(data) else _binary_stl(data, notes)
+    corners = _text_stl(data) if _is_text_stl(data) and not _is_exact(data, len(data)) else _binary_stl(data, notes)
     if not len(corners):
         raise ValueError("it has no triangles")
     return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
 
 
-def _is_exact(data: bytes) -> bool:
-    """True for a binary STL file with as many triangles as its header announces, whatever its header says."""
-    return len(data) == _STL_HEADER + _STL_TRIANGLE * int.from_bytes(data[80:84], "little")
+def _announced(start: bytes) -> int:
+    """Number of triangles in the header of a binary STL file."""
+    return int.from_bytes(start[_STL_HEADER - 4 : _STL_HEADER], "little")
+
+
+def _is_exact(start: bytes, size: int) -> bool:
+    """True for a binary STL file of `size` bytes with as many triangles as announced, whatever its text says."""
+    return len(start) >= _STL_HEADER and size == _STL_HEADER + _STL_TRIANGLE * _announced(start)
 
 
 def _text_stl(data: bytes) -> np.ndarray:
@@ -322,7 +323,7 @@ def _number(word: bytes) -> float:
 
 def _binary_stl(data: bytes, notes: list[str]) -> np.ndarray:
     """Corners (F, 3, 3) of records; where the header's count is wrong, the whole and plausible ones."""
-    announced, whole = int.from_bytes(data[80:84], "little"), max(len(data) - _STL_HEADER, 0) // _STL_TRIANGLE
+    announced, whole = _announced(data), max(len(data) - _STL_HEADER, 0) // _STL_TRIANGLE
     if not whole:
         raise ValueError("it has no triangles: neither text with 'facet' in it, nor whole binary records")
     rows = np.frombuffer(data, _STL_ROW, whole, _STL_HEADER)
