@@ -13,6 +13,8 @@ CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/congrasp
 
 # Compiled programs are kept between runs; another folder: JAX_COMPILATION_CACHE_DIR=...
 export JAX_COMPILATION_CACHE_DIR ?= $(CACHE)/jax
+# Modules are compiled when they are first imported: an environment that forbids it would pay in every process again.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: quickstart test test-all check coverage lint docs bench install clean
 .DEFAULT_GOAL := quickstart
@@ -59,7 +61,8 @@ $(VENV)/.$(EXTRA): pyproject.toml constraints.txt
 	@test -x $(VENV)/bin/python || { echo "Making $(VENV) with $(PYTHON)"; $(PYTHON) -m venv $(VENV); } || \
 	  { echo "Python's venv module does not work here. On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 2; }
 	@echo "Installing congrasp[$(EXTRA)] into $(VENV): some minutes the first time (dev: about 3 GB)"
-	$(PIP) install --quiet --constraint constraints.txt --editable '.[$(EXTRA)]'
+	$(PIP) install --quiet --upgrade --constraint constraints.txt pip
+	$(PIP) install --quiet --no-compile --constraint constraints.txt --editable '.[$(EXTRA)]'
 	@touch $@
 
 clean:

@@ -43,13 +43,6 @@ def _bounded_memory():
         sys.modules["jax"].clear_caches()
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _quickly_compiled_kernels():
-    """Warp's optimiser takes longer than its kernels run here."""
-    if "warp" in sys.modules:
-        sys.modules["warp"].config.optimization_level = 0
-
-
 @pytest.fixture(scope="session")
 def paper_policy(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """File of a human policy that knows the paper's four constraints and has learnt nothing."""

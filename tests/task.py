@@ -4,6 +4,7 @@ Modules that share hand, task, policy and batch share compiled programs, in one 
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
@@ -42,6 +44,16 @@ def bank() -> ConstraintBank:
 def policy() -> PolicyBundle:
     """The untrained policy of `CONFIG`."""
     return untrained(CONFIG)
+
+
+def warp_engine(objects: Sequence[GraspObject], **options: Any) -> Physics:
+    """MJX-Warp with these objects, on a CPU."""
+    import warp  # takes seconds in every worker
+
+    from congrasp.actors.physics.warp import WarpPhysics
+
+    warp.config.optimization_level = 0  # the optimiser takes longer than the kernels run here
+    return WarpPhysics(HAND, TASK, objects, **options)
 
 
 def start_of(**fields: Any) -> ResetState:

@@ -4,19 +4,16 @@ import sys
 
 import jax
 import jax.numpy as jnp
-import warp
 
-from congrasp.actors.physics.warp import WarpPhysics
 from congrasp.common.objects import procedural
 from congrasp.learner.distributed.ranks import Ranks
-from tests.task import HAND, TASK, start_of
+from tests.task import HAND, start_of, warp_engine
 
 
 def main() -> None:
-    warp.config.optimization_level = 0  # as in conftest.py, so that the kernels are those of the other tests
     rank, port = sys.argv[1:]
     ranks = Ranks.join(int(rank), 2, f"127.0.0.1:{port}")
-    physics = WarpPhysics(HAND, TASK, [procedural.generate(0, "box")])
+    physics = warp_engine([procedural.generate(0, "box")])
     state = physics.start(jax.tree.map(jnp.asarray, start_of()))
     state, after = physics.step(state, jnp.zeros((1, 6 + len(HAND.joints))), jnp.ones(1, bool))
     leaves = [leaf for leaf in jax.tree.leaves((state, after)) if isinstance(leaf, jax.Array)]

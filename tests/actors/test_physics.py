@@ -9,9 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from congrasp.actors.physics import resolve_physics
+from congrasp.actors.physics import make_physics, resolve_physics
 from congrasp.actors.physics.engine import ResetState
-from congrasp.actors.physics.mjx import MjxPhysics
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.physics.slots import LEAVES, Pool
 from congrasp.common import rotations
@@ -263,7 +262,7 @@ def test_jax_agrees_with_native(env, optimised):
     # Without the hand's contacts with itself and the table, which take minutes to compile there.
     task = dataclasses.replace(TASK, hand_self_collision=False, hand_table_collision=False)
     native = NativePhysics(HAND, task, OBJECTS, 1)
-    other = MjxPhysics(HAND, task, OBJECTS)
+    other = make_physics("jax", HAND, task, OBJECTS, threads=1)
     step = jax.jit(other.step)
     device = jax.devices()[0]  # a state that is on no certain one would have the step compiled once more
     a, b = native.start(start), jax.device_put(other.start(jax.tree.map(jnp.asarray, start)), device)

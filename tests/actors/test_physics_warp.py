@@ -13,12 +13,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.actors.physics import warp_buffers
 from congrasp.actors.physics.catalogue import Catalogue
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.physics.scene import compile_scene
-from congrasp.actors.physics.warp import WarpPhysics
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject, Piece
@@ -26,6 +24,7 @@ from congrasp.common.transport.ports import free_port
 from tests.actors.test_physics import HAND, TASK, above, grasp, one_each, servoed
 from tests.conftest import ROOT
 from tests.solids import mujoco_mass_properties
+from tests.task import warp_engine
 
 OBJECTS = [procedural.generate(i, family) for i, family in enumerate(["box", "bowl", "mug", "ring"])]
 OTHERS = [procedural.generate(i, family) for i, family in enumerate(["ring", "cylinder", "bowl", "bowl", "box"], 7)]
@@ -56,7 +55,7 @@ def _picked(start: ResetState, index: list[int]) -> ResetState:
 
 def _agrees_with_native(objects: Sequence[GraspObject], start: ResetState) -> None:
     """A scripted grasp: tightly until something is touched and squeezed, statistically after that."""
-    native, warp = NativePhysics(HAND, TASK, objects, 1), WarpPhysics(HAND, TASK, objects)
+    native, warp = NativePhysics(HAND, TASK, objects, 1), warp_engine(objects)
     step, batch = jax.jit(warp.step), len(objects)
     a, b = native.start(start), warp.start(start)
     table = np.ones(batch, bool)
@@ -89,7 +88,7 @@ def test_primitives_and_meshes_of_one_pool_agree_with_native(start):
 
 def test_gains_of_each_environment_agree_with_native():
     start, target = servoed(one_each(OBJECTS))
-    native, warp = NativePhysics(HAND, TASK, OBJECTS, 1), WarpPhysics(HAND, TASK, OBJECTS)
+    native, warp = NativePhysics(HAND, TASK, OBJECTS, 1), warp_engine(OBJECTS)
     step, table = jax.jit(warp.step), np.ones(len(OBJECTS), bool)
     a, b = native.start(start), warp.start(jax.tree.map(jnp.asarray, start))
     for _ in range(5):
@@ -124,7 +123,7 @@ def test_scanned_objects_agree_with_native(shared_objects):
 
 def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(start):
     """One control step by JAX and three repeats are four control steps with the same targets; and nobody notices."""
-    physics, batch = WarpPhysics(HAND, TASK, OBJECTS), len(OBJECTS)
+    physics, batch = warp_engine(OBJECTS), len(OBJECTS)
     target, table, step = jnp.asarray(grasp(start, 5)), jnp.ones(batch, bool), jax.jit(physics.step)
     first, _ = step(physics.start(start), target, table)
     before = jax.tree.map(np.array, first)
@@ -165,7 +164,7 @@ def test_rows_are_what_mujoco_compiles():
 
 
 def test_a_reset_picks_each_environments_object_and_leaves_the_others(start):
-    warp, native = WarpPhysics(HAND, TASK, OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
+    warp, native = warp_engine(OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
     step, table = jax.jit(warp.step), jnp.ones(4, bool)
     state = warp.start(start)
     for i in range(5):
@@ -193,7 +192,7 @@ def test_a_reset_picks_each_environments_object_and_leaves_the_others(start):
 
 @pytest.mark.slow
 def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(start, others):
-    warp, untouched = WarpPhysics(HAND, TASK, OBJECTS), WarpPhysics(HAND, TASK, OBJECTS)
+    warp, untouched = warp_engine(OBJECTS), warp_engine(OBJECTS)
     step, step_untouched, table = jax.jit(warp.step), jax.jit(untouched.step), jnp.ones(4, bool)
     state, expected = warp.start(start), untouched.start(start)
     for i in range(30):
@@ -219,7 +218,7 @@ def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
 
 def test_a_compiled_loop_is_the_same_as_single_steps(start):
     """Resets in a branch, two loops after one another, and states that are used twice."""
-    warp = WarpPhysics(HAND, TASK, OBJECTS)
+    warp = warp_engine(OBJECTS)
     targets = jnp.stack([jnp.asarray(grasp(start, i)) for i in range(8, 20)])
     table, swapped = jnp.ones(4, bool), _picked(start, [2, 3, 0, 1])
 
@@ -245,7 +244,7 @@ def test_a_compiled_loop_is_the_same_as_single_steps(start):
 def test_meshes_are_absent_from_an_environment_alone_too(start):
     """An unused mesh slot in the middle of a sheet would touch the table."""
     sheet = dataclasses.replace(OBJECTS[0], pieces=(Piece("box", (0.04, 0.04, 0.0003)),))
-    warp = WarpPhysics(HAND, TASK, [sheet])
+    warp = warp_engine([sheet])
     step, occupancy = jax.jit(warp.step), []
     for batch in (1, 2):
         flat = _picked(start, [0] * batch)._replace(
@@ -258,7 +257,7 @@ def test_meshes_are_absent_from_an_environment_alone_too(start):
 
 
 def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(start):
-    warp = WarpPhysics(HAND, TASK, OBJECTS)
+    warp = warp_engine(OBJECTS)
     first = warp.start(start)
     target, table = jnp.asarray(grasp(start, 0)), jnp.ones(4, bool)
     state, _ = warp.step(first, target, table)
@@ -273,7 +272,9 @@ def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(st
 
 
 def test_buffers_are_as_full_as_what_mujoco_finds(start):
-    warp, native = WarpPhysics(HAND, TASK, OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
+    from congrasp.actors.physics import warp_buffers
+
+    warp, native = warp_engine(OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
     state, a = warp.start(start), native.start(start)
     for i in range(5):
         target, table = grasp(start, i), np.ones(4, bool)
@@ -288,8 +289,8 @@ def test_buffers_are_as_full_as_what_mujoco_finds(start):
 
 
 def test_what_had_no_room_is_counted(start, monkeypatch):
-    monkeypatch.setattr(warp_buffers, "CONTACTS_PER_ENVIRONMENT", 2)
-    warp = WarpPhysics(HAND, TASK, OBJECTS)
+    monkeypatch.setattr("congrasp.actors.physics.warp_buffers.CONTACTS_PER_ENVIRONMENT", 2)
+    warp = warp_engine(OBJECTS)
     _, crowded = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
     assert crowded.occupancy[0] > 1 > crowded.occupancy[1]
 
@@ -298,7 +299,7 @@ def test_steps_whose_solver_reached_its_limit_are_counted(start):
     """An iteration limit of 1 is reached in every physics step of these environments in contact with the table."""
     limited = []
     for iterations in (1, 100):
-        warp = WarpPhysics(HAND, TASK, OBJECTS)
+        warp = warp_engine(OBJECTS)
         warp._catalogue.model.opt.iterations = iterations
         _, after = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
         limited.append(float(after.occupancy[2]))
@@ -307,8 +308,8 @@ def test_steps_whose_solver_reached_its_limit_are_counted(start):
 
 def test_more_pieces_than_slots_are_one_clear_line(start):
     with pytest.raises(CongraspError, match=r"'bowl.*' has 8 mesh pieces, but the environments have only 3 slots"):
-        WarpPhysics(HAND, TASK, OBJECTS, mesh_slots=3)
-    warp = WarpPhysics(HAND, TASK, [OBJECTS[0]], mesh_slots=0)
+        warp_engine(OBJECTS, mesh_slots=3)
+    warp = warp_engine([OBJECTS[0]], mesh_slots=0)
     state = warp.start(_picked(start, [0]))
     with pytest.raises(CongraspError, match="only 0 slots"):
         warp.replace_objects(state, [OBJECTS[1]])

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.actors import stress as protocols
 from congrasp.actors.attempts import Attempts, Phases
 from congrasp.actors.initial import RequestedEpisodes
-from congrasp.actors.physics.mjx import MjxPhysics
+from congrasp.actors.physics import make_physics
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.stress import Frame, Protocol
 from congrasp.common.objects.distance import distance_field
@@ -23,7 +23,7 @@ from congrasp.common.task import plausibility
 from congrasp.common.task.constraints import optional
 from congrasp.common.task.types import Surface
 from tests import task as suite
-from tests.task import BATCH, HAND, OBJECTS, TASK
+from tests.task import BATCH, HAND, OBJECTS, TASK, warp_engine
 
 WITHOUT_MESHES = set(protocols.ASSESSED) - {"hand_mesh_mm"}
 """What is measured of a hand whose file has no visual meshes."""
@@ -148,7 +148,7 @@ def test_mjx_gets_the_same_force(monkeypatch):
     """What MJX makes of `xfrc_applied` is MuJoCo's; compiling it takes over a minute."""
     monkeypatch.setattr("congrasp.actors.physics.mjx.mjx.step", lambda model, data: data)
     physics, force = (
-        MjxPhysics(HAND, TASK, OBJECTS),
+        make_physics("jax", HAND, TASK, OBJECTS, threads=1),
         np.random.default_rng(0).normal(size=(BATCH, 3)).astype(np.float32),
     )
     state = physics.start(start().reset_state)
@@ -161,8 +161,7 @@ def test_mjx_gets_the_same_force(monkeypatch):
 
 @pytest.mark.slow
 def test_warp_pushes_with_the_same_force():
-    warp = pytest.importorskip("congrasp.actors.physics.warp")
-    check_fall(warp.WarpPhysics(HAND, TASK, OBJECTS, mesh_slots=0))
+    check_fall(warp_engine(OBJECTS, mesh_slots=0))
 
 
 class Seen(NamedTuple):

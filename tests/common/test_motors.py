@@ -8,8 +8,6 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from mujoco import mjx
-from mujoco.mjx.third_party import mujoco_warp
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
@@ -122,6 +120,8 @@ def _closing(hand):
 
 @pytest.mark.slow
 def test_warp_couples_joints_as_mujoco_c_does(hand):
+    from mujoco.mjx.third_party import mujoco_warp  # takes seconds
+
     model, native = _closing(hand)
     theirs, data = mujoco_warp.put_model(model), mujoco_warp.put_data(model, native)
     for _ in range(40):
@@ -135,6 +135,8 @@ def test_warp_couples_joints_as_mujoco_c_does(hand):
 
 @pytest.mark.slow
 def test_mjx_couples_joints_as_mujoco_c_does():
+    from mujoco import mjx  # takes seconds
+
     claw = import_hand(pathlib.Path(__file__).parents[1] / "hands" / "claw.urdf").hand
     tendon = Motor("tendon", {"opposing_root": 1.0, "opposing_middle": 0.5}, 4.0, 0.1, 1.0)
     follow = Coupling("left_middle", "left_root", 0.9)

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from congrasp.actors.physics.mjx import MjxPhysics
+from congrasp.actors.physics import make_physics
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.files import hand_from_text, hand_text
@@ -199,7 +199,7 @@ def test_a_hand_collides_by_its_files_own_shapes_if_asked(driven):
     np.testing.assert_allclose(found[0], expected[0], atol=2e-6)
     assert ours.body_mass.sum() == pytest.approx(sum(link.mass for link in driven.hand.links))
     with pytest.raises(CongraspError, match="jax supports capsules only"):
-        MjxPhysics(hand, TaskConfig(), [])
+        make_physics("jax", hand, TaskConfig(), [], threads=1)
 
 
 def test_links_that_collide_by_meshes_keep_their_capsules(tmp_path):
