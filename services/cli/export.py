@@ -90,50 +90,6 @@ def motion(
     return 0
 
 
-def grasp(
-    paths: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
-    to: Literal["dexgraspbench"] = "dexgraspbench",
-    out: pathlib.Path = pathlib.Path("dexgraspbench"),
-    replay: bool = False,
-) -> int:
-    """Write pregrasp, grasp and squeeze of motions, with their objects, for the grasp tests of another project.
-
-    dexgraspbench: DexGraspBench, for Allegro, and for Shadow hands imported from the benchmark's own file. The folder
-    gets NPZ files with its names, of which examples/dexgraspbench.py makes its pickles. Each is read back and placed by
-    the benchmark's kinematics; the largest error in millimetres is printed.
-
-    Args:
-      paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); those that are not held, or cannot
-        be exported, are left out.
-      to: The project.
-      out: The folder to write.
-      replay: Also run the test here, in MuJoCo C: six pushes of 1 N without gravity, from the grasp and from the
-        pregrasp; writes replay.json.
-
-    Examples:
-      congrasp export grasp grasps
-      congrasp export grasp grasps/mug/grasp.npz --replay
-    """
-    from congrasp.services.cli.console import tracked
-    from congrasp.services.export.dexgraspbench import export_grasps
-    from congrasp.services.export.frames import TOLERANCE_MM
-    from congrasp.services.export.replay import replay as replayed
-    from congrasp.services.export.replay import save_replay, summary
-
-    if not paths:
-        raise CongraspError("No motion was given.", "Pass a folder or a motion (.npz) of 'congrasp grasp'.")
-    with tracked() as track:
-        grasps, error, left_out = export_grasps(paths, out, track("Exporting", None))
-        found = replayed(grasps, track("Replaying", len(grasps))) if replay and grasps else []
-    for reason in left_out:
-        print(f"Left out: {reason}")
-    print(f"{out}: {len(grasps)} grasps, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
-    if found:
-        save_replay(out, found)
-        print(summary(found))
-    return 0
-
-
 def layout(
     path: Annotated[pathlib.Path, tyro.conf.Positional],
     out: pathlib.Path = pathlib.Path("congrasp-layout.json"),
@@ -159,4 +115,4 @@ def layout(
     return 0
 
 
-COMMANDS = {"policy": policy, "motion": motion, "grasp": grasp, "layout": layout}
+COMMANDS = {"policy": policy, "motion": motion, "layout": layout}
