@@ -1,8 +1,9 @@
 """Video of motions from a fixed camera: hand, arm, object and table, without simulation-only elements."""
 
+import pathlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -15,11 +16,40 @@ from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.scene import Camera, Shape
 from congrasp.services.viz.shapes import arm_shapes, fit, object_shape, skin_shape, table_shape
+from congrasp.services.viz.sheets import save_video
 
 SIZE = (320, 240)
 """Width and height in pixels."""
 _DIRECTION = np.array([0.8, -1.0, 0.7])  # from the table's middle to the camera
 _STEP = 10  # frames between those that the camera must contain
+_KEYFRAMES = ("-g", "2")  # for random access in training
+_COUNTED = 64  # pixels between those that are returned
+
+
+class Film(NamedTuple):
+    """A video."""
+
+    calibration: dict[str, Any]
+    """See `calibration`."""
+    pixels: list[np.ndarray]
+    """(n, 3) from 0 to 1 for each motion: some pixels of every frame."""
+
+
+def film(path: pathlib.Path, motions: Sequence[GraspMotion], frame_rate: int) -> Film:
+    """Writes the video of all motions in sequence, from a camera that shows all of them."""
+    camera, pixels = camera_for(motions), list[np.ndarray]()
+
+    def frames() -> Iterator[np.ndarray]:
+        """Yields every frame, and keeps some of its pixels."""
+        for motion in motions:
+            kept = []
+            for picture in pictures(motion, camera):
+                kept.append(picture.reshape(-1, 3)[::_COUNTED] / 255)
+                yield picture
+            pixels.append(np.concatenate(kept))
+
+    save_video(path, frames(), SIZE, frame_rate, _KEYFRAMES)
+    return Film(calibration(camera), pixels)
 
 
 def camera_for(motions: Sequence[GraspMotion]) -> Camera:

@@ -1,35 +1,28 @@
-"""USD as text (.usda) with time samples; written by Pixar's own library, read back from the text without it.
+"""USD as text (.usda) with time samples.
 
 One Xform a link, nested as hand and arm are, the hand's with USD's own capsules as guides; object and arm are meshes.
 The hand's surface is skinned: a skeleton of the links with an animation moves it (UsdSkel).
 """
 
-import ast
 import json
 import pathlib
-import re
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
-from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.skin import MATERIALS, Skin
-from congrasp.common.rotations import continuous
 from congrasp.services.export.frames import (
     COLOURS,
     OBJECT,
     SKIN,
     Body,
-    Track,
     arm_meshes,
     bodies,
     capsules,
     facts,
     identifiers,
     object_mesh,
-    pose_matrices,
     skin_of_motion,
 )
 from congrasp.services.export.motion_file import GraspMotion
@@ -61,7 +54,7 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         translate, orient = xform.AddTranslateOp(_DOUBLE), xform.AddOrientOp(_DOUBLE)
         if len(body.translation) == 1:
             translate.Set(Gf.Vec3d(*body.translation[0]))
-        for t, turn in enumerate(continuous(body.rotation.as_quat(scalar_first=True))):
+        for t, turn in enumerate(body.quaternions(scalar_first=True)):
             orient.Set(Gf.Quatd(*turn), t)
             if len(body.translation) > 1:
                 translate.Set(Gf.Vec3d(*body.translation[t]), t)
@@ -116,7 +109,7 @@ def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body
     skeleton.CreateRestTransformsAttr([Gf.Matrix4d().SetTranslate(Gf.Vec3d(*o)) for o in skin.origins - parents])
     animation.CreateJointsAttr(names)
     animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)] * len(links))
-    turns = np.stack([continuous(link.rotation.as_quat(scalar_first=True)) for link in links], 1)
+    turns = np.stack([link.quaternions(scalar_first=True) for link in links], 1)
     places = np.stack([np.broadcast_to(link.translation, (len(turns), 3)) for link in links], 1)
     rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
     for t, (turn, place) in enumerate(zip(turns, places, strict=True)):
@@ -163,56 +156,3 @@ def _add_coordinates(mesh: UsdGeom.Mesh, vertices: np.ndarray, faces: np.ndarray
     st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(flat.uv, np.float32)))
     st.SetIndices(Vt.IntArray(flat.faces.ravel().tolist()))
-
-
-def read(path: pathlib.Path) -> list[Track]:
-    """Reads a file's text, composed from the root to the tips."""
-    layer = _parse(path.read_text(encoding="utf-8"))
-    assert layer["upAxis"] == "Z" and layer["metersPerUnit"] == 1
-    codes = np.arange(layer["startTimeCode"], layer["endTimeCode"] + 1)
-    poses: dict[str, np.ndarray] = {}
-    corners: dict[str, list[np.ndarray]] = {}
-
-    def visit(prim: dict[str, Any], parent: np.ndarray, body: str = "") -> None:
-        """World poses of a prim and those below it, and the triangles of meshes."""
-        body = prim.get(_NAME, body)
-        if _NAME in prim:
-            assert prim["xformOpOrder"] == ["xformOp:translate", "xformOp:orient"]
-            place, turn = (_samples(prim, name, len(codes)) for name in prim["xformOpOrder"])
-            parent = poses[body] = parent @ pose_matrices(place, Rotation.from_quat(turn, scalar_first=True))
-        elif "faceVertexIndices" in prim and "skel:skeleton" not in prim:
-            triangles = np.array(prim["points"])[prim["faceVertexIndices"]].reshape(-1, 3, 3)
-            corners.setdefault(body, []).append(triangles)
-        for name, child in prim.items():
-            if name.startswith("/"):
-                visit(child, parent, body)
-
-    visit(layer, np.eye(4))
-    meshes = {body: np.concatenate(triangles) for body, triangles in corners.items()}
-    return [Track(codes / layer["timeCodesPerSecond"], poses, meshes)]
-
-
-def _samples(prim: dict[str, Any], name: str, count: int) -> np.ndarray:
-    """(T, n) values of an attribute at every time code."""
-    samples = prim.get(f"{name}.timeSamples", {})
-    return np.array([samples[str(t)] if samples else prim[name] for t in range(count)], float)
-
-
-def _parse(text: str) -> dict[str, Any]:
-    """A layer's text as nested dictionaries: attributes by name, time samples by code, prims by `/name`."""
-    layer: dict[str, Any] = {}
-    open_blocks, prim = [layer], ""
-    for line in map(str.strip, text.splitlines()):
-        found = re.match(r"(?:[\w\[\]]+ )*([\w:.]+) = (.*)", line) or re.match(r"(\d+): (.*),", line)
-        if definition := re.match(r'def \w+ "(\w+)"', line):
-            prim = f"/{definition[1]}"
-        elif line == "}":
-            open_blocks.pop()
-        elif line == "{" or (found and found[2] == "{"):
-            block: dict[str, Any] = {}
-            open_blocks[-1][found[1] if found else prim] = block
-            open_blocks.append(block)
-        elif found:
-            value = found[2].removesuffix(" (")  # meta data of the attribute follow
-            open_blocks[-1][found[1]] = value if value.startswith("<") else ast.literal_eval(value)
-    return layer
