@@ -120,7 +120,7 @@ class ContradictionError(RefusedError):
 
 
 class LayoutError(RefusedError):
-    """A packed query has a layout other than the policy's."""
+    """A query has a layout other than the policy's."""
 
     code = "layout"
 
