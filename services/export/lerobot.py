@@ -1,4 +1,4 @@
-"""A LeRobot dataset, version 3.0: one episode per motion; written with pyarrow, read back by the layout in its files.
+"""A LeRobot dataset, version 3.0: one episode per motion.
 
 `observation.state` is the proprioception (joints of arm and fingers, then the wrist's pose),
 `observation.environment_state` the object's pose, `action` the arm's joints one step later, the finger targets, and the

@@ -83,7 +83,9 @@ def export_motions(
             for file, target in written:
                 file.replace(target)
     except OSError as error:
-        raise CongraspError(f"{path} cannot be written: {error.strerror}.", "Pass another with --out.") from None
+        raise CongraspError(
+            f"{path} cannot be written: {error.strerror or error}.", "Pass another with --out."
+        ) from None
 
 
 def default_name(motion: GraspMotion, kind: str) -> pathlib.Path:
