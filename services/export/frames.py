@@ -86,22 +86,28 @@ def skin_of_motion(motion: GraspMotion) -> Skin:
     with contextlib.suppress(CongraspError):  # the motion itself has all the data
         if motion.hand in own_hands() and _same_hand(motion, hand := get_hand(motion.hand)):
             return skin_of(hand)
-    origins = np.zeros((len(motion.link_names), 3))
-    first = np.unique(motion.joint_link, return_index=True)[1]
-    origins[motion.joint_link[first]] = motion.joint_anchor[first]
+    origins = link_origins(motion)
     skeleton = Skeleton(
-        motion.hand,
-        tuple(map(str, motion.link_names)),
-        motion.link_parent,
-        origins,
-        motion.capsule_ends + origins[motion.capsule_link][:, None],
-        motion.capsule_radius,
-        motion.capsule_link,
-        motion.joint_anchor,
-        motion.joint_axis,
-        motion.joint_link,
+        hand=motion.hand,
+        names=tuple(map(str, motion.link_names)),
+        parents=motion.link_parent,
+        origins=origins,
+        capsules=motion.capsule_ends + origins[motion.capsule_link][:, None],
+        radii=motion.capsule_radius,
+        capsule_link=motion.capsule_link,
+        anchors=motion.joint_anchor,
+        axes=motion.joint_axis,
+        joint_link=motion.joint_link,
     )
     return skin_on(skeleton)
+
+
+def link_origins(motion: GraspMotion) -> np.ndarray:
+    """(L, 3) m, origins of the links in the wrist frame with all joints at zero: the anchors of their first joints."""
+    origins = np.zeros((len(motion.link_names), 3))
+    links, first = np.unique(motion.joint_link, return_index=True)
+    origins[links] = motion.joint_anchor[first]
+    return origins
 
 
 def _same_hand(motion: GraspMotion, hand: Hand) -> bool:

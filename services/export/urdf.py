@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.services.export.frames import capsules, pose_matrices
+from congrasp.services.export.frames import capsules, link_origins, pose_matrices
 from congrasp.services.export.motion_file import GraspMotion, robot_joints
 from congrasp.services.record.moved_arm import UNLIMITED, MovedArm
 
@@ -55,11 +55,9 @@ def robot_urdf(motion: GraspMotion) -> str:
 def _add_hand(robot: ET.Element, motion: GraspMotion) -> None:
     """Adds the hand's links, which have the palm's orientation with all joints at zero."""
     names = robot_joints(motion)[-len(motion.joint_names) :]
-    origins = np.zeros((len(motion.link_names), 3))  # of the links' frames in the wrist frame, all joints at zero
+    origins = link_origins(motion)
     for i, (name, parent) in enumerate(zip(map(str, motion.link_names), motion.link_parent, strict=True)):
         moved = np.flatnonzero(motion.joint_link == i)
-        if len(moved):
-            origins[i] = motion.joint_anchor[moved[0]]
         joints = [
             _Joint(names[j], "revolute", motion.joint_axis[j], motion.joint_anchor[j] - origins[i], limits, _SPEED)
             for j, limits in zip(moved, motion.joint_limits[moved], strict=True)

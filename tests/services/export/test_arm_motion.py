@@ -22,7 +22,7 @@ from congrasp.services.arm.description import load_arm
 from congrasp.services.arm.links import moved_arm
 from congrasp.services.arm.robot import Pose, build_robot, default_mount
 from congrasp.services.export import frames, motion_formats, urdf
-from congrasp.services.export.camera import camera_for, pictures
+from congrasp.services.export.lerobot import camera_for, pictures
 from congrasp.services.export.motion_file import (
     GraspMotion,
     at_rate,
