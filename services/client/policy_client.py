@@ -32,7 +32,7 @@ class PolicyClient(EpisodePolicy):
         Args:
           connect: the server's endpoint, such as tcp/10.0.0.7:7457.
           run: name under which the policy is served.
-          hand: name of the controlled hand; a server with another hand's policy rejects the queries.
+          hand: name of the controlled hand; the policy of another one is refused.
           timeout: deadline of one call, s.
           wait: seconds to wait for the server to appear.
           certs: folder of a client's certificate, for a server that requires one.
