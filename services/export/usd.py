@@ -7,6 +7,7 @@ The hand's surface is skinned: a skeleton of the links with an animation moves i
 import json
 import pathlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
@@ -59,11 +60,13 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
             if len(body.translation) > 1:
                 translate.Set(Gf.Vec3d(*body.translation[t]), t)
         if body.name == OBJECT:
-            _add_mesh(stage, paths[-1], motion)
+            vertices, faces, paint = object_mesh(motion)
+            colours = COLOURS[OBJECT] if paint is None else paint
+            _add_mesh(stage, paths[-1].AppendChild("mesh"), vertices, faces, colours)
         _add_capsules(stage, paths[-1], motion, i)
         for number, part in enumerate(arm.get(body.name, ())):
-            shape = _new_mesh(stage, paths[-1].AppendChild(f"mesh_{number}"), part.vertices, part.faces)
-            shape.CreateDisplayColorAttr([part.colour])
+            place = paths[-1].AppendChild(f"mesh_{number}")
+            _add_mesh(stage, place, part.vertices, part.faces, part.colour, textured=False)
     links = found[: len(motion.link_names)]
     _add_skin(stage, root.GetPath().AppendChild(SKIN), skin_of_motion(motion), links)
     stage.Save()
@@ -81,18 +84,6 @@ def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link:
         capsule.CreateDisplayColorAttr([COLOURS["link"]])
         capsule.AddTranslateOp(_DOUBLE).Set(Gf.Vec3d(*middle))
         capsule.AddOrientOp(_DOUBLE).Set(Gf.Quatd(*turn.as_quat(scalar_first=True)))
-
-
-def _add_mesh(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion) -> None:
-    """Adds the object's mesh in its frame."""
-    vertices, faces, colours = object_mesh(motion)
-    mesh = _new_mesh(stage, parent.AppendChild("mesh"), vertices, faces)
-    _add_coordinates(mesh, vertices, faces)
-    if colours is None:
-        mesh.CreateDisplayColorAttr([COLOURS[OBJECT]])
-    else:
-        own = mesh.CreateDisplayColorAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colours)))
-        UsdGeom.Primvar(own).SetInterpolation(UsdGeom.Tokens.vertex)
 
 
 def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body]) -> None:
@@ -114,45 +105,42 @@ def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body
     rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
     for t, (turn, place) in enumerate(zip(turns, places, strict=True)):
         rotations.Set([Gf.Quatf(*map(float, q)) for q in turn], t)
-        translations.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(place, np.float32)), t)
-    _add_surface(stage, path.AppendChild("mesh"), skin, skeleton)
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
-    UsdSkel.BindingAPI.Apply(root.GetPrim())
-
-
-def _add_surface(stage: Usd.Stage, path: Sdf.Path, skin: Skin, skeleton: UsdSkel.Skeleton) -> None:
-    """Adds the hand's surface, bound to a skeleton of its links."""
-    mesh = _new_mesh(stage, path, skin.points, skin.faces)
-    _add_coordinates(mesh, skin.points, skin.faces)
-    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(skin.normals))
+        translations.Set(_vectors(place), t)
+    colours = np.array([COLOURS[name] for name in MATERIALS])[skin.material]
+    mesh = _add_mesh(stage, path.AppendChild("mesh"), skin.points, skin.faces, colours)
+    mesh.CreateNormalsAttr(_vectors(skin.normals))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    colours = np.array([COLOURS[name] for name in MATERIALS], np.float32)[skin.material]
-    colour = mesh.CreateDisplayColorAttr(Vt.Vec3fArray.FromNumpy(colours))
-    UsdGeom.Primvar(colour).SetInterpolation(UsdGeom.Tokens.vertex)
     influences, weights = skin.influences()
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     binding.CreateJointIndicesPrimvar(False, 4).Set(influences.ravel().tolist())
     binding.CreateJointWeightsPrimvar(False, 4).Set(weights.ravel().tolist())
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    UsdSkel.BindingAPI.Apply(root.GetPrim())
 
 
-def _new_mesh(stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.ndarray) -> UsdGeom.Mesh:
-    """A mesh of triangles, not subdivided."""
-    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, np.float32))
-    mesh = UsdGeom.Mesh.Define(stage, path)
+def _add_mesh(
+    stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.ndarray, colours: Any, *, textured: bool = True
+) -> UsdGeom.Mesh:
+    """Adds triangles (F, 3), not subdivided, of one colour (3,) or with that of each vertex (V, 3)."""
+    mesh, points = UsdGeom.Mesh.Define(stage, path), _vectors(vertices)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreatePointsAttr(points)
     mesh.CreateFaceVertexCountsAttr([3] * len(faces))
     mesh.CreateFaceVertexIndicesAttr(faces.ravel().tolist())
     mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    colour = mesh.CreateDisplayColorAttr(_vectors(np.reshape(colours, (-1, 3))))
+    if np.ndim(colours) > 1:
+        UsdGeom.Primvar(colour).SetInterpolation(UsdGeom.Tokens.vertex)
+    if textured:
+        flat, kind = unwrapped(vertices, faces), Sdf.ValueTypeNames.TexCoord2fArray
+        st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
+        st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(flat.uv, np.float32)))
+        st.SetIndices(Vt.IntArray(flat.faces.ravel().tolist()))
     return mesh
 
 
-def _add_coordinates(mesh: UsdGeom.Mesh, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Adds texture coordinates to a mesh (V, 3), (F, 3)."""
-    flat = unwrapped(vertices, faces)
-    primvars, kind = UsdGeom.PrimvarsAPI(mesh), Sdf.ValueTypeNames.TexCoord2fArray
-    st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
-    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(flat.uv, np.float32)))
-    st.SetIndices(Vt.IntArray(flat.faces.ravel().tolist()))
+def _vectors(values: np.ndarray) -> Vt.Vec3fArray:
+    """Vectors (n, 3) as USD's."""
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
