@@ -1,4 +1,4 @@
-"""Answers of exported policies, read by the runtimes that users have, next to those of the Flax policy."""
+"""Difference between an exported policy, in the runtimes that users have, and the Flax policy."""
 
 import pathlib
 import zipfile

@@ -1,4 +1,4 @@
-"""Readers of exported motions, each independent of the writer, and the distance of what they find from the motion."""
+"""Readers of exported motions, independent of the writers, and the distance between a file and its motion."""
 
 import json
 import pathlib

@@ -110,7 +110,7 @@ def test_the_client_finds_a_server_again_that_was_started_anew(endpoint):
     server.close()
 
 
-def test_a_server_of_another_layout_in_the_first_ones_place_is_asked_for_it(endpoint):
+def test_the_layout_is_requested_again_when_another_server_has_another_one(endpoint):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
         client.reset(REQUEST)
@@ -125,7 +125,7 @@ def test_a_server_of_another_layout_in_the_first_ones_place_is_asked_for_it(endp
     server.close()
 
 
-def test_a_server_of_another_hand_in_the_first_ones_place_is_refused(endpoint):
+def test_another_server_with_the_policy_of_another_hand_is_refused(endpoint):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
         client.reset(REQUEST)
