@@ -31,7 +31,7 @@ class CongraspError(Exception):
 
 _EXTRAS = {
     **dict.fromkeys(("foxglove", "imageio_ffmpeg", "jinja2", "matplotlib"), "viz"),
-    **dict.fromkeys(("bvhio", "mcap_ros2", "onnx", "onnxruntime", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
+    **dict.fromkeys(("onnx", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
     **dict.fromkeys(("daqp", "mink", "mujoco_menagerie", "qpsolvers"), "arm"),
     "gymnasium": "gym",
     "wandb": "wandb",
@@ -120,7 +120,7 @@ class ContradictionError(RefusedError):
 
 
 class LayoutError(RefusedError):
-    """A packed query has a layout other than the policy's."""
+    """A query has a layout other than the policy's."""
 
     code = "layout"
 

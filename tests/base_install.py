@@ -43,7 +43,7 @@ def steady_server(hand: str = "allegro") -> Iterator[int]:
 
     def act(key: str, query: Message) -> Message:
         targets = np.zeros((1, 2 * (len(get_hand(hand).joints) + 6)), np.float32)  # and the action
-        return function.reply(query, Inference(targets, [[]]), {"version": 1, "total_ms": 0.0})
+        return Inference(targets, [[]]).reply({"version": 1, "total_ms": 0.0})
 
     with urls.listen(f"tcp/127.0.0.1:{port}", "server") as server:
         server.serve(keys.health, lambda key, query: Message({}, function.metadata()))

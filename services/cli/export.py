@@ -1,4 +1,4 @@
-"""Policies and motions for other programs, each file checked as it is written."""
+"""Policies and motions for other programs."""
 
 import pathlib
 from typing import Annotated, Literal
@@ -15,7 +15,7 @@ def policy(
     out: pathlib.Path | None = None,
     force: bool = False,
 ) -> int:
-    """Write a policy as ONNX or StableHLO, and print its largest difference from the original on random inputs.
+    """Write a policy as ONNX or StableHLO.
 
     Normalisation is inside; the file also holds the hand, the meaning and order of every input and output, and the
     hand's MuJoCo model. docs/policy-export.md and examples/onnx_grasp.py show its use.
@@ -34,13 +34,13 @@ def policy(
     from congrasp.common.io.files import check_free
     from congrasp.common.policy.bundle import load
     from congrasp.common.policy.pretrained import policy_file
-    from congrasp.services.export.policy import SUFFIXES, TOLERANCE, export_policy
+    from congrasp.services.export.policy import SUFFIXES, export_policy
 
     source = policy_file(policy, hand)
     path = out or pathlib.Path(f"policy{SUFFIXES[to]}")
     check_free(path, force=force)
-    difference = export_policy(load(source), to, path)
-    print(f"{path}: largest absolute difference to the Flax policy {difference:.1e} (at most {TOLERANCE:g})")
+    export_policy(load(source), to, path)
+    print(path)
     return 0
 
 
@@ -54,7 +54,7 @@ def motion(
     camera: bool = False,
     force: bool = False,
 ) -> int:
-    """Write a grasp motion for another program, read the file back, and print its largest error in millimetres.
+    """Write a grasp motion for another program.
 
     glb: Blender, the web, Unity, Unreal. usd: Isaac, Houdini, Maya. bvh: motion capture. ros2: a bag with joint
     trajectory, TF and URDF. lerobot: a dataset (version 3.0) with an episode for each motion. docs/exports.md describes
@@ -75,7 +75,6 @@ def motion(
       congrasp export motion grasps/mug/grasp.npz --to glb
       congrasp export motion runs/mine --success --to ros2 --out bag
     """
-    from congrasp.services.export.frames import TOLERANCE_MM
     from congrasp.services.export.motion_file import at_rate
     from congrasp.services.export.motion_formats import default_name, export_motions, pick_motion
 
@@ -84,53 +83,8 @@ def motion(
     motions = [pick_motion(path, index, success=success) for path in paths]
     motions = [at_rate(motion, fps) for motion in motions] if fps else motions
     target = out or default_name(motions[0], to)
-    error = export_motions(motions, to, target, camera=camera, force=force)
-    frames = sum(len(motion.time) for motion in motions)
-    print(f"{target}: {frames} frames, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
-    return 0
-
-
-def grasp(
-    paths: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
-    to: Literal["dexgraspbench"] = "dexgraspbench",
-    out: pathlib.Path = pathlib.Path("dexgraspbench"),
-    replay: bool = False,
-) -> int:
-    """Write pregrasp, grasp and squeeze of motions, with their objects, for the grasp tests of another project.
-
-    dexgraspbench: DexGraspBench, for Allegro, and for Shadow hands imported from the benchmark's own file. The folder
-    gets NPZ files with its names, of which examples/dexgraspbench.py makes its pickles. Each is read back and placed by
-    the benchmark's kinematics; the largest error in millimetres is printed.
-
-    Args:
-      paths: Folders of 'congrasp grasp', its motions (.npz), or recordings (.mcap); those that are not held, or cannot
-        be exported, are left out.
-      to: The project.
-      out: The folder to write.
-      replay: Also run the test here, in MuJoCo C: six pushes of 1 N without gravity, from the grasp and from the
-        pregrasp; writes replay.json.
-
-    Examples:
-      congrasp export grasp grasps
-      congrasp export grasp grasps/mug/grasp.npz --replay
-    """
-    from congrasp.services.cli.console import tracked
-    from congrasp.services.export.dexgraspbench import export_grasps
-    from congrasp.services.export.frames import TOLERANCE_MM
-    from congrasp.services.export.replay import replay as replayed
-    from congrasp.services.export.replay import save_replay, summary
-
-    if not paths:
-        raise CongraspError("No motion was given.", "Pass a folder or a motion (.npz) of 'congrasp grasp'.")
-    with tracked() as track:
-        grasps, error, left_out = export_grasps(paths, out, track("Exporting", None))
-        found = replayed(grasps, track("Replaying", len(grasps))) if replay and grasps else []
-    for reason in left_out:
-        print(f"Left out: {reason}")
-    print(f"{out}: {len(grasps)} grasps, largest error {error:.1g} mm (at most {TOLERANCE_MM} mm)")
-    if found:
-        save_replay(out, found)
-        print(summary(found))
+    export_motions(motions, to, target, camera=camera, force=force)
+    print(f"{target}: {sum(len(motion.time) for motion in motions)} frames")
     return 0
 
 
@@ -159,4 +113,4 @@ def layout(
     return 0
 
 
-COMMANDS = {"policy": policy, "motion": motion, "grasp": grasp, "layout": layout}
+COMMANDS = {"policy": policy, "motion": motion, "layout": layout}

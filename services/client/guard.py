@@ -14,8 +14,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
-from congrasp.services.client.floor import Floor
-from congrasp.services.client.limits import JointLimits, Limiter, Speeds, as_numbers
+from congrasp.services.client.limits import Floor, JointLimits, Limiter, Speeds, as_numbers
 from congrasp.services.client.policy import Answer, Policy, State
 
 Fallback = Literal["freeze", "open"]

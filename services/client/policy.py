@@ -91,7 +91,8 @@ class Policy(Protocol):
           `hand`, its `joints` (F names in the order of `q`), `open_pose` (F,) rad; `limits`, the fields of
           `JointLimits`, or None for a hand whose joints share motors; `period`, seconds of a control step;
           `approach_steps`, control steps before the table is removed in training; `observation` (`full`,
-          `tracked` or `camera`), `constraints`, `surface_points`, `trajectory_points`.
+          `tracked` or `camera`), `constraints`, `surface_points`, `trajectory_points`; `query`, the layout of queries
+          (`services.serve.requests.Layout.description`).
 
         Raises:
           TransportError: there is no response from the server, or it serves another hand.

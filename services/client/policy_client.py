@@ -32,7 +32,7 @@ class PolicyClient(EpisodePolicy):
         Args:
           connect: the server's endpoint, such as tcp/10.0.0.7:7457.
           run: name under which the policy is served.
-          hand: name of the controlled hand; a server with another hand's policy rejects the queries.
+          hand: name of the controlled hand; the policy of another one is refused.
           timeout: deadline of one call, s.
           wait: seconds to wait for the server to appear.
           certs: folder of a client's certificate, for a server that requires one.
@@ -54,15 +54,18 @@ class PolicyClient(EpisodePolicy):
         deadline = time.monotonic() + self._wait
         while True:
             try:
-                query = Message({}, {"metadata": True})
-                found = dict(self._transport.query(self._keys.health, query, timeout=self._timeout).meta)
-                break
+                return self._described()
             except TransportError as error:
                 if isinstance(error, RefusedError) or time.monotonic() > deadline:
                     raise
                 time.sleep(_AGAIN)
-        if "limits" not in found:
-            raise RefusedError("The server does not describe its policy.", "Update congrasp where it runs.")
+
+    def _described(self) -> dict[str, Any]:
+        """The metadata of a server that responds."""
+        query = Message({}, {"metadata": True})
+        found = dict(self._transport.query(self._keys.health, query, timeout=self._timeout).meta)
+        if "query" not in found:
+            raise RefusedError("The server does not describe its queries.", "Update congrasp where it runs.")
         if found["hand"] != self._hand:
             raise RefusedError(f"The policy is for the hand {ascii(found['hand'])[:60]}, not '{self._hand}'.")
         return found
@@ -73,5 +76,5 @@ class PolicyClient(EpisodePolicy):
 
     def _query(self, query: Message) -> Message:
         """The server's reply."""
-        meta = {"hand": self._hand, "timeout": self._timeout, **query.meta}
-        return self._transport.query(self._act_key, Message(query.arrays, meta), timeout=self._timeout)
+        query = Message(query.arrays, {"timeout": self._timeout, **query.meta})
+        return self._transport.query(self._act_key, query, timeout=self._timeout)

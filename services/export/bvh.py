@@ -1,4 +1,4 @@
-"""Biovision hierarchy: centimetres and y-up, as motion-capture programs expect; read back by bvhio.
+"""Biovision hierarchy: centimetres and y-up, as motion-capture programs expect.
 
 The format has no comments, so the meaning of the numbers is written to `<name>.json` next to it.
 """
@@ -6,12 +6,11 @@ The format has no comments, so the meaning of the numbers is written to `<name>.
 import json
 import pathlib
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.services.export.frames import FROM_Y_UP, TO_Y_UP, Track, bodies, facts, identifiers, pose_matrices
+from congrasp.services.export.frames import TO_Y_UP, bodies, facts, identifiers
 from congrasp.services.export.motion_file import GraspMotion
 
 _CM = 100.0
@@ -83,25 +82,3 @@ def _end(motion: GraspMotion, index: int) -> np.ndarray:
     """Drawn end of a last link, in its frame, m: the far end of its last capsule."""
     capsules = np.flatnonzero(motion.capsule_link == index)
     return motion.capsule_ends[capsules[-1], 1] if len(capsules) else np.array([0.0, 0.0, 0.01])
-
-
-def read(path: pathlib.Path) -> list[Track]:
-    """Reads a file with bvhio, composed from the root to the tips."""
-    import bvhio
-
-    names = json.loads(path.with_name(f"{path.name}.json").read_text())["frames"]
-    file = bvhio.readAsBvh(str(path))
-    poses: dict[str, np.ndarray] = {}
-
-    def visit(joint: Any, parent: np.ndarray) -> None:
-        """World poses of a joint and those below it."""
-        position = np.array([key.Position.to_tuple() for key in joint.Keyframes]) / _CM
-        turn = Rotation.from_quat([key.Rotation.to_tuple() for key in joint.Keyframes], scalar_first=True)
-        pose = parent @ pose_matrices(position, turn)
-        if joint.Name in names:
-            poses[names[joint.Name]] = pose
-        for child in joint.Children:
-            visit(child, pose)
-
-    visit(file.Root, FROM_Y_UP)
-    return [Track(file.FrameTime * np.arange(file.FrameCount), poses)]

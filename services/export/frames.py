@@ -1,4 +1,4 @@
-"""Poses of every link and of the object over time, from which formats are written and checked."""
+"""Poses, meshes and facts of a motion, from which every format is written."""
 
 import contextlib
 import re
@@ -14,6 +14,7 @@ from congrasp.common.hands.skeleton import Skeleton
 from congrasp.common.hands.skin import Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.painting import painted
+from congrasp.common.rotations import continuous
 from congrasp.services.export.motion_file import GraspMotion, hand_arrays
 from congrasp.services.record import palette
 from congrasp.services.record.moved_arm import Mesh
@@ -26,29 +27,10 @@ NOT_LINKS = (OBJECT, SKIN, "world")
 """Names that links of arms must not have."""
 COLOURS = {**palette.MATERIALS, OBJECT: palette.OBJECT}
 """Colours of the materials of hands, and of the object."""
-TOLERANCE_MM = 0.1
-"""Largest error of the kinematics of a file that is kept, mm."""
-_LEVER = 0.1  # m; a point this far from a frame's origin shows its rotation
-_SAME_TIME = 1e-6  # s
 _KINEMATICS = ("link_names", "link_parent", "joint_link", "joint_axis", "joint_anchor")
 _STILL = 1e-6  # m; a link whose origin moves less than this in its parent's frame does not move there
-
-
-FROM_Y_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
-"""(4, 4) transform from a world frame with the y axis up to one with the z axis up: y to z, z to -y."""
-TO_Y_UP = Rotation.from_matrix(FROM_Y_UP[:3, :3].T)
-"""Rotation of its inverse."""
-
-
-class Track(NamedTuple):
-    """Content of a file for one motion, computed by its reader."""
-
-    time: np.ndarray
-    """(T,) s, from zero."""
-    poses: dict[str, np.ndarray]
-    """(T, 4, 4) frame to world of every link and the object; metres, z up."""
-    triangles: dict[str, np.ndarray] | None = None
-    """(E, 3, 3) corners of the meshes of object and arm links in their frames; None if the format has no meshes."""
+TO_Y_UP = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""Rotation from a world frame with the z axis up to one with the y axis up: z to y, y to -z."""
 
 
 class Body(NamedTuple):
@@ -61,6 +43,10 @@ class Body(NamedTuple):
     """(T, 3) m, or (1, 3) if it is constant."""
     rotation: Rotation
     """T rotations."""
+
+    def quaternions(self, *, scalar_first: bool) -> np.ndarray:
+        """(T, 4), each on the side of the one before, so that programs may interpolate between them."""
+        return continuous(self.rotation.as_quat(scalar_first=scalar_first))
 
 
 class Capsule(NamedTuple):
@@ -100,22 +86,28 @@ def skin_of_motion(motion: GraspMotion) -> Skin:
     with contextlib.suppress(CongraspError):  # the motion itself has all the data
         if motion.hand in own_hands() and _same_hand(motion, hand := get_hand(motion.hand)):
             return skin_of(hand)
-    origins = np.zeros((len(motion.link_names), 3))
-    first = np.unique(motion.joint_link, return_index=True)[1]
-    origins[motion.joint_link[first]] = motion.joint_anchor[first]
+    origins = link_origins(motion)
     skeleton = Skeleton(
-        motion.hand,
-        tuple(map(str, motion.link_names)),
-        motion.link_parent,
-        origins,
-        motion.capsule_ends + origins[motion.capsule_link][:, None],
-        motion.capsule_radius,
-        motion.capsule_link,
-        motion.joint_anchor,
-        motion.joint_axis,
-        motion.joint_link,
+        hand=motion.hand,
+        names=tuple(map(str, motion.link_names)),
+        parents=motion.link_parent,
+        origins=origins,
+        capsules=motion.capsule_ends + origins[motion.capsule_link][:, None],
+        radii=motion.capsule_radius,
+        capsule_link=motion.capsule_link,
+        anchors=motion.joint_anchor,
+        axes=motion.joint_axis,
+        joint_link=motion.joint_link,
     )
     return skin_on(skeleton)
+
+
+def link_origins(motion: GraspMotion) -> np.ndarray:
+    """(L, 3) m, origins of the links in the wrist frame with all joints at zero: the anchors of their first joints."""
+    origins = np.zeros((len(motion.link_names), 3))
+    links, first = np.unique(motion.joint_link, return_index=True)
+    origins[links] = motion.joint_anchor[first]
+    return origins
 
 
 def _same_hand(motion: GraspMotion, hand: Hand) -> bool:
@@ -159,59 +151,6 @@ def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
     return matrices
 
 
-def error_mm(motion: GraspMotion, track: Track) -> float:
-    """Largest distance in mm between points of the motion and of the file.
-
-    The points are each frame's origin and three a decimetre away along its axes, at every time, and the triangles of
-    object and arm in their frames.
-
-    Raises:
-      CongraspError: the file has other bodies or times than the motion.
-    """
-    expected = _world_poses(motion.link_names, motion.link_position, motion.link_quaternion)
-    turns = Rotation.from_quat(motion.object_quaternion, scalar_first=True)
-    expected[OBJECT] = pose_matrices(motion.object_position, turns)
-    if arm := motion.arm:
-        expected |= _world_poses(arm.link_names, arm.link_position, arm.link_quaternion)
-    if odd := sorted(expected.keys() ^ track.poses.keys()):
-        raise CongraspError(f"The file lacks or should not have the frame '{odd[0]}'.")
-    if track.time.shape != motion.time.shape or np.abs(track.time - motion.time).max() > _SAME_TIME:
-        raise CongraspError("The file has other times than the motion.")
-    points = np.concatenate([np.zeros((1, 3)), _LEVER * np.eye(3)])
-    points = np.concatenate([points, np.ones((4, 1))], 1).T
-    distances = [np.linalg.norm(((expected[name] - track.poses[name]) @ points)[:, :3], axis=1) for name in expected]
-    worst = max(float(distance.max()) for distance in distances)
-    if track.triangles is not None:
-        meshes = _triangles(motion, track.triangles[OBJECT].shape)
-        if {name: mesh.shape for name, mesh in meshes.items()} != {n: m.shape for n, m in track.triangles.items()}:
-            raise CongraspError("The file's meshes have other triangles than the motion's.")
-        apart = (np.linalg.norm(track.triangles[name] - mesh, axis=-1).max() for name, mesh in meshes.items())
-        worst = max(worst, *map(float, apart))
-    return 1000 * worst
-
-
-def _world_poses(names: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> dict[str, np.ndarray]:
-    """(T, 4, 4) of each link, from (T, L, 3) and (T, L, 4)."""
-    turns = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
-    poses = pose_matrices(position.reshape(-1, 3), turns).reshape(*position.shape[:2], 4, 4)
-    return dict(zip(map(str, names), poses.swapaxes(0, 1), strict=True))
-
-
-def _triangles(motion: GraspMotion, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """(E, 3, 3) corners of the meshes of object and arm links in their frames.
-
-    The object's mesh is the one cut for its colours, if that has the shape.
-    """
-    corners = motion.object_vertices[motion.object_faces]
-    if motion.colours and corners.shape != shape:
-        vertices, faces, _ = object_mesh(motion)
-        corners = vertices[faces]
-    found = {OBJECT: corners}
-    for name, parts in arm_meshes(motion).items():
-        found[name] = np.concatenate([part.vertices[part.faces] for part in parts])
-    return found
-
-
 def arm_meshes(motion: GraspMotion) -> dict[str, list[Mesh]]:
     """Meshes of each link of the arm that has any; empty without an arm."""
     found: dict[str, list[Mesh]] = {}
@@ -223,8 +162,7 @@ def arm_meshes(motion: GraspMotion) -> dict[str, list[Mesh]]:
 
 def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dict[str, Any]:
     """Metadata of every file: origin of the motion, and meaning of its numbers in this format."""
-    arm = motion.arm
-    return {
+    about = {
         "generator": "congrasp",
         "hand": motion.hand,
         "object": motion.object,
@@ -236,12 +174,10 @@ def facts(motion: GraspMotion, *, frame: str, unit: str, quaternion: str) -> dic
         "quaternion": quaternion,
         "joints": motion.joint_names.tolist(),
         "links": motion.link_names.tolist(),
-        **(
-            {"arm": arm.name, "arm_joints": arm.joint_names.tolist(), "arm_links": arm.link_names.tolist()}
-            if arm
-            else {}
-        ),
     }
+    if arm := motion.arm:
+        about |= {"arm": arm.name, "arm_joints": arm.joint_names.tolist(), "arm_links": arm.link_names.tolist()}
+    return about
 
 
 def identifiers(names: Sequence[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""A LeRobot dataset, version 3.0: one episode per motion; written with pyarrow, read back by the layout in its files.
+"""A LeRobot dataset, version 3.0: one episode per motion.
 
 `observation.state` is the proprioception (joints of arm and fingers, then the wrist's pose),
 `observation.environment_state` the object's pose, `action` the arm's joints one step later, the finger targets, and the
@@ -9,20 +9,24 @@ camera there is `observation.images.front` too: one MP4 for all episodes, a fram
 import json
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.export.camera import SIZE, calibration, camera_for, pictures
-from congrasp.services.export.frames import OBJECT, Track, facts, pose_matrices
+from congrasp.common.hands.skin import Skin
+from congrasp.common.runtime.parallel import cores
+from congrasp.services.export.frames import facts, skin_of_motion
 from congrasp.services.export.motion_file import GraspMotion, robot_joints
-from congrasp.services.export.urdf import forward_kinematics, robot_urdf
-from congrasp.services.viz.scene import Camera
+from congrasp.services.export.urdf import robot_urdf
+from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.scene import Camera, Shape
+from congrasp.services.viz.shapes import arm_shapes, fit, object_shape, skin_shape, table_shape
 from congrasp.services.viz.sheets import save_video
 
 VERSION = "v3.0"
@@ -34,6 +38,10 @@ _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _STATE, _OBJECT, _ACTION = "observation.state", "observation.environment_state", "action"
 _CAMERA = "observation.images.front"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+SIZE = (320, 240)
+"""Width and height of the video, pixels."""
+_DIRECTION = np.array([0.8, -1.0, 0.7])  # from the table's middle to the camera
+_STEP = 10  # frames between those that the camera must contain
 _KEYFRAMES = ("-g", "2")  # for random access in training
 _COUNTED = 64  # pixels between those that the statistics count
 
@@ -45,105 +53,67 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion], *, camera: bool = 
       CongraspError: the motions differ in robot or control step, or the control step is no whole number of frames a
         second.
     """
-    first = motions[0]
-    fps = round(1 / first.control_dt)
-    if abs(fps * first.control_dt - 1) > 1e-6:
-        raise CongraspError(f"A control step of {first.control_dt} s makes no whole number of frames a second.")
-    for motion in motions:
-        if _robot(motion) != _robot(first):
-            raise CongraspError(
-                "A dataset has one robot and one control step, but the motions differ.", "Export each set."
-            )
-    tasks = list(dict.fromkeys(_task(motion) for motion in motions))
-    episodes = [_columns(motion, i, tasks) for i, motion in enumerate(motions)]
-    lengths = [len(motion.time) for motion in motions]
-    starts = np.cumsum([0, *lengths])
-    for columns, start, length in zip(episodes, starts, lengths, strict=False):
-        columns["index"] = start + np.arange(length)
+    first, fps = motions[0], _frame_rate(motions)
+    tasks = list(dict.fromkeys(map(_task, motions)))
+    starts = np.cumsum([0, *(len(motion.time) for motion in motions)])
+    episodes = [_columns(motion, i, int(starts[i]), tasks) for i, motion in enumerate(motions)]
     every = {name: np.concatenate([columns[name] for columns in episodes]) for name in episodes[0]}
-    seen = _film(path, motions, fps) if camera else None
-    rows: list[dict[str, Any]] = []
+    stats = {name: _statistics(values) for name, values in every.items()}
+    info = _info(first, len(motions), int(starts[-1]), len(tasks), fps)
+    described = {"congrasp": _about(motions), "stats": stats, "info": info}
+    pixels: list[np.ndarray] = []
+    if camera:
+        video = path / _VIDEO.format(video_key=_CAMERA, **_PLACE)
+        described["camera"], pixels = film(video, motions, fps)
+        stats[_CAMERA] = _statistics(np.concatenate(pixels), int(starts[-1]))
+        info["video_path"], info["features"][_CAMERA] = _VIDEO, _video_feature(fps)
+    rows = []
     for i, columns in enumerate(episodes):
-        own = {f"stats/{name}/{key}": value for name, c in columns.items() for key, value in _statistics(c).items()}
-        rows.append(
-            {
-                "episode_index": i,
-                "tasks": [_task(motions[i])],
-                "length": lengths[i],
-                "data/chunk_index": 0,
-                "data/file_index": 0,
-                "dataset_from_index": int(starts[i]),
-                "dataset_to_index": int(starts[i + 1]),
-                **own,
-                **(_filmed(seen.pixels[i], lengths[i], starts[i : i + 2] / fps) if seen else {}),
-                "meta/episodes/chunk_index": 0,
-                "meta/episodes/file_index": 0,
-            }
-        )
+        start, end = starts[i : i + 2].tolist()
+        row = {"episode_index": i, "tasks": [_task(motions[i])], "length": end - start}
+        row |= _prefixed("data", _PLACE) | {"dataset_from_index": start, "dataset_to_index": end}
+        for name, values in columns.items():
+            row |= _prefixed(f"stats/{name}", _statistics(values))
+        if camera:
+            span = {**_PLACE, "from_timestamp": start / fps, "to_timestamp": end / fps}
+            row |= _prefixed(f"videos/{_CAMERA}", span)
+            row |= _prefixed(f"stats/{_CAMERA}", _statistics(pixels[i], end - start))
+        rows.append(row | _prefixed("meta/episodes", _PLACE))
     _write_parquet(path / "data" / _FILE.format(**_PLACE), pa.table({n: _column(v) for n, v in every.items()}))
     _write_parquet(path / "meta" / "episodes" / _FILE.format(**_PLACE), pa.Table.from_pylist(rows))
     _write_parquet(path / "meta" / "tasks.parquet", _tasks_table(tasks))
-    about = {
-        **facts(first, frame="world: z up, table's top at z = 0", unit="m, rad, s", quaternion="qw, qx, qy, qz"),
-        "objects": [motion.object for motion in motions],
-        "success": [motion.success for motion in motions],
-        **({"arm_base": [_base(motion) for motion in motions]} if first.arm else {}),
-        "action": "finger targets of the joints' position servos; arm's joints and wrist's pose one step later",
-    }
+    (path / "meta" / ("robot.urdf" if first.arm else "hand.urdf")).write_text(robot_urdf(first))
+    for name, content in described.items():
+        (path / "meta" / f"{name}.json").write_text(json.dumps(content, indent=1))
+
+
+def _frame_rate(motions: Sequence[GraspMotion]) -> int:
+    """Frames a second of motions of one robot."""
+    dt = motions[0].control_dt
+    fps = round(1 / dt)
+    if abs(fps * dt - 1) > 1e-6:
+        raise CongraspError(f"A control step of {dt} s makes no whole number of frames a second.")
+    if any(_robot(motion) != _robot(motions[0]) for motion in motions):
+        raise CongraspError("A dataset has one robot and one control step, but the motions differ.", "Export each set.")
+    return fps
+
+
+def _prefixed(prefix: str, entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Entries with their names below a prefix."""
+    return {f"{prefix}/{name}": value for name, value in entries.items()}
+
+
+def _about(motions: Sequence[GraspMotion]) -> dict[str, Any]:
+    """Meaning of the dataset's numbers, and origin of its motions."""
+    about = facts(motions[0], frame="world: z up, table's top at z = 0", unit="m, rad, s", quaternion="qw, qx, qy, qz")
     del about["object"], about["constraints"]
-    meta = path / "meta"
-    (meta / ("robot.urdf" if first.arm else "hand.urdf")).write_text(robot_urdf(first))
-    (meta / "congrasp.json").write_text(json.dumps(about, indent=1))
-    stats: dict[str, Any] = {name: _statistics(values) for name, values in every.items()}
-    info = _info(first, len(motions), int(starts[-1]), len(tasks), fps)
-    if seen:
-        stats[_CAMERA] = _image_statistics(np.concatenate(seen.pixels), int(starts[-1]))
-        info["video_path"], info["features"][_CAMERA] = _VIDEO, _video_feature(fps)
-        (meta / "camera.json").write_text(json.dumps(calibration(seen.camera), indent=1))
-    (meta / "stats.json").write_text(json.dumps(stats, indent=1))
-    (meta / "info.json").write_text(json.dumps(info, indent=1))
-
-
-class _Film(NamedTuple):
-    """Recording of a camera."""
-
-    camera: Camera
-    pixels: list[np.ndarray]
-    """(n, 3) from 0 to 1 of each episode: some pixels of every frame."""
-
-
-def _film(path: pathlib.Path, motions: Sequence[GraspMotion], fps: int) -> _Film:
-    """Writes the video of all motions in sequence, from a camera that shows all of them."""
-    camera, pixels = camera_for(motions), list[np.ndarray]()
-
-    def frames() -> Iterator[np.ndarray]:
-        """Yields every frame, and counts its pixels."""
-        for motion in motions:
-            counted = []
-            for picture in pictures(motion, camera):
-                counted.append(picture.reshape(-1, 3)[::_COUNTED] / 255)
-                yield picture
-            pixels.append(np.concatenate(counted))
-
-    save_video(path / _VIDEO.format(video_key=_CAMERA, **_PLACE), frames(), SIZE, fps, _KEYFRAMES)
-    return _Film(camera, pixels)
-
-
-def _filmed(pixels: np.ndarray, frames: int, seconds: np.ndarray) -> dict[str, Any]:
-    """Entries of an episode's row for its part of the video, between two times (2,), s."""
-    begin, end = seconds.tolist()
-    place = {**_PLACE, "from_timestamp": begin, "to_timestamp": end}
-    statistics = _image_statistics(pixels, frames)
-    return {
-        **{f"videos/{_CAMERA}/{name}": value for name, value in place.items()},
-        **{f"stats/{_CAMERA}/{name}": value for name, value in statistics.items()},
-    }
-
-
-def _image_statistics(pixels: np.ndarray, frames: int) -> dict[str, Any]:
-    """Statistics of pixels (n, 3), of shape (3, 1, 1) each; the count is that of frames."""
-    found = {name: np.reshape(values, (-1, 1, 1)).tolist() for name, values in _statistics(pixels).items()}
-    return found | {"count": [frames]}
+    about |= {"objects": [motion.object for motion in motions], "success": [motion.success for motion in motions]}
+    if motions[0].arm:
+        about["arm_base"] = [
+            [*m.arm.link_position[0, 0].tolist(), *m.arm.link_quaternion[0, 0].tolist()] for m in motions if m.arm
+        ]
+    about["action"] = "finger targets of the joints' position servos; arm's joints and wrist's pose one step later"
+    return about
 
 
 def _video_feature(fps: int) -> dict[str, Any]:
@@ -170,14 +140,8 @@ def _robot(motion: GraspMotion) -> tuple[Any, ...]:
     )
 
 
-def _base(motion: GraspMotion) -> list[float]:
-    """Position and quaternion (7,) of the arm's base in the world."""
-    assert motion.arm is not None
-    return [*motion.arm.link_position[0, 0].tolist(), *motion.arm.link_quaternion[0, 0].tolist()]
-
-
-def _columns(motion: GraspMotion, episode: int, tasks: Sequence[str]) -> dict[str, np.ndarray]:
-    """A motion's columns (T, ...) by name."""
+def _columns(motion: GraspMotion, episode: int, start: int, tasks: Sequence[str]) -> dict[str, np.ndarray]:
+    """A motion's columns (T, ...) by name; `start` is the number of rows before them."""
     count = len(motion.time)
     arm = motion.arm.joint_position if motion.arm else np.zeros((count, 0))
     wrist = np.concatenate([motion.wrist_position, motion.wrist_quaternion], 1)
@@ -189,7 +153,7 @@ def _columns(motion: GraspMotion, episode: int, tasks: Sequence[str]) -> dict[st
         "timestamp": motion.time.astype(np.float32),
         "frame_index": np.arange(count),
         "episode_index": np.full(count, episode),
-        "index": np.arange(count),
+        "index": start + np.arange(count),
         "task_index": np.full(count, tasks.index(_task(motion))),
     }
 
@@ -212,17 +176,14 @@ def _tasks_table(tasks: Sequence[str]) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def _statistics(values: np.ndarray) -> dict[str, list[float]]:
-    """Statistics of a column, in the names of the format."""
+def _statistics(values: np.ndarray, frames: int = 0) -> dict[str, list[Any]]:
+    """Statistics of a column (T, ...), in the names of the format, or of some pixels (n, 3) of a number of frames."""
     columns = values.reshape(len(values), -1).astype(float)
-    return {
-        "min": columns.min(0).tolist(),
-        "max": columns.max(0).tolist(),
-        "mean": columns.mean(0).tolist(),
-        "std": columns.std(0).tolist(),
-        "count": [len(columns)],
-        **{name: np.quantile(columns, q, axis=0).tolist() for name, q in _QUANTILES.items()},
-    }
+    shape = (-1, 1, 1) if frames else (-1,)
+    found = {"min": columns.min(0), "max": columns.max(0), "mean": columns.mean(0), "std": columns.std(0)}
+    quantiles = {name: np.quantile(columns, q, axis=0) for name, q in _QUANTILES.items()}
+    first, rest = ({name: x.reshape(shape).tolist() for name, x in part.items()} for part in (found, quantiles))
+    return {**first, "count": [frames or len(columns)], **rest}
 
 
 def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
@@ -267,43 +228,76 @@ def _info(motion: GraspMotion, episodes: int, frames: int, tasks: int, fps: int)
     }
 
 
-def read(path: pathlib.Path) -> list[Track]:
-    """Reads every episode by the description in the files: features by name, kinematics by the URDF."""
-    info = json.loads((path / "meta" / "info.json").read_text())
-    (urdf,) = (file.read_text() for file in (path / "meta").glob("*.urdf"))
-    about = json.loads((path / "meta" / "congrasp.json").read_text())
-    links = [*about["links"], *about.get("arm_links", ())]
-    episodes = pq.read_table(path / "meta" / "episodes").to_pylist()
-    tracks = []
-    wrist = [f"wrist_{name}" for name in _POSE]
-    for episode in sorted(episodes, key=lambda row: row["episode_index"]):
-        place = {name: episode[f"data/{name}"] for name in _PLACE}
-        table = pq.read_table(path / info["data_path"].format(**place))
-        rows = table.filter(pc.equal(table["episode_index"], episode["episode_index"])).sort_by("index")
-        state = _named(info, rows, _STATE)
-        environment = _named(info, rows, _OBJECT)
-        angles = {name: state[name] for name in state if name not in wrist}
-        palm = _pose(state, "wrist")
-        bases = about.get("arm_base")
-        base = _matrices(np.array([bases[episode["episode_index"]]])) if bases else palm
-        poses = forward_kinematics(urdf, angles, palm, links[0], base)
-        poses[OBJECT] = _pose(environment, "object")
-        kept = {name: pose for name, pose in poses.items() if name in links or name == OBJECT}
-        tracks.append(Track(rows["frame_index"].to_numpy() / info["fps"], kept))
-    return tracks
+class Film(NamedTuple):
+    """Video of motions."""
+
+    calibration: dict[str, Any]
+    """See `calibration`."""
+    pixels: list[np.ndarray]
+    """(n, 3) from 0 to 1 for each motion: some pixels of every frame."""
 
 
-def _named(info: Mapping[str, Any], rows: pa.Table, feature: str) -> dict[str, np.ndarray]:
-    """(T,) columns of a feature by the names of its parts."""
-    values = np.array(rows[feature].to_pylist(), float)
-    return dict(zip(info["features"][feature]["names"], values.T, strict=True))
+def film(path: pathlib.Path, motions: Sequence[GraspMotion], frame_rate: int) -> Film:
+    """Writes the video of all motions in sequence, from a camera that shows all of them."""
+    camera, pixels = camera_for(motions), list[np.ndarray]()
+
+    def frames() -> Iterator[np.ndarray]:
+        """Yields every frame, and keeps some of its pixels."""
+        for motion in motions:
+            kept = []
+            for picture in pictures(motion, camera):
+                kept.append(picture.reshape(-1, 3)[::_COUNTED] / 255)
+                yield picture
+            pixels.append(np.concatenate(kept))
+
+    save_video(path, frames(), SIZE, frame_rate, _KEYFRAMES)
+    return Film(calibration(camera), pixels)
 
 
-def _pose(values: Mapping[str, np.ndarray], prefix: str) -> np.ndarray:
-    """(T, 4, 4) of the columns with a prefix."""
-    return _matrices(np.stack([values[f"{prefix}_{name}"] for name in _POSE], -1))
+def camera_for(motions: Sequence[GraspMotion]) -> Camera:
+    """Returns a camera that shows hands and objects of all motions."""
+    points = np.concatenate([_extent(motion) for motion in motions])
+    return fit(points[ConvexHull(points).vertices], _DIRECTION, SIZE[0] / SIZE[1])
 
 
-def _matrices(poses: np.ndarray) -> np.ndarray:
-    """(T, 4, 4) of positions and quaternions (T, 7)."""
-    return pose_matrices(poses[:, :3], Rotation.from_quat(poses[:, 3:], scalar_first=True))
+def _extent(motion: GraspMotion) -> np.ndarray:
+    """(n, 3) points of the hand's skin and of the object at some frames of a motion."""
+    found = []
+    skin = skin_of_motion(motion)
+    for frame in {*range(0, len(motion.time), _STEP), len(motion.time) - 1}:
+        hand, thing = _shapes(motion, skin, frame)[:2]
+        found += [hand.vertices, Rotation.from_quat(thing.quaternion, scalar_first=True).apply(thing.vertices)]
+        found[-1] = found[-1] + thing.position
+    return np.concatenate(found)
+
+
+def pictures(motion: GraspMotion, camera: Camera) -> Iterator[np.ndarray]:
+    """(height, width, 3) uint8 of every frame of a motion."""
+    skin = skin_of_motion(motion)
+    with ThreadPoolExecutor(cores()) as pool:
+        frames = range(len(motion.time))
+        yield from pool.map(lambda frame: render_scene(_shapes(motion, skin, frame), camera, SIZE), frames)
+
+
+def calibration(camera: Camera) -> dict[str, Any]:
+    """Parameters of the pinhole camera in the convention of computer vision: x right, y down, z forward."""
+    right, up, forward = camera.axes()
+    focal = SIZE[1] / 2 / np.tan(np.radians(camera.field_of_view) / 2)
+    return {
+        "model": "pinhole, no distortion; x right, y down, z forward; pixel (0, 0) is the upper left one's centre",
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "intrinsics": [[focal, 0.0, SIZE[0] / 2 - 0.5], [0.0, focal, SIZE[1] / 2 - 0.5], [0.0, 0.0, 1.0]],
+        "camera_to_world": [*np.column_stack([right, -up, forward, camera.position]).tolist(), [0.0, 0.0, 0.0, 1.0]],
+    }
+
+
+def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
+    """Shapes of the hand, the object, the arm, and the table while it is present."""
+    hand = skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
+    own = motion.colours
+    mesh = motion.object_vertices, motion.object_faces
+    paint = None if own is None else (own.points, own.values / 255)
+    thing = object_shape(mesh, motion.object_position[frame], motion.object_quaternion[frame], paint)
+    arm = arm_shapes(motion.arm, frame) if motion.arm else []
+    return [hand, thing, *arm, *([table_shape(motion.object_position[0])] if motion.table[frame] else [])]

@@ -289,6 +289,9 @@ def _check_arrays(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> No
     for name, below in (("link_parent", "L"), ("joint_link", "L"), ("capsule_link", "L")):
         if arrays[name].min() < -(name == "link_parent") or arrays[name].max() >= sizes[below]:
             raise ValueError(f"{name} names links that do not exist")
+    for name in ("joint_names", "link_names"):
+        if len(np.unique(arrays[name])) < len(arrays[name]):
+            raise ValueError(f"{name} has a name twice")
     colours = arrays.get(_VALUES, np.zeros(1))
     if colours.min() < 0 or colours.max() > 255:
         raise ValueError(f"{_VALUES} are not from 0 to 255")

@@ -1,15 +1,14 @@
-"""Hand and arm as URDF, for formats that carry joint angles, and the kinematics that MuJoCo makes of it."""
+"""Hand and arm as URDF, for formats that carry joint angles."""
 
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.services.export.frames import capsules, pose_matrices
+from congrasp.services.export.frames import capsules, link_origins, pose_matrices
 from congrasp.services.export.motion_file import GraspMotion, robot_joints
 from congrasp.services.record.moved_arm import UNLIMITED, MovedArm
 
@@ -56,11 +55,9 @@ def robot_urdf(motion: GraspMotion) -> str:
 def _add_hand(robot: ET.Element, motion: GraspMotion) -> None:
     """Adds the hand's links, which have the palm's orientation with all joints at zero."""
     names = robot_joints(motion)[-len(motion.joint_names) :]
-    origins = np.zeros((len(motion.link_names), 3))  # of the links' frames in the wrist frame, all joints at zero
+    origins = link_origins(motion)
     for i, (name, parent) in enumerate(zip(map(str, motion.link_names), motion.link_parent, strict=True)):
         moved = np.flatnonzero(motion.joint_link == i)
-        if len(moved):
-            origins[i] = motion.joint_anchor[moved[0]]
         joints = [
             _Joint(names[j], "revolute", motion.joint_axis[j], motion.joint_anchor[j] - origins[i], limits, _SPEED)
             for j, limits in zip(moved, motion.joint_limits[moved], strict=True)
@@ -161,36 +158,3 @@ def _number(value: float) -> str:
 def _numbers(values: np.ndarray) -> str:
     """Numbers of a vector."""
     return " ".join(map(_number, values))
-
-
-def forward_kinematics(
-    urdf: str, angles: Mapping[str, np.ndarray], wrist: np.ndarray, palm: str, base: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Poses (T, 4, 4) of all links, computed by MuJoCo from the file's text.
-
-    Args:
-      urdf: the text.
-      angles: (T,) of each joint by name, rad.
-      wrist: (T, 4, 4) poses of the palm, with which the links below it move.
-      palm: name of the palm.
-      base: (T, 4, 4) or (4, 4) pose of the root.
-    """
-    robot = ET.fromstring(urdf)
-    extension = ET.SubElement(robot, "mujoco")  # keeps links without joints, which would be merged
-    ET.SubElement(extension, "compiler", fusestatic="false")
-    model = mujoco.MjModel.from_xml_string(ET.tostring(robot, "unicode"))
-    data = mujoco.MjData(model)
-    matrices = np.zeros((len(wrist), model.nbody, 4, 4))
-    for t in range(len(wrist)):
-        for name, values in angles.items():
-            data.qpos[model.joint(name).qposadr[0]] = values[t]
-        mujoco.mj_kinematics(model, data)
-        matrices[t] = pose_matrices(data.xpos, Rotation.from_matrix(data.xmat.reshape(-1, 3, 3)))
-    held = {model.body(palm).id}
-    onto = wrist @ np.linalg.inv(matrices[:, model.body(palm).id])
-    poses = {}
-    for i in range(1, model.nbody):
-        if int(model.body_parentid[i]) in held:
-            held.add(i)
-        poses[model.body(i).name] = (onto if i in held else base) @ matrices[:, i]
-    return poses

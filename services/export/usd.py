@@ -1,35 +1,29 @@
-"""USD as text (.usda) with time samples; written by Pixar's own library, read back from the text without it.
+"""USD as text (.usda) with time samples.
 
 One Xform a link, nested as hand and arm are, the hand's with USD's own capsules as guides; object and arm are meshes.
 The hand's surface is skinned: a skeleton of the links with an animation moves it (UsdSkel).
 """
 
-import ast
 import json
 import pathlib
-import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
-from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.skin import MATERIALS, Skin
-from congrasp.common.rotations import continuous
 from congrasp.services.export.frames import (
     COLOURS,
     OBJECT,
     SKIN,
     Body,
-    Track,
     arm_meshes,
     bodies,
     capsules,
     facts,
     identifiers,
     object_mesh,
-    pose_matrices,
     skin_of_motion,
 )
 from congrasp.services.export.motion_file import GraspMotion
@@ -61,16 +55,18 @@ def write(path: pathlib.Path, motions: Sequence[GraspMotion]) -> None:
         translate, orient = xform.AddTranslateOp(_DOUBLE), xform.AddOrientOp(_DOUBLE)
         if len(body.translation) == 1:
             translate.Set(Gf.Vec3d(*body.translation[0]))
-        for t, turn in enumerate(continuous(body.rotation.as_quat(scalar_first=True))):
+        for t, turn in enumerate(body.quaternions(scalar_first=True)):
             orient.Set(Gf.Quatd(*turn), t)
             if len(body.translation) > 1:
                 translate.Set(Gf.Vec3d(*body.translation[t]), t)
         if body.name == OBJECT:
-            _add_mesh(stage, paths[-1], motion)
+            vertices, faces, paint = object_mesh(motion)
+            colours = COLOURS[OBJECT] if paint is None else paint
+            _add_mesh(stage, paths[-1].AppendChild("mesh"), vertices, faces, colours)
         _add_capsules(stage, paths[-1], motion, i)
         for number, part in enumerate(arm.get(body.name, ())):
-            shape = _new_mesh(stage, paths[-1].AppendChild(f"mesh_{number}"), part.vertices, part.faces)
-            shape.CreateDisplayColorAttr([part.colour])
+            place = paths[-1].AppendChild(f"mesh_{number}")
+            _add_mesh(stage, place, part.vertices, part.faces, part.colour, textured=False)
     links = found[: len(motion.link_names)]
     _add_skin(stage, root.GetPath().AppendChild(SKIN), skin_of_motion(motion), links)
     stage.Save()
@@ -90,18 +86,6 @@ def _add_capsules(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion, link:
         capsule.AddOrientOp(_DOUBLE).Set(Gf.Quatd(*turn.as_quat(scalar_first=True)))
 
 
-def _add_mesh(stage: Usd.Stage, parent: Sdf.Path, motion: GraspMotion) -> None:
-    """Adds the object's mesh in its frame."""
-    vertices, faces, colours = object_mesh(motion)
-    mesh = _new_mesh(stage, parent.AppendChild("mesh"), vertices, faces)
-    _add_coordinates(mesh, vertices, faces)
-    if colours is None:
-        mesh.CreateDisplayColorAttr([COLOURS[OBJECT]])
-    else:
-        own = mesh.CreateDisplayColorAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(colours)))
-        UsdGeom.Primvar(own).SetInterpolation(UsdGeom.Tokens.vertex)
-
-
 def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body]) -> None:
     """Adds the hand's surface, a skeleton of its links, and their animation."""
     root = UsdSkel.Root.Define(stage, path)
@@ -116,103 +100,47 @@ def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body
     skeleton.CreateRestTransformsAttr([Gf.Matrix4d().SetTranslate(Gf.Vec3d(*o)) for o in skin.origins - parents])
     animation.CreateJointsAttr(names)
     animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)] * len(links))
-    turns = np.stack([continuous(link.rotation.as_quat(scalar_first=True)) for link in links], 1)
+    turns = np.stack([link.quaternions(scalar_first=True) for link in links], 1)
     places = np.stack([np.broadcast_to(link.translation, (len(turns), 3)) for link in links], 1)
     rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
     for t, (turn, place) in enumerate(zip(turns, places, strict=True)):
         rotations.Set([Gf.Quatf(*map(float, q)) for q in turn], t)
-        translations.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(place, np.float32)), t)
-    _add_surface(stage, path.AppendChild("mesh"), skin, skeleton)
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
-    UsdSkel.BindingAPI.Apply(root.GetPrim())
-
-
-def _add_surface(stage: Usd.Stage, path: Sdf.Path, skin: Skin, skeleton: UsdSkel.Skeleton) -> None:
-    """Adds the hand's surface, bound to a skeleton of its links."""
-    mesh = _new_mesh(stage, path, skin.points, skin.faces)
-    _add_coordinates(mesh, skin.points, skin.faces)
-    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(skin.normals))
+        translations.Set(_vectors(place), t)
+    colours = np.array([COLOURS[name] for name in MATERIALS])[skin.material]
+    mesh = _add_mesh(stage, path.AppendChild("mesh"), skin.points, skin.faces, colours)
+    mesh.CreateNormalsAttr(_vectors(skin.normals))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    colours = np.array([COLOURS[name] for name in MATERIALS], np.float32)[skin.material]
-    colour = mesh.CreateDisplayColorAttr(Vt.Vec3fArray.FromNumpy(colours))
-    UsdGeom.Primvar(colour).SetInterpolation(UsdGeom.Tokens.vertex)
     influences, weights = skin.influences()
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     binding.CreateJointIndicesPrimvar(False, 4).Set(influences.ravel().tolist())
     binding.CreateJointWeightsPrimvar(False, 4).Set(weights.ravel().tolist())
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    UsdSkel.BindingAPI.Apply(root.GetPrim())
 
 
-def _new_mesh(stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.ndarray) -> UsdGeom.Mesh:
-    """A mesh of triangles, not subdivided."""
-    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, np.float32))
-    mesh = UsdGeom.Mesh.Define(stage, path)
+def _add_mesh(
+    stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.ndarray, colours: Any, *, textured: bool = True
+) -> UsdGeom.Mesh:
+    """Adds triangles (F, 3), not subdivided, of one colour (3,) or with that of each vertex (V, 3)."""
+    mesh, points = UsdGeom.Mesh.Define(stage, path), _vectors(vertices)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreatePointsAttr(points)
     mesh.CreateFaceVertexCountsAttr([3] * len(faces))
     mesh.CreateFaceVertexIndicesAttr(faces.ravel().tolist())
     mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    colour = mesh.CreateDisplayColorAttr(_vectors(np.reshape(colours, (-1, 3))))
+    if np.ndim(colours) > 1:
+        UsdGeom.Primvar(colour).SetInterpolation(UsdGeom.Tokens.vertex)
+    if textured:
+        flat, kind = unwrapped(vertices, faces), Sdf.ValueTypeNames.TexCoord2fArray
+        st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
+        st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(flat.uv, np.float32)))
+        st.SetIndices(Vt.IntArray(flat.faces.ravel().tolist()))
     return mesh
 
 
-def _add_coordinates(mesh: UsdGeom.Mesh, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Adds texture coordinates to a mesh (V, 3), (F, 3)."""
-    flat = unwrapped(vertices, faces)
-    primvars, kind = UsdGeom.PrimvarsAPI(mesh), Sdf.ValueTypeNames.TexCoord2fArray
-    st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.faceVarying)
-    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(flat.uv, np.float32)))
-    st.SetIndices(Vt.IntArray(flat.faces.ravel().tolist()))
-
-
-def read(path: pathlib.Path) -> list[Track]:
-    """Reads a file's text, composed from the root to the tips."""
-    layer = _parse(path.read_text(encoding="utf-8"))
-    assert layer["upAxis"] == "Z" and layer["metersPerUnit"] == 1
-    codes = np.arange(layer["startTimeCode"], layer["endTimeCode"] + 1)
-    poses: dict[str, np.ndarray] = {}
-    corners: dict[str, list[np.ndarray]] = {}
-
-    def visit(prim: dict[str, Any], parent: np.ndarray, body: str = "") -> None:
-        """World poses of a prim and those below it, and the triangles of meshes."""
-        body = prim.get(_NAME, body)
-        if _NAME in prim:
-            assert prim["xformOpOrder"] == ["xformOp:translate", "xformOp:orient"]
-            place, turn = (_samples(prim, name, len(codes)) for name in prim["xformOpOrder"])
-            parent = poses[body] = parent @ pose_matrices(place, Rotation.from_quat(turn, scalar_first=True))
-        elif "faceVertexIndices" in prim and "skel:skeleton" not in prim:
-            triangles = np.array(prim["points"])[prim["faceVertexIndices"]].reshape(-1, 3, 3)
-            corners.setdefault(body, []).append(triangles)
-        for name, child in prim.items():
-            if name.startswith("/"):
-                visit(child, parent, body)
-
-    visit(layer, np.eye(4))
-    meshes = {body: np.concatenate(triangles) for body, triangles in corners.items()}
-    return [Track(codes / layer["timeCodesPerSecond"], poses, meshes)]
-
-
-def _samples(prim: dict[str, Any], name: str, count: int) -> np.ndarray:
-    """(T, n) values of an attribute at every time code."""
-    samples = prim.get(f"{name}.timeSamples", {})
-    return np.array([samples[str(t)] if samples else prim[name] for t in range(count)], float)
-
-
-def _parse(text: str) -> dict[str, Any]:
-    """A layer's text as nested dictionaries: attributes by name, time samples by code, prims by `/name`."""
-    layer: dict[str, Any] = {}
-    open_blocks, prim = [layer], ""
-    for line in map(str.strip, text.splitlines()):
-        found = re.match(r"(?:[\w\[\]]+ )*([\w:.]+) = (.*)", line) or re.match(r"(\d+): (.*),", line)
-        if definition := re.match(r'def \w+ "(\w+)"', line):
-            prim = f"/{definition[1]}"
-        elif line == "}":
-            open_blocks.pop()
-        elif line == "{" or (found and found[2] == "{"):
-            block: dict[str, Any] = {}
-            open_blocks[-1][found[1] if found else prim] = block
-            open_blocks.append(block)
-        elif found:
-            value = found[2].removesuffix(" (")  # meta data of the attribute follow
-            open_blocks[-1][found[1]] = value if value.startswith("<") else ast.literal_eval(value)
-    return layer
+def _vectors(values: np.ndarray) -> Vt.Vec3fArray:
+    """Vectors (n, 3) as USD's."""
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))

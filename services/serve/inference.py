@@ -20,8 +20,9 @@ from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import seen_by
 from congrasp.common.task.types import SceneState
 from congrasp.common.wire.codec import Message
+from congrasp.services.client.episode import PACKED
 from congrasp.services.client.limits import JointLimits
-from congrasp.services.serve.requests import PACKED, STATES_LIMIT, Layout, Query
+from congrasp.services.serve.requests import STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)
 """Batches are padded to one of these sizes, so that nothing compiles after the warm-up."""
@@ -34,6 +35,10 @@ class Inference(NamedTuple):
     """(n, A + F + 6): the policy's mean action in units of action, finger targets (rad), wrist targets (m and rad)."""
     active: list[list[str]]
     """For each state, the active constraints and the reasons, in sentences."""
+
+    def reply(self, meta: Mapping[str, Any]) -> Message:
+        """Returns it as a message with further metadata, at least `version` and `total_ms`."""
+        return Message({PACKED: self.vectors}, {**meta, "active": self.active})
 
 
 class PolicyFunction:
@@ -67,29 +72,6 @@ class PolicyFunction:
         starts = [0, *ends[:-1]]
         return [self._answer(query, found[a:b]) for query, a, b in zip(queries, starts, ends, strict=True)]
 
-    def reply(self, request: Message, answer: Inference, meta: Mapping[str, Any]) -> Message:
-        """Returns the reply to a query: targets by name or packed, and the layout if requested.
-
-        Args:
-          request: the query.
-          answer: the inferred answer.
-          meta: further metadata, at least `version` and `total_ms`.
-        """
-        meta = {**meta, "active": answer.active}
-        if PACKED in request.arrays:
-            return Message({PACKED: answer.vectors}, meta)
-        if request.meta.get("layout"):
-            settle = self.layout.task.sensing.settle
-            meta |= {
-                "layout": self.layout.digest,
-                "states": STATES_LIMIT,
-                "settle": settle,
-                **self.layout.description(),
-            }
-        fingers = len(self.layout.hand.joints)
-        parts = np.split(answer.vectors[0], [-fingers - 6, -6])
-        return Message(dict(zip(("action", "q_target", "u_target"), parts, strict=True)), meta)
-
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`, as JSON."""
         hand, task = self.layout.hand, self.layout.task
@@ -105,6 +87,7 @@ class PolicyFunction:
             "constraints": [constraint.name for constraint in self.layout.known],
             "surface_points": task.surface_points,
             "trajectory_points": task.trajectory_points,
+            "query": {**self.layout.description(), "digest": self.layout.digest},
         }
 
     def _answer(self, query: Query, found: np.ndarray) -> Inference | Exception:

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import psutil
 
-from congrasp.common.errors import CongraspError, OverloadedError, TransportError
+from congrasp.common.errors import OverloadedError, TransportError
 from congrasp.common.request import GraspRequest
 from congrasp.common.transport.ports import local_url
 from congrasp.services.client.policy import Policy
@@ -22,7 +21,7 @@ from congrasp.services.ops.children import Child, end_all
 def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]]:
     """Context with a server of a policy file on this machine: yields its endpoint and process id.
 
-    The server may still be compiling.
+    The server may still be compiling: a client's `metadata` waits for it.
 
     Args:
       policy: the file.
@@ -34,25 +33,6 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]
         yield endpoint, server.start()
     finally:
         end_all([server])
-
-
-def processor_seconds(process: int) -> float:
-    """Processor time of a process in all its threads, s."""
-    times = psutil.Process(process).cpu_times()
-    return times.user + times.system
-
-
-def wait_until_ready(client: PolicyClient, seconds: float = 180.0) -> None:
-    """Waits until the server has compiled and responds; raises a CongraspError after `seconds`."""
-    deadline = time.monotonic() + seconds
-    while True:
-        try:
-            client.health()
-            return
-        except TransportError:
-            if time.monotonic() > deadline:
-                raise CongraspError(f"The policy server is not ready after {seconds:g} s.") from None
-            time.sleep(0.2)
 
 
 class Example(NamedTuple):

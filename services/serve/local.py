@@ -31,8 +31,8 @@ class LocalPolicy(EpisodePolicy):
         self._function = PolicyFunction(get_hand(bundle.spec.hand), bundle.task)
         self._function.warm_up(bundle.inference_parameters, BATCH_SIZES[:1])
 
-    def metadata(self) -> dict[str, Any]:
-        """See `Policy.metadata`."""
+    def _described(self) -> dict[str, Any]:
+        """The metadata of the bundle."""
         return self._function.metadata()
 
     def _query(self, query: Message) -> Message:
@@ -45,8 +45,7 @@ class LocalPolicy(EpisodePolicy):
                 raise answer
         except CongraspError as error:
             raise error_of(error.code, str(error)) from None
-        meta = {"version": self._bundle.version, "total_ms": 1e3 * (time.perf_counter() - began)}
-        return self._function.reply(query, answer, meta)
+        return answer.reply({"version": self._bundle.version, "total_ms": 1e3 * (time.perf_counter() - began)})
 
 
 def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:

@@ -1,23 +1,23 @@
-"""Queries of the live policy: their arrays, validation, and conversion to one flat vector.
+"""Queries of the live policy: their layout, validation, and completion.
 
-A query names its constraints in the metadata and carries, without batch axis, the fields of
-`common.task.types.SceneState`, the object's surface points and the goal fields of its constraints. The whole query is
-transferred to the device as one float32 vector, since the overhead of a transfer equals that of thirty times its size.
+A query is one array `packed` (n, S) of float32: a row for each of n states under the same constraints. Its metadata
+have the names of the `constraints`, the digest of the `layout`, and the `timeout` in seconds. One vector is transferred
+to the device at once, since the overhead of a transfer equals that of thirty times its size. The layout is part of
+`Policy.metadata`. `services.client.episode.Packer` writes and checks the fields; absent ones are zero.
 
-For a policy with history (`TaskConfig.observation` "tracked") it also carries `past_q`, `past_u`, `past_q_target`,
-`past_u_target`, `past_object_position` and `past_object_quaternion` of earlier control steps, newest first; without
-them, those of the current one are repeated.
+The fields, without batch axis, are those of `common.task.types.SceneState`, the object's `surface_points` with
+`surface_avoid`, and the goal arrays of the constraints.
+
+For a policy with history (`TaskConfig.observation` "tracked") there are also `past_q`, `past_u`, `past_q_target`,
+`past_u_target`, `past_object_position` and `past_object_quaternion` of earlier control steps, newest first.
 
 For a policy with a camera ("camera") `cloud` (N, 3) replaces `surface_points` and all fields of the object's pose and
 velocity. Cloud and constraints are in the world frame.
 
-For a policy that observes normals (`TaskConfig.surface_normals`) it may carry `surface_normals` (N, 3), outward unit
-vectors; missing ones are estimated from the points, those of a cloud toward `camera_position` (3,), world frame. Other
-policies ignore both.
+For a policy that observes normals (`TaskConfig.surface_normals`) there are `surface_normals` (N, 3), outward unit
+vectors. Zeros are estimated from the points, those of a cloud toward `camera_position` (3,), world frame.
 
-A query may also be packed: the vector itself as its single array, with the digest of its layout in the metadata. A
-named query can request the `layout` with its reply. Packed queries cost both ends a quarter. They may hold several
-states, one per row, with the same constraints; the reply then has as many rows.
+The reply is one array `packed` with a row for each state: action, finger targets, wrist targets.
 """
 
 import hashlib
@@ -42,6 +42,7 @@ from congrasp.common.task.normals import estimated_normals
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.common.wire.codec import Message
+from congrasp.services.client.episode import PACKED
 
 STATES_LIMIT = 64
 """Most states in one query."""
@@ -49,21 +50,7 @@ CLOUD = "cloud"
 """Name of the points of a query to a policy with a camera."""
 NORMALS, CAMERA = "surface_normals", "camera_position"
 """Names of the normals at these points, and of the position of the camera."""
-SURFACE_LIMIT = 4096
-"""Most surface points in one query; the policy uses `TaskConfig.surface_points` of them."""
-PACKED = "packed"
-"""Name of the array of a packed query."""
 _UNIT_TOLERANCE = 0.02
-_OPTIONAL_STATE = (
-    "q_velocity",
-    "u_velocity",
-    "object_velocity",
-    "object_angular_velocity",
-    "contact_force",
-    "contact_position",
-    "contact_found",
-    "wrist_load",
-)
 
 
 class Query(NamedTuple):
@@ -124,12 +111,27 @@ class Layout:
         past = [name for name in self._past if "quaternion" in name]
         self._directions = [*(name for name in self._state if "quaternion" in name), *past, *own]
         self._unit = [*self._directions, *([NORMALS] if NORMALS in self.shapes else [])]
-        self.digest = hashlib.sha256(json.dumps(self.description()).encode()).hexdigest()[:16]
+        described = json.dumps([hand.name, self.description()])
+        self.digest = hashlib.sha256(described.encode()).hexdigest()[:16]
 
     def description(self) -> dict[str, Any]:
-        """Layout for clients that pack queries: size of the vector, and offset and shape of every client field."""
-        fields = {name: [self.offsets[name], *shape] for name, shape in self.shapes.items() if name != "asked"}
-        return {"size": self.size, "fields": fields}
+        """Layout for clients, as JSON.
+
+        Returns:
+          `size` of the vector; `fields`, offset and shape of each; `constraints`, the fields that each one needs;
+          `states`, the most in one query; `settle`, m, see `SensingConfig`.
+        """
+        needs = {
+            c.name: [*(f"{c.name}_{name}" for name, array in c.arrays.items() if array.required), *c.needs]
+            for c in self.known
+        }
+        return {
+            "size": self.size,
+            "fields": {name: [self.offsets[name], *shape] for name, shape in self.shapes.items() if name != "asked"},
+            "constraints": needs,
+            "states": STATES_LIMIT,
+            "settle": self.task.sensing.settle,
+        }
 
     def unpack(self, vectors: Any) -> dict[str, Any]:
         """Returns the fields (B, ...) of flat vectors (B, S), for NumPy and traced arrays."""
@@ -144,52 +146,22 @@ class Layout:
         return slice(self.offsets[name], self.offsets[name] + math.prod(self.shapes[name]))
 
     def parse(self, message: Message) -> Query:
-        """Converts a query to a vector, unless it is packed; raises a CongraspError for an invalid form."""
-        meta = message.meta
-        hand = meta.get("hand", self.hand.name)
-        if hand != self.hand.name:
-            raise CongraspError(f"The policy is for the hand '{self.hand.name}', not {ascii(hand)[:60]}.")
-        asked = self._asked(meta.get("constraints", ["heading"]))
-        vectors = self._packed(message) if PACKED in message.arrays else self._named(message.arrays, asked)[None]
-        vectors[:, self._places("asked")] = [constraint.name in asked for constraint in self.known]
-        return Query(vectors, asked)
+        """Returns a query, whose values `complete` checks.
 
-    def _packed(self, message: Message) -> np.ndarray:
-        """Returns the vectors (n, S) of a packed query, a copy."""
-        vectors, digest = message.arrays[PACKED], message.meta.get("layout")
-        if digest != self.digest or len(message.arrays) > 1 or vectors.ndim != 2 or vectors.shape[1] != self.size:
-            raise LayoutError(
-                "The packed query does not match the policy's layout.", "Request the layout with a named query."
-            )
+        Raises:
+          LayoutError: it is not in this layout.
+          CongraspError: it names no valid constraints, or has too many states.
+        """
+        vectors = message.arrays.get(PACKED)
+        fits = vectors is not None and vectors.ndim == 2 and vectors.shape[1] == self.size and len(message.arrays) == 1
+        if vectors is None or not fits or message.meta.get("layout") != self.digest:
+            raise LayoutError("The query does not match the policy's layout.", "Take it from the policy's metadata.")
         if not 1 <= len(vectors) <= STATES_LIMIT:
             raise CongraspError(f"The query has {len(vectors)} states.", f"Send 1 to {STATES_LIMIT} at a time.")
-        return np.array(vectors, np.float32)
-
-    def _named(self, arrays: Mapping[str, Any], asked: tuple[str, ...]) -> np.ndarray:
-        """Returns the vector (S,) of a named query; raises a CongraspError for an unknown, missing or invalid field."""
-        arrays = {name: x for name, x in arrays.items() if name in self.shapes or name not in (NORMALS, CAMERA)}
-        unknown = sorted(arrays.keys() - self.shapes.keys() | arrays.keys() & {"asked"})
-        if unknown:
-            shown = ascii(unknown[0])[:60]
-            raise CongraspError(f"The query has an unknown field {shown}.", f"Known: {', '.join(self.shapes)}.")
-        required = [name for name in self._state if name not in _OPTIONAL_STATE]
-        required.append(self.points)
-        required += [n for n, (c, _, array) in self._arrays.items() if c.name in asked and array.required]
-        required += [name for constraint in self.known if constraint.name in asked for name in constraint.needs]
-        for name in required:
-            if name not in arrays:
-                raise CongraspError(f"The query lacks the field '{name}'.")
-        vector = np.zeros(self.size, np.float32)
-        given = dict(arrays)
-        given |= self._resampled(given)
-        for name in self._past:  # without history, the current state is repeated
-            given.setdefault(name, np.broadcast_to(given[name.removeprefix("past_")], self.shapes[name]))
-        for name, value in given.items():
-            shape = self.shapes[name]
-            if np.shape(value) != shape:
-                raise CongraspError(f"The field '{name}' has shape {np.shape(value)}; it must be {shape}.")
-            vector[self._places(name)] = np.ravel(value)
-        return vector
+        asked = self._asked(message.meta.get("constraints", ["heading"]))
+        vectors = np.array(vectors, np.float32)
+        vectors[:, self._places("asked")] = [constraint.name in asked for constraint in self.known]
+        return Query(vectors, asked)
 
     def complete(self, vectors: jax.Array) -> tuple[dict[str, jax.Array], jax.Array]:
         """Normalises quaternions and directions of queries, and fills in omitted fields; traced with the policy.
@@ -286,26 +258,6 @@ class Layout:
                 "The query has no constraint that guides the wrist.", f"Add one of: {', '.join(leading)}."
             )
         return tuple(constraint.name for constraint in self.known if constraint.name in names)
-
-    def _resampled(self, arrays: dict[str, Any]) -> dict[str, np.ndarray]:
-        """Points, labels and, if given, normals, resampled to the number that the policy uses."""
-        points = np.asarray(arrays[self.points])
-        if points.ndim != 2 or points.shape[1] != 3 or not 1 <= len(points) <= SURFACE_LIMIT:
-            raise CongraspError(
-                f"The field '{self.points}' has shape {points.shape}; it must be (N, 3), N at most {SURFACE_LIMIT}."
-            )
-        avoid = np.asarray(arrays.get("surface_avoid", np.zeros(len(points), bool)))
-        if avoid.shape != (len(points),):
-            raise CongraspError(f"The field 'surface_avoid' has shape {avoid.shape}; it must be ({len(points)},).")
-        found = {self.points: points, "surface_avoid": avoid}
-        if NORMALS in arrays:
-            found[NORMALS] = normals = np.asarray(arrays[NORMALS])
-            if normals.shape != points.shape:
-                raise CongraspError(f"The field '{NORMALS}' has shape {normals.shape}; it must be {points.shape}.")
-        if len(points) == self.task.surface_points:
-            return found
-        index = np.arange(self.task.surface_points) * len(points) // self.task.surface_points
-        return {name: array[index] for name, array in found.items()}
 
 
 def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[jax.Array, jax.Array]:

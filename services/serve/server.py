@@ -152,15 +152,15 @@ class PolicyServer:
             self._count(error, began)
             raise
         answer: Future[Message] = Future()
-        future.add_done_callback(functools.partial(self._finish, request, began, answer))
+        future.add_done_callback(functools.partial(self._finish, began, answer))
         return answer
 
-    def _finish(self, request: Message, began: float, answer: "Future[Message]", done: "Future[_Answered]") -> None:
+    def _finish(self, began: float, answer: "Future[Message]", done: "Future[_Answered]") -> None:
         """Resolves a query with the outcome of its batch."""
         error = done.exception()
         self._count(error, began)
         if error is None:
-            answer.set_result(self._message(request, done.result(), time.monotonic() - began))
+            answer.set_result(_message(done.result(), time.monotonic() - began))
         else:
             answer.set_exception(error)
 
@@ -169,14 +169,6 @@ class PolicyServer:
         lost = error.code if isinstance(error, OverloadedError | LateError) else "refused"
         self._answered += error is None
         self._on_answer("answered" if error is None else lost, time.monotonic() - began)
-
-    def _message(self, request: Message, answered: "_Answered", seconds: float) -> Message:
-        """Returns the reply: targets in the query's form, version, times."""
-        answer, held, queued, inferred = answered
-        times = {"queue_ms": queued, "infer_ms": inferred, "total_ms": seconds}
-        meta = {"version": held.bundle.version, "hash": held.hash}
-        meta |= {name: round(1e3 * spent, 3) for name, spent in times.items()}
-        return self._function.reply(request, answer, meta)
 
     @staticmethod
     def _deadline(seconds: Any) -> float:
@@ -229,6 +221,14 @@ class PolicyServer:
             raise CongraspError("The newer policy was trained on another task.", "Restart the server to serve it.")
         self._held = _hold(newer)
         self._trouble = ""
+
+
+def _message(answered: _Answered, seconds: float) -> Message:
+    """Returns the reply: targets, version, times."""
+    answer, held, queued, inferred = answered
+    times = {"queue_ms": queued, "infer_ms": inferred, "total_ms": seconds}
+    meta = {"version": held.bundle.version, "hash": held.hash}
+    return answer.reply({**meta, **{name: round(1e3 * spent, 3) for name, spent in times.items()}})
 
 
 def _cut(query: Query, first: int, end: int) -> Query:

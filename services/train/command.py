@@ -35,7 +35,7 @@ from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.ops.shutdown import on_signal
-from congrasp.services.serve.load import example_episode, one_answer, serving, wait_until_ready
+from congrasp.services.serve.load import example_episode, one_answer, serving
 from congrasp.services.train.launch import Launch, Plan
 from congrasp.services.train.learn import learn
 from congrasp.services.train.presets import FULL, easier
@@ -284,8 +284,8 @@ def _live_query(run_dir: pathlib.Path, hand: str) -> None:
     console.print("\n[bold]One live query[/] of a policy server in a separate process:")
     with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
         episode = example_episode(HELD_OUT_SEED, hand)
-        with PolicyClient(endpoint, hand=episode.hand, wait=60.0, timeout=5.0) as client:
-            wait_until_ready(client)
+        with PolicyClient(endpoint, hand=episode.hand, wait=180.0, timeout=5.0) as client:
+            client.metadata()
             console.print(one_answer(client, episode), markup=False, soft_wrap=True)
 
 

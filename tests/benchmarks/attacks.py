@@ -19,7 +19,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.serve.load import Example, example_episode, serving, wait_until_ready
+from congrasp.services.serve.load import Example, example_episode, serving
 from congrasp.services.train.command import untrained
 from congrasp.services.train.presets import get_preset
 from tests.benchmarks.attackers import attacked
@@ -73,7 +73,7 @@ def _honest(folder: pathlib.Path, seconds: float) -> Iterator[tuple[str, Callabl
     with serving(folder / "policy.safetensors", folder / "serve.log") as (endpoint, process):
         episode = example_episode(1_000_000)
         with PolicyClient(endpoint, wait=_START) as client:
-            wait_until_ready(client)
+            client.metadata()
             (folder / "query").write_bytes(_long_query(client, episode))
 
             def measure() -> list[float]:
@@ -111,7 +111,7 @@ def _long_query(client: PolicyClient, episode: Example) -> bytes:
     ask = client._query
 
     def keep(query: Message) -> Message:
-        kept.append(Message(query.arrays, {"hand": episode.hand, "timeout": 60.0, **query.meta}))
+        kept.append(Message(query.arrays, {"timeout": 60.0, **query.meta}))
         return ask(query)
 
     client._query = keep  # type: ignore[method-assign]

@@ -5,7 +5,7 @@ import contextlib
 import numpy as np
 import pytest
 
-from congrasp.common.errors import TransportError
+from congrasp.common.errors import RefusedError, TransportError
 from congrasp.common.hands import get_hand
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
@@ -14,7 +14,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.serve.requests import PACKED, Layout
+from congrasp.services.serve.inference import Inference, PolicyFunction
 from tests.waits import eventually
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -33,31 +33,30 @@ STATE = {
 }
 
 
-def layout(points=4):
-    return Layout(get_hand("human"), TaskConfig(surface_points=points, trajectory_points=2))
+HAND = get_hand("human")
 
 
 class CannedServer:
-    """Answers the n-th query with targets of value n, and keeps the fields of the queries and how they came."""
+    """Answers the n-th query with targets of value n, and keeps the fields of the queries."""
 
     def __init__(self, endpoint: str, points: int = 4):
-        self.layout = layout(points)
+        self.function = PolicyFunction(HAND, TaskConfig(surface_points=points, trajectory_points=2))
         self.fields: list[dict[str, np.ndarray]] = []
-        self.forms: list[str] = []
+        self.described = 0
         self.transport = ZenohTransport(listen=[endpoint], flows=("policy",))
         self.transport.serve(below(Keys("policy").act), self._act)
-        self.transport.serve(Keys("policy").health, lambda key, request: Message({}, {"ready": True}))
+        self.transport.serve(Keys("policy").health, self._describe)
+
+    def _describe(self, key: str, request: Message) -> Message:
+        self.described += 1
+        return Message({}, self.function.metadata())
 
     def _act(self, key: str, request: Message) -> Message:
-        query = self.layout.parse(request)
-        self.fields.append({name: value[0] for name, value in self.layout.unpack(query.vectors).items()})
-        self.forms.append("packed" if PACKED in request.arrays else "named")
+        layout = self.function.layout
+        self.fields.append({name: x[0] for name, x in layout.unpack(layout.parse(request).vectors).items()})
         n = np.float32(len(self.fields))
-        meta = {"version": 3, "active": [["words"]], "total_ms": 0.5}
-        targets = {"action": np.zeros(26, np.float32), "q_target": np.full(20, n), "u_target": np.full(6, -n)}
-        if self.forms[-1] == "packed":
-            return Message({PACKED: np.concatenate(list(targets.values()))[None]}, meta)
-        return Message(targets, {**meta, "layout": self.layout.digest, **self.layout.description()})
+        targets = np.concatenate([np.zeros(26), np.full(20, n), np.full(6, -n)]).astype(np.float32)
+        return Inference(targets[None], [["words"]]).reply({"version": 3, "total_ms": 0.5})
 
     def close(self) -> None:
         self.transport.close()
@@ -83,7 +82,7 @@ def test_the_client_remembers_the_episode_and_the_previous_targets(endpoint):
         client.act(STATE)
     server.close()
     first, second, third = server.fields
-    assert server.forms == ["named", "packed", "named"]
+    assert server.described == 1
     assert answer.version == 3 and answer.active == ("words",) and answer.server_ms == 0.5
     np.testing.assert_array_equal(answer.u_target, np.full(6, -1.0))
     np.testing.assert_allclose(first["q_target"], REQUEST.q, rtol=1e-6)
@@ -111,7 +110,7 @@ def test_the_client_finds_a_server_again_that_was_started_anew(endpoint):
     server.close()
 
 
-def test_a_server_of_another_layout_in_the_first_ones_place_is_asked_by_names(endpoint):
+def test_the_layout_is_requested_again_when_another_server_has_another_one(endpoint):
     server = CannedServer(endpoint)
     with PolicyClient(endpoint) as client:
         client.reset(REQUEST)
@@ -121,8 +120,20 @@ def test_a_server_of_another_layout_in_the_first_ones_place_is_asked_by_names(en
         server = CannedServer(endpoint, points=3)
         eventually(lambda: answered(client))
         client.act(STATE)
-        assert server.forms == ["named", "packed"]
-        np.testing.assert_array_equal(server.fields[1]["surface_points"], server.fields[0]["surface_points"])
+        assert server.described == 1 and server.fields[1]["surface_points"].shape == (3, 3)
+        assert [float(fields["time"]) for fields in server.fields] == [2.0, 3.0]
+    server.close()
+
+
+def test_another_server_with_the_policy_of_another_hand_is_refused(endpoint):
+    server = CannedServer(endpoint)
+    with PolicyClient(endpoint) as client:
+        client.reset(REQUEST)
+        client.act(STATE)
+        server.function = PolicyFunction(get_hand("allegro"), TaskConfig(hand="allegro"))
+        for ask in (lambda: client.act(STATE), client.metadata):
+            with pytest.raises(RefusedError, match="The policy is for the hand 'allegro', not 'human'"):
+                ask()
     server.close()
 
 

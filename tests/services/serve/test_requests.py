@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import os
 
 import jax
 import numpy as np
@@ -11,15 +10,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, LayoutError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.normals import estimated_normals
 from congrasp.common.wire.codec import Message
 from congrasp.services.serve.requests import Layout
+from tests.queries import packed
 
 HAND = get_hand("human")
 LAYOUT = Layout(HAND, TaskConfig(constraints=PAPER, surface_points=8, trajectory_points=3))
@@ -41,8 +40,8 @@ def arrays(**changes):
     return {name: value for name, value in {**given_arrays, **changes}.items() if value is not None}
 
 
-def parse(constraints=("heading",), meta=None, **changes):
-    return completed(LAYOUT.parse(Message(arrays(**changes), {"constraints": list(constraints), **(meta or {})})))
+def parse(constraints=("heading",), **changes):
+    return completed(LAYOUT.parse(packed(LAYOUT, arrays(**changes), constraints)))
 
 
 def completed(query):
@@ -129,53 +128,39 @@ def test_bad_queries_name_the_field_and_the_rule(constraints, changes, words):
         parse(constraints, **changes)
 
 
-def test_another_hand_is_refused_without_looking_for_it(tmp_path):
-    """Whatever a peer calls a hand: no file is opened (a pipe waits for ever), and the answer is one short line."""
-    known, pipe = tmp_path / "known.json", tmp_path / "pipe.json"
-    known.write_text(hand_text(HAND))
-    os.mkfifo(pipe)
-    odd = ["paw", str(known), str(pipe), hand_text(HAND), "x" * 500_000, None, 7, 1e300, True, [], ["human"], {"a": 1}]
-    for name in odd:
-        with pytest.raises(CongraspError, match="for the hand 'human', not") as caught:
-            parse(meta={"hand": name})
-        assert len(str(caught.value)) < 120 and str(caught.value).isascii()
-
-
 def test_odd_constraints_are_refused_in_one_short_line():
     for names in (None, 7, "heading", [["heading"]], [None], ["x" * 500_000], {"heading": 1}, ["heading", 3]):
         with pytest.raises(CongraspError, match="list of names") as caught:
-            LAYOUT.parse(Message(arrays(), {"constraints": names}))
+            LAYOUT.parse(Message(packed(LAYOUT, arrays()).arrays, {"layout": LAYOUT.digest, "constraints": names}))
         assert len(str(caught.value)) < 120
 
 
-def test_a_packed_query_is_the_vector_of_the_named_one():
-    named = LAYOUT.parse(Message(arrays(), {"constraints": ["heading"]}))
-    description = LAYOUT.description()
-    vector = np.zeros(description["size"], np.float32)
-    for name, value in arrays().items():
-        offset, *shape = description["fields"][name]
-        vector[offset : offset + int(np.prod(shape))] = np.ravel(value)
-    meta = {"constraints": ["heading"], "layout": LAYOUT.digest}
-    packed = LAYOUT.parse(Message({"packed": vector[None]}, meta))
-    np.testing.assert_array_equal(packed.vectors, named.vectors)
-    other = Layout(HAND, TaskConfig(constraints=PAPER, surface_points=8, trajectory_points=4)).digest
+def test_a_query_of_another_layout_is_refused():
+    vector, meta = packed(LAYOUT, arrays()).arrays["packed"], {"constraints": ["heading"], "layout": LAYOUT.digest}
+    assert len(LAYOUT.parse(Message({"packed": np.tile(vector, (64, 1))}, meta)).vectors) == 64
     for count in (0, 65):
         with pytest.raises(CongraspError, match=f"The query has {count} states"):
             LAYOUT.parse(Message({"packed": np.tile(vector, (count, 1))}, meta))
+    task = TaskConfig(constraints=PAPER, surface_points=8, trajectory_points=3)
+    others = (
+        Layout(HAND, dataclasses.replace(task, trajectory_points=4)),
+        Layout(dataclasses.replace(HAND, name="x"), task),
+    )
     for wrong in (
-        Message({"packed": vector[None]}, {**meta, "layout": other}),
-        Message({"packed": vector}, meta),
-        Message({"packed": vector[None, :-1]}, meta),
-        Message({"packed": vector[None], "q": np.zeros(20)}, meta),
-        Message({"packed": vector[None]}, {"constraints": ["heading"]}),
+        *(Message({"packed": vector}, {**meta, "layout": other.digest}) for other in others),
+        Message({"packed": vector[0]}, meta),
+        Message({"packed": vector[:, :-1]}, meta),
+        Message({"packed": vector, "q": np.zeros(20)}, meta),
+        Message({"packed": vector}, {"constraints": ["heading"]}),
+        Message(arrays(), meta),
     ):
-        with pytest.raises(CongraspError, match="does not match the policy's layout"):
+        with pytest.raises(LayoutError, match="does not match the policy's layout"):
             LAYOUT.parse(wrong)
 
 
 def test_a_bad_query_of_a_batch_spoils_no_other():
     good, bad, third = (
-        LAYOUT.parse(Message(arrays(**changes), {}))
+        LAYOUT.parse(packed(LAYOUT, arrays(**changes)))
         for changes in ({}, {"u": np.full(6, np.nan)}, {"base_quaternion": np.zeros(4)})
     )
     queries = good, bad, good, third
@@ -206,7 +191,7 @@ def normals_of(task=CLOSER, **changes):
     given_arrays = {name: value for name, value in arrays(**changes).items() if name in {*layout.shapes, *changes}}
     if points == "cloud":
         given_arrays = {n: x for n, x in given_arrays.items() if "object" not in n} | {points: changes[points]}
-    query = layout.parse(Message(given_arrays, {"constraints": ["heading"]}))
+    query = layout.parse(packed(layout, given_arrays))
     checks, surface = complete(query.vectors)
     if error := layout.find_error(query, np.asarray(checks)):
         raise error

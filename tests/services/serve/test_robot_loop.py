@@ -10,7 +10,6 @@ import pytest
 
 import congrasp
 from congrasp.common.policy import bundle as bundles
-from congrasp.services.serve.load import wait_until_ready
 from tests.base_install import steady_server
 from tests.benchmarks.robot import SEED, Rig
 from tests.task import HAND, TASK, policy
@@ -53,7 +52,7 @@ def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_s
     server = example.Server(tmp_path / "policy.safetensors")
     try:
         client = congrasp.PolicyClient(server.url, hand=HAND.name, timeout=0.2, wait=SECONDS)
-        wait_until_ready(client, SECONDS)
+        client.metadata()
         with congrasp.Guard(client, limits, HAND.q_open, stale=0.1, hold=0.3, fallback="open") as guard:
             grasps, ticker, counters = example.Grasps(robot, guard, TASK), congrasp.Ticker(100.0), guard.counters
 

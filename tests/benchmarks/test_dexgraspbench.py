@@ -20,12 +20,11 @@ from congrasp.common.hands.spec import Motor
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands import grips
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
-from congrasp.services.assets.objects.decompose import Decomposition
-from congrasp.services.cli.main import run
-from congrasp.services.export import benchmark_objects, dexgraspbench
-from congrasp.services.export.benchmark_hands import BENCHMARK_HANDS, benchmarked, match_hand
 from congrasp.services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
-from congrasp.services.export.replay import replay
+from tests.benchmarks.dexgraspbench import dexgraspbench, write_grasp
+from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, State, benchmark_grasp, read_grasps, squeezed
+from tests.benchmarks.dexgraspbench_hands import BENCHMARK_HANDS, benchmarked, match_hand
+from tests.benchmarks.dexgraspbench_replay import replayed
 from tests.docs.test_docs import ROOT
 from tests.episodes import episode
 
@@ -148,8 +147,7 @@ def motion() -> GraspMotion:
 
 
 def test_allegros_fingertips_are_where_menageries_model_has_them(motion, tmp_path):
-    grasp = dexgraspbench.benchmark_grasp("ball", motion)
-    assert dexgraspbench.write_grasp(grasp, tmp_path) < 0.01
+    write_grasp(benchmark_grasp("ball", motion), tmp_path)
     with np.load(tmp_path / "graspdata/ball/congrasp/0.npz", allow_pickle=False) as arrays:
         arrays = dict(arrays)
     model = mujoco.MjModel.from_xml_string(benchmark_model(ALLEGRO, "quat='0 1 0 1'"))
@@ -263,7 +261,7 @@ def test_squeezing_applies_the_policys_torque_within_the_motors_limit(motion):
         joint_position=np.tile(motion.joint_position[-1], (T, 1)),
         joint_target=motion.joint_position[-1] + ahead,
     )
-    torque = 5.0 * (dexgraspbench.squeezed(HAND, motion, T - 1, 5.0) - motion.joint_position[-1])
+    torque = 5.0 * (squeezed(HAND, motion, T - 1, 5.0) - motion.joint_position[-1])
     np.testing.assert_allclose(torque[:3], [0.3, -0.7, 0.0], atol=1e-6)
 
 
@@ -273,9 +271,7 @@ def test_a_motor_of_two_joints_squeezes_at_the_sum_of_its_joints(motion):
     first = motion.joint_names.tolist().index("index_2")
     target = motion.joint_position.copy()
     target[:, first + 1] += 1.0  # the tendon is 2 rad ahead: 4 N.m, of which it has 0.5
-    way = dexgraspbench.squeezed(pulled, dataclasses.replace(motion, joint_target=target), T - 1, 5.0)[
-        first : first + 2
-    ]
+    way = squeezed(pulled, dataclasses.replace(motion, joint_target=target), T - 1, 5.0)[first : first + 2]
     way -= motion.joint_position[-1, first : first + 2]
     assert way @ [1.0, 2.0] == pytest.approx(0.1)
     assert way[1] == pytest.approx(2 * way[0])
@@ -293,7 +289,7 @@ def test_the_pregrasp_is_the_last_clear_state_beside_the_object_as_it_lies_in_th
         joint_target=np.zeros((T, 16)),
         object_position=motion.wrist_position + wrist.apply(middle),
     )
-    grasp = dexgraspbench.benchmark_grasp("ball", motion)
+    grasp = benchmark_grasp("ball", motion)
     assert grasp.object_position == pytest.approx(motion.object_position[-1])
     assert grasp.clearance == pytest.approx(0.007, abs=5e-4)  # the ball has corners
     state = grasp.states["pregrasp"]
@@ -309,7 +305,7 @@ def test_the_grasp_is_that_at_the_end_of_the_approach(motion):
     removed = dataclasses.replace(motion, table=np.arange(T) < 4)
     lifted = dataclasses.replace(motion, about={"phases": {"grasp": 0.0, "lift": 0.03, "hold": 0.05}}, control_dt=0.01)
     for case, frame in ((removed, 3), (lifted, 2)):
-        grasp = dexgraspbench.benchmark_grasp("ball", case)
+        grasp = benchmark_grasp("ball", case)
         np.testing.assert_allclose(grasp.states["grasp"].q, motion.joint_position[frame])
         np.testing.assert_allclose(grasp.object_position, motion.object_position[frame])
 
@@ -322,10 +318,10 @@ def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(motion, monkeyp
     still = Rotation.identity()
     q = grip.q.astype(float)
     closed = np.clip(q + 0.14 * np.sign(HAND.q_closed - HAND.q_open), HAND.lower, HAND.upper)
-    grasp = dexgraspbench.State(np.zeros(3), still, q)
+    grasp = State(np.zeros(3), still, q)
     # Where no push along an axis brings the box.
-    afar = dexgraspbench.State(np.array([-0.5, -0.5, -0.5]), still, HAND.q_open.astype(float))
-    held = dexgraspbench.Grasp(
+    afar = State(np.array([-0.5, -0.5, -0.5]), still, HAND.q_open.astype(float))
+    held = Grasp(
         name="held",
         hand=HAND,
         match=match_hand(motion),
@@ -337,8 +333,8 @@ def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(motion, monkeyp
         states={"pregrasp": afar, "grasp": grasp, "squeeze": grasp._replace(q=closed)},
         clearance=0.4,
     )
-    lost = held._replace(name="lost", states=dict.fromkeys(dexgraspbench.STATES, afar))
-    first, second = replay([held, lost])
+    lost = held._replace(name="lost", states=dict.fromkeys(STATES, afar))
+    first, second = replayed([held, lost])
     assert first.from_grasp and 0.0 < first.depth_mm < 3.0 and 0.0 < first.pushed_mm < 3.0
     assert not (second.from_grasp or second.from_pregrasp)
     assert second.depth_mm == second.pushed_mm == 0.0
@@ -349,7 +345,7 @@ def test_the_command_and_the_example_make_the_benchmarks_files(motion, tmp_path,
         (tmp_path / "grasps" / name).mkdir(parents=True)
         save_motion(tmp_path / "grasps" / name / "grasp.npz", dataclasses.replace(motion, metrics={"held": held}))
     out = tmp_path / "bench"
-    assert run(["export", "grasp", str(tmp_path / "grasps"), "--out", str(out)]) == 0
+    assert dexgraspbench((tmp_path / "grasps",), out) == 0
     said = capsys.readouterr().out
     assert "lost/grasp.npz: The object is not held." in said and "1 grasps" in said
     script = [sys.executable, str(ROOT / "examples" / "dexgraspbench.py"), str(out), str(tmp_path / "graspdata")]
@@ -371,7 +367,7 @@ def test_the_command_and_the_example_make_the_benchmarks_files(motion, tmp_path,
     assert coefficient * data["obj_scale"] ** 3 == pytest.approx(volume, rel=0.1)
     assert sum(piece.volume for piece in pieces) == pytest.approx(coefficient, rel=1e-5)
     with pytest.raises(CongraspError, match="exists already"):
-        run(["export", "grasp", str(tmp_path / "grasps"), "--out", str(out)])
+        dexgraspbench((tmp_path / "grasps",), out)
 
 
 def save_motions(folder, **motions):
@@ -383,70 +379,20 @@ def save_motions(folder, **motions):
 def test_every_motion_has_a_name_of_its_own(motion, tmp_path):
     for above in ("1/a", "2/a", "3/a-2"):
         save_motions(tmp_path / above[0], **{above[2:]: motion})
-    grasps, _, left_out = dexgraspbench.export_grasps([tmp_path / x for x in "123"], tmp_path / "out")
-    names = [grasp.name for grasp in grasps]
-    assert names == ["a", "a-2", "a-2-2"] and not left_out
-    for folder in (dexgraspbench.GRASPS, dexgraspbench.OBJECTS):
-        assert sorted(x.name for x in (tmp_path / "out" / folder).iterdir()) == names
+    grasps, left_out = read_grasps([tmp_path / x for x in "123"])
+    assert [grasp.name for grasp in grasps] == ["a", "a-2", "a-2-2"] and not left_out
 
 
-def test_one_motion_that_cannot_be_exported_is_left_out(motion, tmp_path, monkeypatch):
+def test_one_motion_that_cannot_be_exported_is_left_out(motion, tmp_path):
     flat = dataclasses.replace(motion, object_vertices=motion.object_vertices * np.float32([1, 1, 0]))
     moved = dataclasses.replace(motion, joint_anchor=motion.joint_anchor + 0.001 * np.arange(16)[:, None])
-    save_motions(tmp_path / "in", flat=flat, good=motion, moved=moved, off=motion)
+    save_motions(tmp_path / "in", flat=flat, good=motion, moved=moved)
     (tmp_path / "in" / "torn").mkdir()
     (tmp_path / "in" / "torn" / "grasp.npz").write_bytes(b"PK")
-    measure = dexgraspbench.error_mm
-    monkeypatch.setattr(dexgraspbench, "error_mm", lambda g, x: 1.0 if g.name == "off" else measure(g, x))
-    grasps, error, left_out = dexgraspbench.export_grasps([tmp_path / "in"], tmp_path / "out")
-    assert [grasp.name for grasp in grasps] == ["good"] and error < 0.01
-    said = dict(zip(("flat", "moved", "off", "torn"), left_out, strict=True))
-    assert all(f"{name}/grasp.npz" in reason for name, reason in said.items())
-    for name, word in {
-        "flat": "has no volume",
-        "moved": "no hand like",
-        "off": "off by 1 mm",
-        "torn": "motion",
-    }.items():
-        assert word in said[name]
-    for folder in (dexgraspbench.GRASPS, dexgraspbench.OBJECTS):
-        assert [x.name for x in (tmp_path / "out" / folder).iterdir()] == ["good"]
+    grasps, left_out = read_grasps([tmp_path / "in"])
+    assert [grasp.name for grasp in grasps] == ["good"]
+    reasons = {"flat": "has no volume", "moved": "no hand like", "torn": "motion"}
+    for (name, word), line in zip(reasons.items(), left_out, strict=True):
+        assert f"{name}/grasp.npz" in line and word in line
     with pytest.raises(CongraspError, match=r"None of the motions can be exported.*has no volume"):
-        dexgraspbench.export_grasps([tmp_path / "in" / "flat"], tmp_path / "none")
-
-
-def test_an_export_that_fails_midway_leaves_nothing_behind(motion, tmp_path, monkeypatch):
-    save_motions(tmp_path / "in", a=motion, b=motion)
-    write = dexgraspbench.write_object
-
-    def full(folder, *rest):
-        if folder.name == "b":
-            raise CongraspError("No space is left.")
-        write(folder, *rest)
-
-    monkeypatch.setattr(dexgraspbench, "write_object", full)
-    out = tmp_path / "below" / "out"
-    with pytest.raises(CongraspError, match="No space is left"):
-        dexgraspbench.export_grasps([tmp_path / "in"], out)
-    assert not [*out.parent.iterdir()]
-    monkeypatch.undo()
-    assert len(dexgraspbench.export_grasps([tmp_path / "in"], out)[0]) == 2
-
-
-@pytest.mark.parametrize(("method", "runs"), [("coacd", 1), ("hull", 2)])
-def test_only_what_coacd_made_is_kept(motion, method, runs, tmp_path, monkeypatch):
-    """What stands in for it when the machine is busy is made anew, as is all after a change of the code."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    calls = []
-
-    def decompose(vertices, faces, **_):
-        calls.append(method)
-        return Decomposition([vertices], method, [])
-
-    monkeypatch.setattr(benchmark_objects, "decompose", decompose)
-    first, second = (benchmark_objects.convex_object(motion) for _ in range(2))
-    assert len(calls) == runs
-    np.testing.assert_allclose(second.pieces[0].vertices, first.pieces[0].vertices, atol=1e-6)
-    monkeypatch.setattr(benchmark_objects, "source_digest", lambda *packages: "another")
-    benchmark_objects.convex_object(motion)
-    assert len(calls) == runs + 1
+        read_grasps([tmp_path / "in" / "flat"])

@@ -129,33 +129,6 @@ class Match(NamedTuple):
             found[link] = (*found.get(link, ()), solid)
         return found
 
-    def joint_frames(self, qpos: np.ndarray) -> tuple[np.ndarray, Rotation]:
-        """Frames of each joint's link in the benchmark's kinematics, by the product of exponentials.
-
-        Args:
-          qpos: (7 + F,), see `qpos`.
-
-        Returns:
-          (F, 3) m, the joints' anchors in the world frame; and the rotation of the link after each joint, from this
-          project's zero pose to the world frame.
-        """
-        root = Rotation.from_quat(qpos[3:7], scalar_first=True)
-        palm = root * Rotation.from_quat(self.hand.quaternion, scalar_first=True)
-        base = qpos[:3] + root.apply(self.hand.position)
-        places, turns = [], []
-        number = 7
-        for rows in self.hand.fingers.values():
-            turn, way = palm, base  # of a point of the zero pose: turn.apply(point) + way
-            for row in np.array(rows).reshape(-1, 2, 3):
-                anchor = turn.apply(row[0]) + way
-                turn = turn * Rotation.from_rotvec(qpos[number] * row[1])
-                way = anchor - turn.apply(row[0])
-                places.append(anchor)
-                turns.append(turn)
-                number += 1
-        own = Rotation.from_quat(self.hand.quaternion, scalar_first=True).inv() * self.rotation
-        return np.array(places), Rotation.concatenate(turns) * own
-
 
 def match_hand(motion: GraspMotion) -> Match:
     """Returns the benchmark's hand for a motion's hand, independent of the names of its joints.

@@ -1,47 +1,39 @@
-"""Grasps for DexGraspBench: pregrasp, grasp and squeeze of motions, with the objects in the benchmark's layout.
+"""Pregrasp, grasp and squeeze of motions for DexGraspBench, and their objects as convex pieces."""
 
-The benchmark's files are pickles, which this project neither writes nor reads. It writes NPZ files with the same names
-and shapes, which `examples/dexgraspbench.py` converts in the benchmark's environment.
-"""
-
-import io
 import itertools
 import pathlib
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
+import trimesh
+from scipy.spatial import QhullError
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.physics.scene import compile_scene
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import HANDS, get_hand, own_hands
+from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import file_name
-from congrasp.common.io.npz import read_npz
-from congrasp.common.objects.spec import GraspObject
+from congrasp.common.objects.plain import plain_object
+from congrasp.common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.hands.kinematics import posed
-from congrasp.services.export.benchmark_hands import Match, benchmarked, match_hand
-from congrasp.services.export.benchmark_objects import convex_object, write_object
-from congrasp.services.export.frames import TOLERANCE_MM
+from congrasp.services.assets.objects.decompose import decompose
+from congrasp.services.assets.objects.pieces import simplify
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.export.motion_formats import pick_motion
 from congrasp.services.record.goals import grasp_span
+from tests.benchmarks.dexgraspbench_hands import Match, benchmarked, match_hand
 
 CLEARANCE = 0.006
 """Metres between hand and object in the pregrasp."""
 STATES = ("pregrasp", "grasp", "squeeze")
-GRASPS, OBJECTS = "graspdata", "object"
-"""Folders of the output."""
 _MOTION = "grasp.npz"  # of `congrasp grasp`, in an object's folder
 _STEADY = 10  # frames of the mean torque of the squeeze
-_LEVER = 0.05  # m; points this far from a joint show its rotation
+_DENSITY = 500.0  # kg/m^3
+_SECONDS = 60.0  # deadline of the convex decomposition of a body
 
 
 class State(NamedTuple):
@@ -77,60 +69,34 @@ class Grasp(NamedTuple):
     """Distance of hand and object in the pregrasp, m; less than `CLEARANCE` if the motion begins nearer."""
 
 
-def export_grasps(
-    paths: Sequence[pathlib.Path], folder: pathlib.Path, progress: Callable[[int], None] = lambda done: None
-) -> tuple[list[Grasp], float, list[str]]:
-    """Writes the grasps of motions into a new folder, which is created when all are written.
+def read_grasps(
+    paths: Sequence[pathlib.Path], progress: Callable[[int], None] = lambda done: None
+) -> tuple[list[Grasp], list[str]]:
+    """Reads the grasps of motions of one hand.
 
     Args:
       paths: NPZ files, recordings, and folders of `congrasp grasp`, with all results below them.
-      folder: output folder, with `GRASPS` and `OBJECTS`.
       progress: called with the number of finished motions.
 
     Returns:
-      The grasps, the largest error in mm (`write_grasp`), and reasons for skipped motions.
+      The grasps under different names, and reasons for skipped motions.
 
     Raises:
-      CongraspError: nothing can be exported, the motions are of several hands, or the folder cannot be written.
+      CongraspError: there is none, or the motions are of several hands.
     """
-    if folder.exists():
-        raise CongraspError(f"{folder} exists already.", "Remove it or pass another with --out.")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as workplace:
-            draft = pathlib.Path(workplace) / folder.name
-            found = _write_grasps(paths, draft, progress)
-            draft.rename(folder)
-    except OSError as error:
-        raise CongraspError(f"{folder} cannot be written: {error.strerror}.", "Pass another with --out.") from None
-    return found
-
-
-def _write_grasps(
-    paths: Sequence[pathlib.Path], folder: pathlib.Path, progress: Callable[[int], None]
-) -> tuple[list[Grasp], float, list[str]]:
-    """See `export_grasps`."""
     grasps: list[Grasp] = []
     left_out: list[str] = []
-    names: set[str] = set()
-    worst = 0.0
     for done, file in enumerate(_files_at(paths), 1):
         try:
-            grasp = _grasp_at(file, names)
+            grasps.append(_grasp_at(file, {grasp.name for grasp in grasps}))
         except CongraspError as error:
             left_out.append(f"{file}: {error}")
-        else:
-            if grasps and grasp.hand.name != grasps[0].hand.name:
-                raise CongraspError(f"{file} is of another hand, {grasp.hand.name}.", "Export each hand separately.")
-            if (off := write_grasp(grasp, folder)) <= TOLERANCE_MM:
-                grasps.append(grasp)
-                worst = max(worst, off)
-            else:
-                left_out.append(f"{file}: off by {off:.3g} mm in the benchmark, above the limit of {TOLERANCE_MM} mm")
         progress(done)
     if not grasps:
         raise CongraspError(" ".join(["None of the motions can be exported.", *left_out[:1]]))
-    return grasps, worst, left_out
+    if len(hands := sorted({grasp.hand.name for grasp in grasps})) > 1:
+        raise CongraspError(f"The motions are of several hands: {', '.join(hands)}.", "Export each hand separately.")
+    return grasps, left_out
 
 
 def _files_at(paths: Sequence[pathlib.Path]) -> Iterator[pathlib.Path]:
@@ -141,7 +107,7 @@ def _files_at(paths: Sequence[pathlib.Path]) -> Iterator[pathlib.Path]:
 
 
 def _grasp_at(file: pathlib.Path, names: set[str]) -> Grasp:
-    """Returns the grasp of a motion's file, under a name that is added to `names`.
+    """Returns the grasp of a motion's file, under a name that is not among `names`.
 
     Raises:
       CongraspError: it is not a motion, its object is not held or has no volume, or the benchmark does not have its
@@ -152,9 +118,7 @@ def _grasp_at(file: pathlib.Path, names: set[str]) -> Grasp:
         raise CongraspError("The object is not held.")
     name = file.resolve().parent.name if file.name == _MOTION else file_name(motion.object, "the object of a motion")
     free = next(x for i in itertools.count(1) if (x := name if i == 1 else f"{name}-{i}") not in names)
-    grasp = benchmark_grasp(free, motion)
-    names.add(free)
-    return grasp
+    return benchmark_grasp(free, motion)
 
 
 def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
@@ -163,7 +127,7 @@ def benchmark_grasp(name: str, motion: GraspMotion) -> Grasp:
     Raises:
       CongraspError: the benchmark does not have the hand.
     """
-    match, hand = match_hand(motion), _hand_of(motion)
+    match, hand = match_hand(motion), get_hand(motion.hand)
     obj = convex_object(motion)
     last = max(grasp_span(motion.about, motion.control_dt, motion.table)[1] - 1, 0)
     clear, clearance = _last_clear(benchmarked(hand, match), obj, motion, last)
@@ -201,72 +165,33 @@ def squeezed(hand: Hand, motion: GraspMotion, t: int, kp: float) -> np.ndarray:
     return q
 
 
-def arrays_of(grasp: Grasp) -> dict[str, np.ndarray]:
-    """Arrays of a grasp for the benchmark, by its names.
-
-    Returns:
-      `pregrasp_qpos`, `grasp_qpos`, `squeeze_qpos` (7 + F,): the root's place (m) and quaternion (w, x, y, z) in the
-      world, and the joints (rad) in the order of `joint_names`; `obj_pose` (7,), likewise, of the frame of the object's
-      file; `obj_scale` (), m per unit of that file; `obj_path`, the object's folder beside that of the grasps.
-    """
-    place = grasp.object_position - grasp.object_rotation.apply(grasp.origin)
-    found = {f"{name}_qpos": grasp.match.qpos(*grasp.states[name]) for name in STATES}
-    return found | {
-        "obj_pose": np.concatenate([place, grasp.object_rotation.as_quat(scalar_first=True)]),
-        "obj_scale": np.array(grasp.scale),
-        "obj_path": np.array(f"{OBJECTS}/{grasp.name}"),
-        "joint_names": np.array(grasp.match.hand.joints),
-        "hand": np.array(grasp.match.name),
-    }
-
-
-def write_grasp(grasp: Grasp, folder: pathlib.Path) -> float:
-    """Writes a grasp, reads it back, and writes its object; removes it if its error is above `TOLERANCE_MM`.
-
-    Returns:
-      The largest error in mm, see `error_mm`.
+def convex_object(motion: GraspMotion) -> GraspObject:
+    """Returns the object in the motion's object frame, made of convex pieces, since a motion only has its mesh.
 
     Raises:
-      CongraspError: the folder cannot be written.
+      CongraspError: the mesh has no volume.
     """
-    path = folder / GRASPS / grasp.name / "congrasp" / "0.npz"
-    buffer = io.BytesIO()
-    arrays: dict[str, Any] = arrays_of(grasp)
-    np.savez(buffer, **arrays)
-    write_atomically(path, buffer.getvalue())
-    error = error_mm(grasp, read_npz(path, "Export it again."))
-    if error <= TOLERANCE_MM:
-        write_object(folder / OBJECTS / grasp.name, grasp.obj, grasp.origin, grasp.scale)
-    else:
-        shutil.rmtree(folder / GRASPS / grasp.name)
-    return error
+    shape = motion.object_vertices.astype(float), motion.object_faces
+    # Bodies that only touch have no vertex in common, unless equal ones are merged.
+    bodies = trimesh.Trimesh(*shape, process=False).split(only_watertight=False, repair=False)
+    if len(bodies) > MAX_MESH_PIECES:
+        bodies = [trimesh.Trimesh(*shape)]
+    pieces = [piece for body in bodies for piece in _pieces(body, max(1, MAX_MESH_PIECES // len(bodies)))]
+    if not pieces:
+        raise CongraspError(f"The mesh of '{motion.object}' has no volume.", "Generate the motion again.")
+    return plain_object(motion.object, tuple(pieces), _DENSITY)
 
 
-def error_mm(grasp: Grasp, arrays: dict[str, np.ndarray]) -> float:
-    """Largest distance in mm of joints, and of points 5 cm from them, between a file and the hand's kinematics."""
-    levers = np.concatenate([np.zeros((1, 3)), _LEVER * np.eye(3)])
-    worst = 0.0
-    for name in ("pregrasp", "grasp"):
-        state, order = grasp.states[name], grasp.match.order
-        data = posed(grasp.hand, state.q)
-        joints = [data.joint(joint.name) for joint in grasp.hand.joints]
-        bodies = [data.body(grasp.hand.links[link].name) for link in grasp.hand.joint_links]
-        anchors, turns = grasp.match.joint_frames(arrays[f"{name}_qpos"])
-        for number, j in enumerate(order):
-            last = j == max(np.flatnonzero(grasp.hand.joint_links == grasp.hand.joint_links[j]))
-            own = Rotation.from_matrix(bodies[j].xmat.reshape(3, 3))
-            here = state.rotation.apply(joints[j].xanchor + own.apply(levers)) + state.position
-            there = anchors[number] + turns[number].apply(levers)
-            distance = np.linalg.norm(here - there, axis=-1)
-            worst = max(worst, float(distance.max() if last else distance[0]))
-    return 1e3 * worst
-
-
-def _hand_of(motion: GraspMotion) -> Hand:
-    """The hand by its name in a motion."""
-    if motion.hand not in {*HANDS, *own_hands()}:
-        raise CongraspError(f"There is no hand '{motion.hand}' here.", "Import it with 'congrasp hands import'.")
-    return get_hand(motion.hand)
+def _pieces(body: trimesh.Trimesh, most: int) -> list[Piece]:
+    """Convex pieces of one body; empty for a flat one."""
+    volume = float(body.volume) if body.is_volume else None
+    vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
+    try:
+        found = decompose(vertices, faces, volume=volume, time_limit=_SECONDS, max_pieces=most)
+        hulls = [simplify(piece) for piece in found.pieces]
+    except QhullError:
+        return []
+    return [Piece("mesh", (0.0, 0.0, 0.0), vertices=hull.astype(float)) for hull in hulls]
 
 
 def _rotation(quaternion: np.ndarray) -> Rotation:

@@ -25,8 +25,8 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.export.benchmark_hands import benchmarked
-from congrasp.services.export.dexgraspbench import STATES, Grasp, State
+from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, State
+from tests.benchmarks.dexgraspbench_hands import benchmarked
 
 MASS, FRICTION, TORSION = 0.1, 0.6, 0.02
 """kg, and sliding and torsional (m) friction of every object."""
@@ -55,7 +55,7 @@ class Replayed(NamedTuple):
     """Deepest penetration of hand and object while it is pushed in the grasp."""
 
 
-def replay(grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda done: None) -> list[Replayed]:
+def replayed(grasps: Sequence[Grasp], progress: Callable[[int], None] = lambda done: None) -> list[Replayed]:
     """Replays grasps of one hand; `progress` is called with the number of finished ones."""
     hand = benchmarked(grasps[0].hand, grasps[0].match)
     found: list[Replayed] = []

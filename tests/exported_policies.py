@@ -1,0 +1,44 @@
+"""Difference between an exported policy, in the runtimes that users have, and the Flax policy."""
+
+import pathlib
+import zipfile
+
+import jax
+import jax.export
+import numpy as np
+import onnxruntime
+
+from congrasp.common.policy.bundle import PolicyBundle, mean_action
+from congrasp.common.policy.network import gated
+
+
+def difference(bundle: PolicyBundle, path: pathlib.Path) -> float:
+    """Largest difference of an action, in action units, over observations far beyond the policy's range, too."""
+    observations = sample_observations(bundle, 64)
+    expected = np.asarray(mean_action(bundle.spec.layout, bundle.inference_parameters, observations))
+    assert np.abs(expected).max() > 1e-3
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            found = jax.export.deserialize(bytearray(archive.read("policy.jax"))).call(observations)
+    else:
+        (found,) = onnxruntime.InferenceSession(path.read_bytes()).run(None, {"observation": observations})
+    return float(np.abs(found - expected).max())
+
+
+def sample_observations(bundle: PolicyBundle, count: int) -> np.ndarray:
+    """Observations (count, D) of 3 and, the second half, of 150 times the policy's spread, with random masks."""
+    rng = np.random.default_rng(9)
+    known = bundle.observation
+    spread = np.sqrt(np.asarray(known.m2) / max(float(known.count), 1.0)) + 1e-3
+    reach = np.repeat([3.0, 150.0], count // 2)[:, None]
+    drawn = np.asarray(known.mean) + reach * spread * rng.normal(size=(count, len(spread)))
+    names = gated(bundle.spec.layout)
+    start, mask = 0, rng.integers(0, 2, (count, len(names)))
+    for name, size in bundle.spec.layout:
+        block = slice(start, start + size)
+        start += size
+        if name in names:
+            drawn[:, block] *= mask[:, names.index(name), None]
+        elif name == "mask":
+            drawn[:, block] = mask
+    return drawn.astype(np.float32)
