@@ -55,6 +55,8 @@ _FIRM = ("clean", *SURVIVAL)
 """Metrics that add a cost of 1 where they are zero."""
 _UNLIKELY = 0.5
 """Cost of each resting pose that is preferred to a grasp's initial one, see `_places`."""
+_LIGHTER, _SMALLER, _ENOUGH = 0.25, 0.7, 0.25
+"""Factors of mass and of size by which the cause of failures is looked for, and the share of holds that shows it."""
 _TOUCHED = 0.2
 """Share of contacts in the avoid region at and above which an attempt does not count as a hold."""
 
@@ -80,6 +82,8 @@ class Grasp:
     """Active constraints and the reasons, in sentences."""
     arm: "ArmMotion | None" = None
     """The motion of the arm, if there is one."""
+    cause: str = ""
+    """Why no attempt holds the object, in a sentence, if it is its weight or its width."""
 
     @property
     def success(self) -> bool:
@@ -113,6 +117,7 @@ class Grasp:
             "held_quarter_second": self.motion.success,
             "attempts": self.attempts,
             "attempts_held": self.held,
+            **({"cause": self.cause} if self.cause else {}),
             "rest": self.rest + 1,
             "phases": self.motion.about.get("phases", {}),
             "constraints": list(self.motion.constraints),
@@ -188,9 +193,7 @@ class Grasper:
             progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
             self._compiled = True
             what = f"Attempting others ({round_ + 1})" if round_ else "Attempting"
-            outcome = self._attempts.run(
-                obj, episodes, functools.partial(lambda what, step: progress(what, step, self._attempts.steps), what)
-            )
+            outcome = self._attempts.run(obj, episodes, functools.partial(self._attempting, progress, what))
             _check_aligned(outcome)
             removal = self.task.approach_steps - 1
             cost = costs(outcome, tuple(request.constraints), removal, self._attempts.phases.lift)
@@ -217,11 +220,39 @@ class Grasper:
             raise _no_motion(obj, self._arm.name, attempted, refused)
         assert best is not None
         _, outcome, wanted, index, rests = best
-        return self._result(obj, request, outcome, wanted, rests, attempted, held, index)
+        cause = "" if held else self._cause(obj, request, progress)
+        found = self._result(obj, request, outcome, wanted, rests, attempted, held, index)
+        return dataclasses.replace(found, cause=cause)
 
     def close(self) -> None:
         """Ends the threads of the physics."""
         self._attempts.close()
+
+    def _attempting(self, progress: Progress, what: str, step: int) -> None:
+        """Reports a control step of attempts."""
+        progress(what, step, self._attempts.steps)
+
+    def _cause(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> str:
+        """A sentence on what makes every attempt fail, if attempts hold the object with one thing changed.
+
+        Its mass is changed first, then its size, at the same mass and where the request names no place in its frame.
+        """
+        lighter = dataclasses.replace(obj, mass=_LIGHTER * obj.mass, inertia=_LIGHTER * np.asarray(obj.inertia))
+        trials = [(lighter, "weight", f"a quarter of its {1000 * obj.mass:.0f} g")]
+        if prescribed(request) is None and request.given("heading", "position") is None:
+            smaller = obj.scaled(_SMALLER, constant_mass=True)
+            trials.append((smaller, "width", f"{100 * _SMALLER:.0f} % of its size"))
+        for changed, cause, how in trials:
+            try:
+                episodes, _, different = self._episodes(changed, request, np.random.default_rng(self._seed))
+            except CongraspError:
+                continue
+            what = f"Looking whether its {cause} is the cause"
+            outcome = self._attempts.run(changed, episodes, functools.partial(self._attempting, progress, what))
+            holds = int((outcome.metrics["held"][:different] > 0).sum())
+            if holds >= _ENOUGH * different:
+                return f"Its {cause} is the cause: with {how} {holds} of {different} attempts hold it."
+        return ""
 
     def _on_arm(
         self,

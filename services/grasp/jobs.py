@@ -80,7 +80,8 @@ class Result(NamedTuple):
         errors = [f"{what} {_shown(facts, stem)}" for stem, what in _ERRORS.items() if f"{stem}_m" in facts]
         if "affordance_ratio" in facts:
             errors.append(f"{100 * facts['affordance_ratio']:.0f} % of the touches where there should be none")
-        lying = [f"in resting pose {facts['rest']}, not the likeliest"] if facts["rest"] > 1 else []
+        lying = [facts["cause"].rstrip(".")] if facts.get("cause") else []
+        lying += [f"in resting pose {facts['rest']}, not the likeliest"] if facts["rest"] > 1 else []
         return "; ".join(
             [facts["size"], outcome, *lying, best, *errors, f"strongest link {facts['force_link_max']:.1f} N"]
         )

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pathlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -127,6 +128,29 @@ def test_costs_of_attempts():
     trace = Trace(*(np.zeros((3, 5, 3)) for _ in Trace._fields))
     found = costs(Outcome(None, zeros > 0, zeros == 0, metrics, trace), ("heading",), 1)  # type: ignore[arg-type]
     np.testing.assert_allclose(found, [11004.0, 4.0, 2.0, 0.5, 4.5], rtol=1e-6)
+
+
+def test_what_no_attempt_holds_has_a_cause(block, monkeypatch):
+    """Attempts that hold what is light or narrow enough: the cause is what they are told apart by."""
+    four = Grasper(bundles.load(policy_file(None)), attempts=4)
+
+    def cause(request, may_be_held):
+        def run(obj, episodes, progress):
+            return SimpleNamespace(metrics={"held": np.full(4, float(may_be_held(obj)))})
+
+        monkeypatch.setattr(four._attempts, "run", run)
+        return four._cause(block, request, lambda what, done, total: None)
+
+    free, light, narrow = GraspRequest(), 0.3 * block.mass, 0.8 * SIDES[0]
+    assert cause(free, lambda obj: obj.mass < light) == (
+        f"Its weight is the cause: with a quarter of its {1000 * block.mass:.0f} g 4 of 4 attempts hold it."
+    )
+    assert cause(free, lambda obj: np.ptp(obj.points[:, 0]) < narrow and obj.mass == block.mass) == (
+        "Its width is the cause: with 70 % of its size 4 of 4 attempts hold it."
+    )
+    assert cause(free, lambda obj: False) == ""
+    placed = GraspRequest({"heading": {"position": np.zeros(3)}})  # in the frame of an object of this size
+    assert cause(placed, lambda obj: np.ptp(obj.points[:, 0]) < narrow) == ""
 
 
 def test_a_grasp_lifts_the_block_off_a_table_that_stays(block):
