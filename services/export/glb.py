@@ -97,8 +97,9 @@ class _Scene:
         return len(self.file.accessors) - 1
 
     def add_material(self, name: str, colour: Sequence[float], roughness: float | None = None) -> int:
-        """Adds a material of a colour, red, green, blue from 0 to 1."""
-        surface = gltf.PbrMetallicRoughness(baseColorFactor=[*colour, 1.0], metallicFactor=0.0)
+        """Adds a material of an sRGB colour, red, green, blue from 0 to 1; glTF takes linear factors."""
+        linear = (np.array(colour) ** GAMMA).tolist()
+        surface = gltf.PbrMetallicRoughness(baseColorFactor=[*linear, 1.0], metallicFactor=0.0)
         if roughness is not None:
             surface.roughnessFactor = roughness
         self.file.materials.append(gltf.Material(name=name, pbrMetallicRoughness=surface))
@@ -148,7 +149,7 @@ def _part(scene: _Scene, mesh: Mesh) -> gltf.Primitive:
     normals = normals.reshape(-1, 3)
     keys = np.column_stack([corners, normals.round(3)])
     _, first, faces = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    material = scene.add_material("arm", (np.array(mesh.colour) ** GAMMA).tolist(), roughness=0.5)
+    material = scene.add_material("arm", mesh.colour, roughness=0.5)
     attributes = scene.attributes(POSITION=mesh.vertices[corners[first]], NORMAL=normals[first])
     return scene.primitive(attributes, faces, material)
 

@@ -28,6 +28,7 @@ from congrasp.services.export.frames import (
 )
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.export.unwrap import unwrapped
+from congrasp.services.viz.kernels import GAMMA
 
 _NAME = "congrasp:name"
 _DOUBLE = UsdGeom.XformOp.PrecisionDouble
@@ -123,14 +124,17 @@ def _add_skin(stage: Usd.Stage, path: Sdf.Path, skin: Skin, links: Sequence[Body
 def _add_mesh(
     stage: Usd.Stage, path: Sdf.Path, vertices: np.ndarray, faces: np.ndarray, colours: Any, *, textured: bool = True
 ) -> UsdGeom.Mesh:
-    """Adds triangles (F, 3), not subdivided, of one colour (3,) or with that of each vertex (V, 3)."""
+    """Adds triangles (F, 3), not subdivided, of one sRGB colour (3,) or with that of each vertex (V, 3).
+
+    Displayed colours are linear.
+    """
     mesh, points = UsdGeom.Mesh.Define(stage, path), _vectors(vertices)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreatePointsAttr(points)
     mesh.CreateFaceVertexCountsAttr([3] * len(faces))
     mesh.CreateFaceVertexIndicesAttr(faces.ravel().tolist())
     mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
-    colour = mesh.CreateDisplayColorAttr(_vectors(np.reshape(colours, (-1, 3))))
+    colour = mesh.CreateDisplayColorAttr(_vectors(np.reshape(colours, (-1, 3)) ** GAMMA))
     if np.ndim(colours) > 1:
         UsdGeom.Primvar(colour).SetInterpolation(UsdGeom.Tokens.vertex)
     if textured:

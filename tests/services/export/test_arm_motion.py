@@ -198,14 +198,14 @@ def test_other_readers_find_meshes_and_colours(motion: GraspMotion, tmp_path: pa
     for i, pose in enumerate(seen.values()):
         np.testing.assert_allclose((FROM_Y_UP @ pose)[:3, 3], arm.link_position[0, i], atol=1e-6)
     colours = [mesh.visual.material.baseColorFactor[:3] for name, mesh in scene.geometry.items() if "sledge" in name]
-    linear = [255 * np.array(colour) ** 2.2 for colour in (ORANGE, BLUE)]
-    np.testing.assert_allclose(colours, linear, atol=1)
+    linear = np.array([ORANGE, BLUE]) ** 2.2
+    np.testing.assert_allclose(colours, 255 * linear, atol=1)
     stage = Usd.Stage.Open(str(tmp_path / "motion.usda"))
     sledge = stage.GetPrimAtPath("/grasp/odd_base/sledge")
     pose = np.array(UsdGeom.XformCache(3.0).GetLocalToWorldTransform(sledge)).T
     np.testing.assert_allclose(pose[:3, 3], arm.link_position[3, 1], atol=1e-6)
     shown = [UsdGeom.Mesh(sledge.GetChild(f"mesh_{i}")).GetDisplayColorAttr().Get()[0] for i in (0, 1)]
-    np.testing.assert_allclose(shown, [ORANGE, BLUE], atol=1e-6)
+    np.testing.assert_allclose(shown, linear, atol=1e-6)
 
 
 def test_the_camera_sees_the_arm(motion: GraspMotion) -> None:

@@ -24,6 +24,7 @@ from congrasp.common.rotations import continuous
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.cli.main import main
 from congrasp.services.export import frames, motion_formats
+from congrasp.services.export.frames import COLOURS
 from congrasp.services.export.lerobot import camera_for, pictures
 from congrasp.services.export.motion_file import (
     GraspMotion,
@@ -336,6 +337,17 @@ def test_glb_and_usd_have_the_colours_of_the_object(
     shown = shape.GetDisplayColorPrimvar()
     assert shown.GetInterpolation() == UsdGeom.Tokens.vertex
     assert red_above_blue(np.array(shape.GetPointsAttr().Get()), np.array(shown.Get()))
+
+
+def test_colours_of_a_hand_are_linear_in_glb_and_usd(human: GraspMotion, tmp_path: pathlib.Path) -> None:
+    flesh = np.array(COLOURS["flesh"]) ** 2.2
+    file = pygltflib.GLTF2().load(str(export([human], "glb", tmp_path)))
+    (material,) = (material for material in file.materials if material.name == "flesh")
+    np.testing.assert_allclose(material.pbrMetallicRoughness.baseColorFactor, [*flesh, 1.0], atol=1e-6)
+    stage = Usd.Stage.Open(str(export([human], "usd", tmp_path)))
+    meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    shown = np.concatenate([np.array(mesh.GetDisplayColorPrimvar().Get()) for mesh in meshes])
+    assert (np.abs(shown - flesh).max(1) < 1e-5).any()
 
 
 def test_a_bvh_has_the_skeleton_of_the_skin(human: GraspMotion, tmp_path: pathlib.Path) -> None:
