@@ -52,29 +52,27 @@ def example_episode(seed: int, hand: str = "human") -> Example:
     """Returns the initial state of an episode with a procedural object and one of its headings."""
     import jax
 
-    from congrasp.actors import initial
+    from congrasp.actors.initial import initial_hand
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
     from congrasp.common.objects.pool import scale_objects
     from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.sampling.build import build_bank
+    from congrasp.common.task.constraints import goal_of
+    from congrasp.common.task.types import Surface
+    from congrasp.services.grasp.approaches import headings
 
-    task = TaskConfig(hand=hand, constraints=("heading",))
-    found = get_hand(hand)
+    task, found = TaskConfig(hand=hand, constraints=("heading",)), get_hand(hand)
     (obj,) = scale_objects(found, task, [procedural.generate(seed)])
-    sample = jax.jit(initial.sample, static_argnames=("hand", "task", "batch"))
-    bank = build_bank(found, task, [obj], seed)
-    initial_conditions = jax.device_get(sample(found, task, bank, jax.random.key(seed), batch=1))
-    world = {name: np.asarray(value)[0] for name, value in initial_conditions.reset_state._asdict().items()}
-    pose = world["object_position"], world["object_quaternion"]
-    request = GraspRequest(
-        {"heading": initial_conditions.goal.row(0)["heading"]._asdict()},
-        surface=np.asarray(initial_conditions.surface.points)[0],
-        q=world["q"],
-        wrist=(world["base_position"], world["base_quaternion"]),
-        object_pose=pose,
-    )
-    state = {"q": world["q"], "u": np.zeros(6), "object_position": pose[0], "object_quaternion": pose[1]}
+    *frame, (rest,) = headings(found, obj, GraspRequest(), 1, np.random.default_rng(seed))
+    position, direction, cross = (axis[0].astype(np.float32) for axis in frame)
+    goals = {"heading": {"position": position, "direction": direction, "cross": cross}}
+    points, pose = (np.asarray(x, np.float32) for x in (obj.points[: task.surface_points], obj.rest_poses[rest]))
+    asked = goal_of(found, task, GraspRequest(goals)), Surface(points, np.zeros(len(points), bool)), pose
+    begin = jax.jit(initial_hand, static_argnums=(0, 1))
+    q, *wrist = (np.asarray(value)[0] for value in begin(found, task, *jax.tree.map(lambda x: x[None], asked)))
+    world = tuple(wrist), (pose[:3], pose[3:])
+    request = GraspRequest(goals, surface=points, q=q, wrist=world[0], object_pose=world[1])
+    state = {"q": q, "u": np.zeros(6), "object_position": pose[:3], "object_quaternion": pose[3:]}
     return Example(found.name, obj.name, request, state)
 
 
