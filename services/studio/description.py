@@ -1,7 +1,7 @@
 """Description of a request for the page, as JSON."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -14,8 +14,8 @@ from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.resting import rest_tilts
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import get_constraint, optional
-from congrasp.common.task.sampling.closed_poses import Poses
+from congrasp.common.task.constraints import get_constraint, goal_of, optional
+from congrasp.common.task.constraints.markers import Ghost
 from congrasp.common.task.types import Goal, Surface
 from congrasp.services.grasp.grasper import surface_of
 from congrasp.services.studio.state import Studio
@@ -51,8 +51,7 @@ def describe(studio: Studio) -> dict[str, Any]:
         "explanation": studio.explanation,
         "trouble": studio.trouble,
         "start": _frames(_start(hand, studio.task, *_batch_of_one(studio, goal))),
-        "pose": None if studio.pose is None else _ghost(hand, studio.pose),
-        "path": None if studio.path is None else np.asarray(studio.path.position).tolist(),
+        "markers": list(_markers(studio)),
         "painted": studio.canvas.paint.version,
         "avoid_share": round(float(studio.canvas.avoid.mean()), 3),
     }
@@ -66,9 +65,17 @@ def _toggles(hand: Hand, name: str, fields: Mapping[str, np.ndarray]) -> dict[st
     return {"name": name, "title": constraint.title, "flags": shown}
 
 
-def _ghost(hand: Hand, pose: Poses) -> dict[str, Any]:
-    """Link frames (L, 3), (L, 4) of a reference pose in the object frame."""
-    return _frames(_links(hand, *(np.asarray(field, np.float32) for field in pose)))
+def _markers(studio: Studio) -> Iterator[dict[str, Any]]:
+    """Kind and fields of the markers of the requested optional constraints, object frame; a ghost as link frames."""
+    goal = goal_of(studio.hand, studio.task, studio._request())
+    for constraint in optional(studio.task):
+        if constraint.name in studio.asked:
+            for marker in constraint.markers(goal[constraint.name], constraint.blocks):
+                if isinstance(marker, Ghost):
+                    fields = _frames(_links(studio.hand, marker.q, marker.position, marker.quaternion))
+                else:
+                    fields = {name: np.asarray(value).tolist() for name, value in marker._asdict().items()}
+                yield {"kind": type(marker).__name__.lower(), **fields}
 
 
 def _frames(links: tuple[jax.Array, jax.Array]) -> dict[str, Any]:

@@ -29,7 +29,7 @@ _TYPES = {
 _POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
 _ROUTES = "/api/"
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_OWN = re.compile("/(api|static)/[^/]*$")
+_OWN = re.compile("/(api|static(/vendor)?)/[^/]*$")
 _TOKEN = re.compile("[0-9a-f]{32}")
 _TIMEOUT = 30.0  # seconds that a request may take to arrive
 _DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes read of a refused body, so that the answer arrives before the close
@@ -242,7 +242,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def _file(self, name: str) -> None:
         """Sends a file of the page."""
-        file = next((file for file in STATIC.iterdir() if file.name == name and file.suffix in _TYPES), None)
+        files = (file for file in STATIC.rglob("*") if file.suffix in _TYPES)
+        file = next((file for file in files if file.relative_to(STATIC).as_posix() == name), None)
         if file is None:
             self._send(404, "text/plain", b"There is nothing of this name.")
             return

@@ -294,7 +294,7 @@ export class StudioPanel {
     const { player, camera } = this.app;
     const { id } = player.motion;
     if (!this.state.drawn.includes(kind)) return this.#download("api/export", { id, kind });
-    return this.act("draw_motion", { id, kind, camera: camera.view, frame: player.motion.step(player.time) });
+    return this.act("draw_motion", { id, kind, camera: camera.viewpoint, frame: player.motion.step(player.time) });
   }
 
   async #download(path, query) {

@@ -191,7 +191,7 @@ def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
     opened.click("[data-tool=path]")
     drag(opened, [(x + 220, y - 40), (x + 140, y - 70), (x + 60, y - 60), (x + 10, y)])
     opened.wait_for_selector("[data-mask=trajectory][data-on=true]")
-    path = np.array(site.studio["path"])
+    (path,) = (np.array(marker["points"]) for marker in site.studio["markers"] if marker["kind"] == "polyline")
     assert len(path) == made_up.MadeUpGrasping().task.trajectory_points
     assert np.linalg.norm(np.diff(path, axis=0), axis=-1).sum() > 0.05
     assert "wrist trajectory guides the wrist" in opened.inner_text("#explanation")

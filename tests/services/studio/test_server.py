@@ -87,7 +87,8 @@ def page(grasping: made_up.MadeUpGrasping) -> Iterator[Page]:
 
 def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: Page) -> None:
     assert b"<title>congrasp" in page.ask("GET", "/")[1]
-    assert page.ask("GET", "/static/gl.js")[0] == 200
+    assert page.ask("GET", "/static/picture.js")[0] == 200
+    assert page.ask("GET", "/prefix/static/vendor/three.module.min.js")[0] == 200
     hostile = ("HTTP://[", f"/static/{'a' * 300}.css", "/static/%00.css")
     for path in ("/static/../server.py", "/static/%2e%2e/server.py", "/etc/passwd", "/static/", "/api/none", *hostile):
         assert page.ask("GET", path)[0] == 404, path
@@ -178,7 +179,7 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         refused = page.ask("GET", "/", Host="other.example.org")
         assert refused[0] == 403 and "--allow-host 'other.example.org'" in json.loads(refused[1])["error"]
         assert page.ask("GET", "/user/me/proxy/7480/api/state")[0] == page.ask("GET", "/user/me/")[0] == 200
-        for file in STATIC.iterdir():  # a proxy offers the page below a prefix
+        for file in filter(pathlib.Path.is_file, STATIC.rglob("*")):  # a proxy offers the page below a prefix
             assert not re.search(r"[\"'`]/(api|static)/", file.read_text())
     finally:
         server.close()
