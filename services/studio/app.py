@@ -24,11 +24,9 @@ from congrasp.services.ops.logs import log
 from congrasp.services.serve.server import follow_file, follow_run
 from congrasp.services.studio.catalogue import Catalogue
 from congrasp.services.studio.grasping import PolicyGrasping
-from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.server import PageServer
+from congrasp.services.studio.server import PageServer, Sessions
 from congrasp.services.studio.session import Session
-from congrasp.services.studio.sessions import Sessions
-from congrasp.services.studio.training import Follower, TrainingWindow
+from congrasp.services.studio.training import Follower, Recordings, TrainingWindow
 
 _GUESS = ImportOptions(unit="guess")
 _FIRST = "mug"

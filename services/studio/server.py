@@ -1,5 +1,6 @@
-"""Serves a studio over HTTP to browsers on this machine: files, JSON, and messages of arrays."""
+"""Serves a studio over HTTP to browsers on this machine: a session for each, files, JSON, and messages of arrays."""
 
+import collections
 import contextlib
 import http.cookies
 import http.server
@@ -9,9 +10,10 @@ import re
 import secrets
 import socket
 import threading
+import time
 import urllib.parse
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message, encode
@@ -20,6 +22,10 @@ from congrasp.services.ops.logs import log
 STATIC = pathlib.Path(__file__).with_name("static")
 MOST_BYTES = 128 << 20
 """Bytes of the largest request body, an uploaded mesh."""
+MOST = 16
+"""Maximum number of browsers; a further one ends the session that was used least recently, if it is idle."""
+IDLE = 1800.0
+"""Seconds without a request after which a session is idle."""
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -64,6 +70,60 @@ class Routes(NamedTuple):
 
     gets: Mapping[str, Get]
     posts: Mapping[str, Post]
+
+
+class Session(Protocol):
+    """Everything behind the page of one browser."""
+
+    routes: Routes
+
+    def close(self) -> None:
+        """Ends it."""
+
+
+class Sessions:
+    """One session per browser, so that edits in one do not change the objects of others."""
+
+    def __init__(self, new: Callable[[], Session]):
+        """Opens the session of the first browser.
+
+        Args:
+          new: opens a session.
+
+        Raises:
+          CongraspError: `new` failed.
+        """
+        self._new, self._spare = new, [new()]
+        self._open: collections.OrderedDict[str, tuple[Session, float]] = collections.OrderedDict()
+        self._lock = threading.Lock()
+
+    def routes(self, browser: str) -> Routes:
+        """Returns the routes of a browser's session, and opens one for a new browser.
+
+        Raises:
+          CongraspError: too many browsers use the studio.
+        """
+        with self._lock:
+            now = time.monotonic()
+            session, _ = self._open.pop(browser, (None, now))
+            if session is None and len(self._open) >= MOST:
+                oldest, used = next(iter(self._open.values()))
+                if now - used < IDLE:
+                    raise CongraspError(
+                        f"{MOST} browsers use this studio.",
+                        f"Come back when one has been idle for {IDLE / 60:.0f} minutes, or start another studio.",
+                    )
+                self._open.popitem(last=False)
+                oldest.close()
+            session = session or (self._spare.pop() if self._spare else self._new())
+            self._open[browser] = session, now
+            return session.routes
+
+    def close(self) -> None:
+        """Closes all sessions."""
+        with self._lock:
+            for session in (*self._spare, *(session for session, _ in self._open.values())):
+                session.close()
 
 
 class PageServer:

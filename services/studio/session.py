@@ -1,4 +1,4 @@
-"""The session of one browser: studio, policy, objects and motions, and the training window; handles its requests."""
+"""The session of one browser: studio, policy, objects, motions, training window and background job; and its routes."""
 
 import functools
 import json
@@ -6,15 +6,14 @@ import math
 import pathlib
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
-
-import numpy as np
 
 from congrasp.actors.attempts import PLAIN, Phases
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
-from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
@@ -22,19 +21,13 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.materials import MATERIALS, with_mass
 from congrasp.services.assets.objects.sizes import METRES
-from congrasp.services.studio.catalogue import Catalogue, Importer, Uploads
-from congrasp.services.studio.description import describe
-from congrasp.services.studio.files import DATA, DRAWN, data_file, drawing
-from congrasp.services.studio.history import ACTIONS, History
-from congrasp.services.studio.jobs import Jobs, Progress
-from congrasp.services.studio.lanes import for_page
-from congrasp.services.studio.motions import Motions
-from congrasp.services.studio.recordings import Recordings
+from congrasp.services.ops.logs import log
+from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads
+from congrasp.services.studio.motions import DATA, DRAWN, Motions, data_file, drawing
+from congrasp.services.studio.page import describe, for_page, hand_message
 from congrasp.services.studio.server import BadRequest, Download, Get, Picture, Routes
-from congrasp.services.studio.state import Studio
-from congrasp.services.studio.thumbnails import Thumbnails
-from congrasp.services.studio.training import TrainingWindow
-from congrasp.services.viz.shapes import skin_colours
+from congrasp.services.studio.state import ACTIONS, History, Studio
+from congrasp.services.studio.training import Recordings, TrainingWindow
 
 LIGHTEST_G, HEAVIEST_G = 1, 5000
 LONGEST = Phases(approach=10.0, lift=0.5, hold=10.0)
@@ -44,6 +37,12 @@ _DRAWING = "drawing"
 """Result of a job that rendered a picture or a video, in place of a motion's number."""
 _LATEST = 1e10
 """Seconds since 1970 beyond which nothing was recorded."""
+
+
+SECONDS = "{seconds}"
+"""Placeholder in the text of a job for its elapsed seconds."""
+Progress = Callable[[str, float], None]
+"""(current activity, completed share from 0 to 1)."""
 
 
 class Grasping(Protocol):
@@ -340,25 +339,74 @@ class Session:
         self._jobs.start(f"drawing the {kind}", work)
 
 
-def hand_message(hand: Hand) -> Message:
-    """A hand's skin (see `common.hands.skin`), and its links' names."""
-    skin = skin_of(hand)
-    links, weights = skin.influences()
-    arrays = {
-        "skin_points": skin.points,
-        "skin_normals": skin.normals,
-        "skin_faces": skin.faces,
-        "skin_joints": links.astype(np.int32),
-        "skin_weights": weights,
-        "skin_origins": skin.origins.astype(np.float32),
-        "skin_colours": skin_colours(skin),
-    }
-    return Message(arrays, {"hand": hand.name, "links": [link.name for link in hand.links]})
-
-
 def json_object(body: bytes) -> dict[str, Any]:
     """A JSON object; a ValueError for anything else."""
     value = json.loads(body)
     if not isinstance(value, dict):
         raise ValueError("not an object")
     return value
+
+
+class Jobs:
+    """Runs one job at a time in a separate thread."""
+
+    def __init__(self) -> None:
+        """Begins without a job."""
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="studio")
+        self._lock = threading.RLock()
+        self._number = 0
+        self._since = 0.0
+        self._state: dict[str, Any] = _state(0, running=False)
+
+    def start(self, text: str, work: Callable[[Progress], str | None]) -> dict[str, Any]:
+        """Begins a job, which may return the key of its result; returns the job's state.
+
+        Raises:
+          CongraspError: another job is still running.
+        """
+        with self._lock:
+            self.require_idle()
+            self._number += 1
+            self._since = time.monotonic()
+            self._state = _state(self._number, text=text)
+            self._pool.submit(self._run, work)
+            return dict(self._state)
+
+    def require_idle(self) -> None:
+        """Raises a CongraspError while a job is running."""
+        with self._lock:
+            if self._state["running"]:
+                raise CongraspError(f"Please wait: {self.state()['text']}.")
+
+    def state(self) -> dict[str, Any]:
+        """The current job, or the last one: number, running, text, share, error, and the key of its result (made)."""
+        with self._lock:
+            seconds = f"{time.monotonic() - self._since:.0f}"
+            return {**self._state, "text": self._state["text"].replace(SECONDS, seconds)}
+
+    def close(self) -> None:
+        """Rejects further jobs, without waiting for a running one."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _run(self, work: Callable[[Progress], str | None]) -> None:
+        """Runs a job to its end and stores its result or error."""
+        error, made = "", None
+        try:
+            made = work(self._progress)
+        except CongraspError as found:
+            error = str(found)
+        except Exception as found:  # the page shows any error of a job, and the studio continues
+            error = f"This went wrong and is a fault of congrasp: {type(found).__name__}: {found}."
+            log("error", error)
+        with self._lock:
+            self._state |= {"running": False, "share": 1.0, "error": error, "made": made}
+
+    def _progress(self, text: str, share: float) -> None:
+        """Stores the progress of the job."""
+        with self._lock:
+            self._state |= {"text": text, "share": min(1.0, max(0.0, share))}
+
+
+def _state(number: int, *, running: bool = True, text: str = "") -> dict[str, Any]:
+    """A job's state at its start."""
+    return {"number": number, "running": running, "text": text, "share": 0.0, "error": "", "made": None}

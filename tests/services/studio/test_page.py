@@ -15,10 +15,9 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
-from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
-from congrasp.services.studio.training import TrainingWindow
+from congrasp.services.studio.training import Recordings, TrainingWindow
 from tests import studio as made_up
 from tests.studio import BEGIN, DIP
 from tests.waits import eventually
@@ -205,7 +204,8 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
 
     def fingers() -> list[str]:
-        return [name for name, on in session.state()["studio"]["others"][0]["flags"]["allowed"].items() if on]
+        row = session.state()["studio"]["constraints"][-1]
+        return [name for name, on in row["flags"]["allowed"].items() if on]
 
     page.goto(server.url)
     page.wait_for_selector("body[data-first-picture]")
@@ -213,11 +213,11 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     page.check("[data-ask=fingers]")
     page.wait_for_selector("[data-mask=fingers][data-on=true]")
     assert "Only the named fingers" in page.inner_text("#explanation") and fingers() == ["thumb", "index"]
-    page.check("#other-constraints label:has-text('middle') input")
+    page.check("#constraints label:has-text('middle') input")
     eventually(lambda: fingers() == ["thumb", "index", "middle"])
     assert page.is_checked("[data-ask=fingers]")
     for name in ("index", "middle"):
-        page.uncheck(f"#other-constraints label:has-text('{name}') input")
+        page.uncheck(f"#constraints label:has-text('{name}') input")
         eventually(lambda name=name: name not in fingers())
     page.wait_for_selector("#trouble:has-text('needs the thumb and another finger. Allow both')")
     assert page.is_disabled("#grasp")

@@ -23,12 +23,11 @@ from congrasp.common.wire.codec import decode
 from congrasp.services.cli.main import main
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
-from congrasp.services.studio import files
-from congrasp.services.studio import sessions as sessions_module
+from congrasp.services.studio import motions, server as server_module
 from congrasp.services.studio.catalogue import Uploads
-from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
 from congrasp.services.studio.session import Session
+from congrasp.services.studio.training import Recordings
 from tests import studio as made_up
 
 
@@ -103,14 +102,14 @@ def test_a_result_that_is_not_json_is_answered() -> None:
 
 def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which a cookie finds again; what one undoes is its own, and the least recent one of too many ends once idle."""
-    monkeypatch.setattr(sessions_module, "MOST", 2)
+    monkeypatch.setattr(server_module, "MOST", 2)
     made: list[Session] = []
 
     def new() -> Session:
         made.append(made_up.session(made_up.MadeUpGrasping()))
         return made[-1]
 
-    sessions = sessions_module.Sessions(new)
+    sessions = server_module.Sessions(new)
     server = PageServer(sessions.routes, "127.0.0.1", 0)
     page = Page(server.port)
 
@@ -134,7 +133,7 @@ def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch)
         for path, kind in (("/api/state", "GET"), ("/api/do", "POST")):
             refused = json.loads(page.ask(kind, path, body if kind == "POST" else b"", Cookie=cookies[2])[1])
             assert "2 browsers use this studio. Come back" in refused["error"] and len(made) == 2
-        monkeypatch.setattr(sessions_module, "IDLE", 0.0)
+        monkeypatch.setattr(server_module, "IDLE", 0.0)
         assert not undoable(cookies[2]) and len(made) == 3
         assert undoable(cookies[0]) and not undoable(cookies[1]) and len(made) == 4
     finally:
@@ -393,7 +392,7 @@ def test_a_mesh_that_comes_during_a_job_is_refused(page, grasping, monkeypatch):
 
 
 def test_a_motion_may_be_named_by_a_number(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)])
+    monkeypatch.setattr(motions, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)])
     page.do("grasp")
     number = int(page.wait()["made"])
     camera = {"position": [0.5, 0.5, 0.5], "target": [0.0, 0.0, 0.0], "field_of_view": 40.0}

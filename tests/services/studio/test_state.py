@@ -10,9 +10,8 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.objects import procedural
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.task.sampling.headings import BACK_OFF, INWARD
-from congrasp.services.studio.description import describe
-from congrasp.services.studio.history import ACTIONS, History
-from congrasp.services.studio.state import Studio
+from congrasp.services.studio.page import describe
+from congrasp.services.studio.state import ACTIONS, History, Studio
 from tests.task import HAND, TASK
 
 MUG = procedural.generate(1, "mug")
@@ -122,10 +121,12 @@ def test_a_drawn_path_keeps_its_begin_and_ends_at_the_wrist_of_the_grasp(studio:
     drawn = [studio.arrow.position + up * h for h in (0.35, 0.25, 0.2)]
     studio.draw(drawn)
     studio.ask("trajectory", True)
-    assert studio.path is not None and studio.pose is not None
-    assert studio.path.position.shape == (TASK.trajectory_points, 3)
-    np.testing.assert_allclose(studio.path.position[0], drawn[0], atol=1e-6)
-    np.testing.assert_allclose(studio.path.position[-1], studio.pose.position, atol=1e-6)
+    path = studio.fields["trajectory"]["position"]
+    assert path.shape == (TASK.trajectory_points, 3)
+    np.testing.assert_allclose(path[0], drawn[0], atol=1e-6)
+    studio.close_hand()
+    np.testing.assert_allclose(path[-1], studio.fields["pose"]["position"], atol=1e-6)
+    studio.ask("pose", False)
     assert studio.trouble == "" and studio.explanation[0].startswith("The wrist trajectory")
 
 
@@ -181,7 +182,7 @@ def test_an_impossible_request_is_explained_before_it_is_sent(studio: Studio) ->
 def test_another_object_forgets_what_was_asked_of_the_one_before(studio: Studio) -> None:
     studio.ask("pose", True)
     studio.take(dataclasses.replace(MUG, name="other"))
-    assert studio.asked == set() and studio.pose is None and describe(studio)["object"]["name"] == "other"
+    assert studio.asked == set() and "pose" not in studio.fields and describe(studio)["object"]["name"] == "other"
 
 
 def same(one: Studio, edit: object) -> bool:
@@ -218,7 +219,7 @@ def test_every_edit_is_undone_and_redone_and_a_new_one_ends_what_could_be_redone
         history.do(name, **values)
         states.append(studio.edit)
         assert history.view() == {"undo": ACTIONS[name], "redo": ""}
-    assert studio.asked == {"trajectory"} and studio.path is not None
+    assert studio.asked == {"trajectory"} and "trajectory" in studio.fields
     for state in states[-2::-1]:
         history.undo()
         assert same(studio, state)
