@@ -47,23 +47,23 @@ class Arrow(NamedTuple):
         return self._replace(cross=np.cos(angle) * level + np.sin(angle) * np.cross(self.direction, level))
 
 
-def arrow_of(position: Any, direction: Any, cross: Any) -> Arrow:
-    """An arrow from values that a user sets.
+def arrow_through(surface: Any, direction: Any, cross: np.ndarray) -> Arrow:
+    """An arrow through a point of the surface, with its target `INWARD` beyond it.
 
     Args:
-      position: (3,) target in the object frame, m.
+      surface: (3,) point in the object frame, m.
       direction: (3,) of any length above zero.
       cross: (3,) cross-finger axis; made orthogonal to the direction.
 
     Raises:
       CongraspError: a value is not three numbers within `LARGEST`, or the direction is zero.
     """
-    position, direction = vector("arrow's position", position), vector("arrow's direction", direction)
+    surface, direction = vector("arrow's point", surface), vector("arrow's direction", direction)
     length = np.linalg.norm(direction)
     if length < 1e-6:
         raise CongraspError("The arrow has no direction.", "Drag its tail away from its tip.")
     direction = direction / length
-    return Arrow(position, direction, _orthogonal(vector("arrow's roll", cross), direction))
+    return Arrow(surface + INWARD * direction, direction, _orthogonal(cross, direction))
 
 
 def from_above(obj: GraspObject, rest: int) -> Arrow:

@@ -141,27 +141,15 @@ class PageServer:
         Raises:
           CongraspError: the port is busy, or there is no such interface.
         """
-        server = self
-
-        class Handler(_Handler):
-            cookie = property(lambda handler: f"congrasp-{server.port}")  # a host's ports share their cookies
-
-            def routes(self) -> Routes:
-                """Routes of this browser."""
-                return routes(self.browser())
-
-            def fault(self) -> str:
-                """Reason why the request is refused; empty if it comes from the page itself."""
-                return server._fault(self)
-
         try:
-            self._server = _Server((host, port), Handler)
+            self._server = _Server((host, port), _Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise CongraspError(
                 f"The page cannot be offered at {host}:{port} ({reason}).",
                 "Choose another --port, or end what uses it.",
             ) from None
+        self.routes, self._server.page = routes, self
         self.host, self.port = host, int(self._server.server_address[1])
         self._names = {*_LOOPBACK, *names} if host in _LOOPBACK else None
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True, name="page")
@@ -179,7 +167,7 @@ class PageServer:
         self._server.server_close()
         self._thread.join(2.0)
 
-    def _fault(self, request: http.server.BaseHTTPRequestHandler) -> str:
+    def fault(self, request: http.server.BaseHTTPRequestHandler) -> str:
         """Reason why a request is refused, with the remedy; empty if it comes from the page itself.
 
         Other sites in the browser must not reach the page. A site's name may resolve to this machine (DNS rebinding),
@@ -197,6 +185,7 @@ class PageServer:
 
 
 class _Server(http.server.ThreadingHTTPServer):
+    page: PageServer
     daemon_threads = True
     request_queue_size = 128  # the client retries a connection that finds no room, after a second
 
@@ -213,15 +202,7 @@ class _Server(http.server.ThreadingHTTPServer):
 class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     timeout = _TIMEOUT
-    cookie: str
-
-    def routes(self) -> Routes:
-        """Routes of the requesting browser."""
-        raise NotImplementedError
-
-    def fault(self) -> str:
-        """Reason why the request is refused; empty if it may be answered."""
-        raise NotImplementedError
+    server: _Server
 
     def do_GET(self) -> None:
         """Answers by a route, or with a file."""
@@ -247,12 +228,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._drain(length)
         elif not 0 <= length <= MOST_BYTES:
             message = "The request has no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
-            self._send(413, "application/json", json.dumps({"error": message}).encode())
+            self._error(413, message)
             self._drain(length)
         elif (routes := self._routes()) is None:
             self._drain(length)
         elif (route := routes.posts.get(path)) is None:
-            self._send(404, "application/json", b'{"error": "There is nothing of this name."}')
+            self._error(404, "There is nothing of this name.")
             self._drain(length)
         else:
             body = self.rfile.read(length)
@@ -261,15 +242,20 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def _routes(self) -> Routes | None:
         """Routes of this browser; None if there is no room for it, which is answered."""
         try:
-            return self.routes()
+            return self.server.page.routes(self._browser())
         except CongraspError as error:
-            self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
+            self._error(200, str(error))
             return None
 
-    def browser(self) -> str:
+    @property
+    def _cookie(self) -> str:
+        """Name of the page's cookie; the ports of a host share theirs."""
+        return f"congrasp-{self.server.page.port}"
+
+    def _browser(self) -> str:
         """The token in the browser's cookie; empty without one."""
         with contextlib.suppress(http.cookies.CookieError):
-            found = http.cookies.SimpleCookie(self.headers.get("Cookie", "")).get(self.cookie)
+            found = http.cookies.SimpleCookie(self.headers.get("Cookie", "")).get(self._cookie)
             return found.value if found and _TOKEN.fullmatch(found.value) else ""
         return ""
 
@@ -288,9 +274,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def _refused(self, fault: str = "") -> bool:
         """Sends a refusal if the request is not allowed, or has another fault; returns True if it did."""
-        fault = self.fault() or fault
-        if fault:
-            self._send(403, "application/json", json.dumps({"error": fault}).encode())
+        if fault := self.server.page.fault(self) or fault:
+            self._error(403, fault)
         return bool(fault)
 
     def _drain(self, length: int) -> None:
@@ -308,8 +293,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._send(404, "text/plain", b"There is nothing of this name.")
             return
         new = {}
-        if file.suffix == ".html" and not self.browser():
-            new = {"Set-Cookie": f"{self.cookie}={secrets.token_hex(16)}; HttpOnly; SameSite=Strict"}
+        if file.suffix == ".html" and not self._browser():
+            new = {"Set-Cookie": f"{self._cookie}={secrets.token_hex(16)}; HttpOnly; SameSite=Strict"}
         self._send(200, _TYPES[file.suffix], file.read_bytes(), new)
 
     def _answer(self, work: Callable[[], Answer]) -> None:
@@ -317,17 +302,18 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         try:
             content = _content(work())
         except BadRequest as error:
-            self._send(400, "application/json", json.dumps({"error": str(error)}).encode())
-            return
+            return self._error(400, str(error))
         except CongraspError as error:
-            self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
-            return
+            return self._error(200, str(error))
         except Exception as error:  # the server continues after any error of a request
             log("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
-            message = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
-            self._send(500, "application/json", json.dumps({"error": message}).encode())
-            return
+            return self._error(500, f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}.")
         self._send(200, *content)
+
+    def _error(self, code: int, error: str) -> None:
+        """Sends an error; one with the code 200 is an answer of the studio, such as a wrong value."""
+        refused = {"X-Refused": "yes"} if code == 200 else {}
+        self._send(code, "application/json", json.dumps({"error": error}).encode(), refused)
 
     def _send(self, code: int, kind: str, data: bytes, more: Mapping[str, str] | None = None) -> None:
         """Sends a whole answer."""

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from congrasp.actors.attempts import PLAIN, Phases
 from congrasp.common.errors import CongraspError
@@ -27,8 +27,9 @@ from congrasp.services.studio.motions import DATA, DRAWN, Motions, data_file, dr
 from congrasp.services.studio.page import describe, for_page, hand_message
 from congrasp.services.studio.server import BadRequest, Download, Get, Picture, Routes
 from congrasp.services.studio.state import ACTIONS, History, Studio
-from congrasp.services.studio.training import Recordings, TrainingWindow
+from congrasp.services.studio.training import TrainingWindow
 
+_T = TypeVar("_T")
 LIGHTEST_G, HEAVIEST_G = 1, 5000
 LONGEST = Phases(approach=10.0, lift=0.5, hold=10.0)
 _OWN_WEIGHT = {"mass_g": 0.0, "material": ""}
@@ -37,8 +38,6 @@ _DRAWING = "drawing"
 """Result of a job that rendered a picture or a video, in place of a motion's number."""
 _LATEST = 1e10
 """Seconds since 1970 beyond which nothing was recorded."""
-
-
 SECONDS = "{seconds}"
 """Placeholder in the text of a job for its elapsed seconds."""
 Progress = Callable[[str, float], None]
@@ -67,7 +66,6 @@ class Session:
         objects: Catalogue,
         importer: Importer,
         window: TrainingWindow | None = None,
-        recordings: Recordings | None = None,
     ):
         """Loads the first hand's policy and the first object.
 
@@ -76,10 +74,8 @@ class Session:
           objects: objects to choose from.
           importer: makes objects from uploaded meshes.
           window: state of a run, or None.
-          recordings: its episodes on disk, or None.
         """
-        self._hands, self._objects = hands, objects
-        self._window, self._recordings = window, recordings
+        self._hands, self._objects, self._window = hands, objects, window
         self._folder = tempfile.TemporaryDirectory(prefix="congrasp-view-")
         self._uploads = Uploads(pathlib.Path(self._folder.name), objects, importer)
         self._lock = threading.RLock()
@@ -127,7 +123,6 @@ class Session:
                 "policy": self._grasping.newest(),
                 "motions": self._motions.view(),
                 "training": self._window is not None,
-                "recordings": self._recordings is not None,
                 "weight": {**self._weight, "materials": list(MATERIALS)},
                 "phases": self._phases._asdict(),
                 "saves": [*DRAWN, *DATA],
@@ -159,8 +154,8 @@ class Session:
         kind, _, name = key.partition(":")
         if kind == "actor" and self._window is not None:
             return self._window.episode(name)
-        if kind == "record" and self._recordings is not None:
-            return self._recordings.episode(name)
+        if kind == "record" and self._window is not None and self._window.recordings is not None:
+            return self._window.recordings.episode(name)
         with self._lock:
             return self._motions.get(key)
 
@@ -182,7 +177,7 @@ class Session:
 
     def episodes_around(self, time: str, seconds: str) -> dict[str, Any]:
         """Episodes that were recorded around a time."""
-        if self._recordings is None:
+        if self._window is None or self._window.recordings is None:
             raise CongraspError("No recordings were named.", "Start the studio with --recordings FOLDER.")
         try:
             when, around = float(time), float(seconds)
@@ -190,7 +185,7 @@ class Session:
             when = around = math.nan
         if not (0.0 <= when < _LATEST and math.isfinite(around)):
             raise BadRequest("A search for episodes needs two finite numbers: time and seconds.")
-        reach, episodes = self._recordings.around(when, min(max(around, 0.1), 3600.0))
+        reach, episodes = self._window.recordings.around(when, min(max(around, 0.1), 3600.0))
         return {"seconds": reach, "episodes": episodes}
 
     def _do(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
@@ -258,30 +253,31 @@ class Session:
 
     def _import(self, file: str, load: Callable[[], str]) -> dict[str, Any]:
         """Begins an import by `load`, which returns the object's name, and then shows the object."""
-
-        def work(progress: Progress) -> None:
-            """Imports it."""
-            progress(f"importing {file}: repair and convex pieces, up to a minute", 0.1)
-            name = load()
-            with self._lock:
-                self._show(name)
-
-        return self._jobs.start(f"importing {file}", work)
+        return self._load(f"importing {file}: repair and convex pieces, up to a minute", load, self._show)
 
     def _choose_hand(self, name: str) -> None:
         """Loads the policy of another hand."""
         if name not in self._hands:
             raise CongraspError(f"There is no policy for the hand '{name}'.", f"There is: {', '.join(self._hands)}.")
 
+        def show(grasping: Grasping) -> None:
+            """Begins a request for it."""
+            self._hand = name
+            self._take_hand(grasping, self._studio.obj)
+
+        self._load(f"loading the policy of the hand {name}", self._hands[name], show)
+
+    def _load(self, text: str, load: Callable[[], _T], show: Callable[[_T], None]) -> dict[str, Any]:
+        """Begins a job that loads something, and shows it afterwards; returns the state of the job."""
+
         def work(progress: Progress) -> None:
             """Loads it."""
-            progress(f"loading the policy of the hand {name}", 0.2)
-            grasping = self._hands[name]()
+            progress(text, 0.2)
+            loaded = load()
             with self._lock:
-                self._hand = name
-                self._take_hand(grasping, self._studio.obj)
+                show(loaded)
 
-        self._jobs.start(f"loading the policy of the hand {name}", work)
+        return self._jobs.start(text, work)
 
     def _take_hand(self, grasping: Grasping, obj: GraspObject) -> None:
         """Opens a studio for a policy's hand."""
@@ -291,17 +287,9 @@ class Session:
 
     def _choose_object(self, name: str) -> None:
         """Makes or imports another object."""
-
-        def work(progress: Progress) -> None:
-            """Makes it."""
-            progress(f"loading {name}", 0.2)
-            self._objects.get(name)
-            with self._lock:
-                self._show(name)
-
         if name not in self._objects.names:
             self._objects.get(name)
-        self._jobs.start(f"loading {name}", work)
+        self._load(f"loading {name}", lambda: self._objects.get(name), lambda obj: self._show(name))
         self._uploads.pending = None
 
     def _show(self, name: str) -> None:

@@ -18,12 +18,12 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import Constraint, get_constraint, goal_of, known, optional, require_known
 from congrasp.common.task.constraints.priority import Resolution, explain, resolve
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
-from congrasp.common.task.sampling.headings import BACK_OFF, INWARD
+from congrasp.common.task.sampling.headings import BACK_OFF
 from congrasp.common.task.sampling.write_sets import make_sets
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
 from congrasp.services.grasp.grasper import with_avoid
-from congrasp.services.studio.drawing import Arrow, Canvas, Paint, arrow_of, from_above, stroke, vector
+from congrasp.services.studio.drawing import Arrow, Canvas, Paint, arrow_through, from_above, stroke, vector
 
 Fields = Mapping[str, np.ndarray]
 """Goal arrays of a constraint by field, without batch axis."""
@@ -131,20 +131,12 @@ class Studio:
         self._set(constraint, {**self.fields[constraint], field: np.array([bool(value) for value in values])})
         self._switch(constraint, True)
 
-    def set_heading(self, position: Any, direction: Any, cross: Any = None) -> None:
-        """Sets the heading.
+    def set_heading(self, surface: Any, direction: Any) -> None:
+        """Sets the heading through a point (3,) of the surface in a direction (3,) of any length above zero.
 
-        Args:
-          position: (3,) target in the object frame, m.
-          direction: (3,) of any length above zero.
-          cross: (3,) along the cross-finger axis, made orthogonal; the current one by default.
+        Its target is `INWARD` beyond the point, as in training, and its roll changes as little as possible.
         """
-        self.arrow = arrow_of(position, direction, self.arrow.cross if cross is None else cross)
-
-    def snap_heading(self, surface: Any, direction: Any) -> None:
-        """Sets the heading through a point (3,) of the surface; its target is `INWARD` beyond it, as in training."""
-        surface, direction = vector("point", surface), vector("arrow's direction", direction)
-        self.set_heading(surface + INWARD * direction / max(1e-6, float(np.linalg.norm(direction))), direction)
+        self.arrow = arrow_through(surface, direction, self.arrow.cross)
 
     def set_roll(self, angle: float) -> None:
         """Sets the angle of the hand around the arrow, in rad; see `Arrow.roll`."""
@@ -344,7 +336,6 @@ ACTIONS = {
     "ask": "constraint on or off",
     "choose": "choice of flags",
     "set_heading": "heading",
-    "snap_heading": "heading",
     "set_roll": "roll",
     "paint": "brush stroke",
     "fill": "painting of everything",

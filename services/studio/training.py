@@ -22,6 +22,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.ops import status as statuses
+from congrasp.services.ops.logs import log
 from congrasp.services.record.channels import flatten
 from congrasp.services.record.reader import Record, is_episode, log_files, metrics_of, read_records
 from congrasp.services.record.salvage import DAMAGE, intact_summary
@@ -91,11 +92,12 @@ class TrainingWindow:
     Attributes:
       live: True if the run is followed; False if it is only read from its recordings.
       damaged: number of messages whose content did not match their key.
+      recordings: recorded episodes of the run, or None.
     """
 
-    def __init__(self, run: str):
+    def __init__(self, run: str, recordings: "Recordings | None" = None):
         """Begins without messages."""
-        self.run, self.live, self.damaged = run, False, 0
+        self.run, self.recordings, self.live, self.damaged = run, recordings, False, 0
         self._lock = threading.Lock()
         self._curves: dict[str, Curve] = {}
         self._actors: dict[str, Actor] = {}
@@ -133,15 +135,18 @@ class TrainingWindow:
                 if now - self._actors[name].seen > _STALE:
                     del self._actors[name]
 
-    def load(self, path: pathlib.Path) -> None:
-        """Reads curves and events from a run's recordings, and the last report and newest episode of every actor.
+    def load(self) -> None:
+        """Reads curves and events from the recordings, and the last report and newest episode of every actor.
 
-        Raises:
-          CongraspError: there are no recordings.
+        Logs a warning if they cannot be read.
         """
+        if self.recordings is None:
+            return
         self._loading = True
         try:
-            self._read(path)
+            self._read(self.recordings.path)
+        except CongraspError as error:
+            log("warning", str(error))
         finally:
             self._loading = False
 
@@ -298,8 +303,8 @@ def labels_of(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
 
 def _logged(record: Record) -> tuple[float, str, str]:
     """Time (seconds since 1970), level and text of a recorded event."""
-    log = Log.FromString(record.data)
-    return record.time / 1e9, Log.Level.Name(log.level).lower(), log.message
+    event = Log.FromString(record.data)
+    return record.time / 1e9, Log.Level.Name(event.level).lower(), event.message
 
 
 class Follower:
@@ -348,18 +353,19 @@ class Recordings:
     """
 
     def __init__(self, path: pathlib.Path):
-        """Reads nothing until the first search, because files may appear and grow."""
+        """Reads nothing until the first search, because files may appear and grow.
+
+        Raises:
+          CongraspError: there is no folder or recording of this name.
+        """
+        remedy = "Name a run's folder, or its recordings."
+        if not path.exists():
+            raise CongraspError(f"There is no file or folder {path}.", remedy)
+        if not path.is_dir() and ".mcap" not in path.suffixes:
+            raise CongraspError(f"{path} is no recording (*.mcap).", remedy)
         self.path = path
         self._lock = threading.Lock()
         self._found: dict[str, Message] = {}
-
-    def check(self) -> None:
-        """Raises a CongraspError if there is no folder or recording of this name."""
-        remedy = "Name a run's folder, or its recordings."
-        if not self.path.exists():
-            raise CongraspError(f"There is no file or folder {self.path}.", remedy)
-        if not self.path.is_dir() and ".mcap" not in self.path.suffixes:
-            raise CongraspError(f"{self.path} is no recording (*.mcap).", remedy)
 
     def around(self, time: float, seconds: float) -> tuple[float, list[dict[str, Any]]]:
         """Episodes that were recorded around a time, in the order of their times.

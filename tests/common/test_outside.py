@@ -231,9 +231,8 @@ def studio(task):
 
     made = Studio(get_hand("human"), task, procedural.generate(0, "box"))
     made.choose("level", "wrist", [True])
-    assert {"name": "level", "title": "level hand", "tool": "", "flags": {"wrist": {"wrist": True}}} in describe(made)[
-        "constraints"
-    ]
+    row = {"name": "level", "title": "level hand", "tool": "", "flags": {"wrist": {"wrist": True}}}
+    assert row in describe(made)["constraints"]
     assert made.asked == {"level"} and made.request.constraints["level"]["wrist"].tolist() == [True]
 
 

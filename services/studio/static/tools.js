@@ -148,7 +148,7 @@ export class Tools {
       const inward = hit.normal.negate().transformDirection(app.body.matrixWorld);
       inward.z = Math.min(inward.z, 0); // from below the table no hand comes: such a direction is levelled
       const direction = inward.transformDirection(app.body.matrixWorld.clone().invert());
-      app.act("snap_heading", { surface: hit.point.toArray(), direction: direction.toArray() });
+      app.act("set_heading", { surface: hit.point.toArray(), direction: direction.toArray() });
     } else if (this.tool === "path" && app.state) {
       this.doing = "path";
       this.stroke = [];
@@ -210,7 +210,7 @@ export class Tools {
     if (this.doing === "path" && this.stroke.length > 1) app.act("draw", { points: this.stroke.map((point) => point.toArray()) });
     if ((this.doing === "tip" || this.doing === "tail") && this.arrow) {
       const surface = this.arrow.at(-INWARD, new Vector3());
-      app.act("snap_heading", { surface: surface.toArray(), direction: this.arrow.direction.toArray() }).finally(() => {
+      app.act("set_heading", { surface: surface.toArray(), direction: this.arrow.direction.toArray() }).finally(() => {
         this.arrow = null;
         app.redraw();
       });

@@ -34,7 +34,8 @@ class Site:
         made_up.record(folder, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
         self.grasping = made_up.MadeUpGrasping()
         self.window: TrainingWindow = made_up.window(100)
-        self.session: Session = made_up.session(self.grasping, window=self.window, recordings=Recordings(folder))
+        self.window.recordings = Recordings(folder)
+        self.session: Session = made_up.session(self.grasping, window=self.window)
         self.server = PageServer(lambda browser: self.session.routes, "127.0.0.1", 0)
 
     @property

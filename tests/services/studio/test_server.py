@@ -23,11 +23,12 @@ from congrasp.common.wire.codec import decode
 from congrasp.services.cli.main import main
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
-from congrasp.services.studio import motions, server as server_module
+from congrasp.services.studio import motions
+from congrasp.services.studio import server as server_module
 from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
 from congrasp.services.studio.session import Session
-from congrasp.services.studio.training import Recordings
+from congrasp.services.studio.training import Recordings, TrainingWindow
 from tests import studio as made_up
 
 
@@ -195,7 +196,7 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         (b'{"action": "draw", "points": [[0, 0, 0], [1]]}', "'draw' takes other values"),
         (b'{"action": "draw", "points": [[1e308, 0, 0], [-1e308, 0, 0]]}', "within"),
         (b'{"action": "paint", "points": [["x", 0, 0]], "radius": 0.01, "avoid": true}', "'paint' takes other values"),
-        (b'{"action": "set_heading", "position": [1e308, 0, 0], "direction": [0, 0, 1]}', "within"),
+        (b'{"action": "set_heading", "surface": [1e308, 0, 0], "direction": [0, 0, 1]}', "within"),
         (b'{"action": "explode"}', "cannot do 'explode'"),
         (b'{"action": "set_roll", "turns": 2}', "other values"),
         (b'{"action": "object", "name": "moon"}', "no object 'moon'"),
@@ -258,7 +259,7 @@ def test_paint_of_no_colour_leaves_the_studio_working(page: Page) -> None:
 
 def test_what_no_page_asks_is_a_bad_request(tmp_path: pathlib.Path) -> None:
     made_up.record(tmp_path, [(made_up.BEGIN, 1)])
-    session = made_up.session(recordings=Recordings(tmp_path))
+    session = made_up.session(window=TrainingWindow("made-up", Recordings(tmp_path)))
     server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
     page = Page(server.port)
     try:

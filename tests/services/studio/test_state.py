@@ -92,7 +92,7 @@ def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studi
 
 
 def test_the_arrow_is_aimed_as_deep_as_in_training_and_rolls_around_itself(studio: Studio) -> None:
-    studio.snap_heading([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
+    studio.set_heading([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
     np.testing.assert_allclose(studio.arrow.position, [0.01, -INWARD, 0.02])
     before = studio.arrow.cross
     studio.set_roll(studio.arrow.roll(studio.up) + np.pi / 2)
@@ -170,7 +170,7 @@ def test_what_cannot_be_is_refused_in_one_line(studio: Studio, do, says) -> None
 
 def test_an_impossible_request_is_explained_before_it_is_sent(studio: Studio) -> None:
     up = matrix(MUG.rest_poses[0][3:]).T @ np.array([0.0, 0.0, 1.0])
-    studio.snap_heading(studio.arrow.position, up)
+    studio.set_heading(studio.arrow.position, up)
     assert "under the table" in studio.trouble
     with pytest.raises(CongraspError, match="under the table"):
         _ = studio.request
@@ -203,8 +203,7 @@ def test_every_edit_is_undone_and_redone_and_a_new_one_ends_what_could_be_redone
     history, up = History(studio), matrix(MUG.rest_poses[0][3:])[2]
     edits = [
         ("set_rest_pose", {"rest": 0}),
-        ("snap_heading", {"surface": MUG.points[0], "direction": -MUG.normals[0]}),
-        ("set_heading", {"position": [0.0, 0.0, 0.0], "direction": -up}),
+        ("set_heading", {"surface": MUG.points[0], "direction": -MUG.normals[0]}),
         ("set_roll", {"angle": 0.5}),
         ("paint", {"points": [MUG.points[0]], "radius": 0.02, "avoid": True}),
         ("close_hand", {}),

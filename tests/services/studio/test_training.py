@@ -172,8 +172,8 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
         transport.publish(KEYS.log("event", "learner", "0"), Message({}, told))
         eventually(lambda: recorder.messages >= 42)
     made_up.record(tmp_path, [(BEGIN, 3), (BEGIN + 5, 3), (BEGIN + 6, 4)])
-    window = TrainingWindow("made-up")
-    window.load(tmp_path)
+    window = TrainingWindow("made-up", Recordings(tmp_path))
+    window.load()
     assert [row["id"] for row in window.view()["actors"]] == ["a003", "a004"]
     assert window.episode("a004").meta["object"] == "thing-4"
     assert window.curve("episode/success").values[DIP] == 0.1
