@@ -85,7 +85,7 @@ class App {
   async takeState(state) {
     const { studio } = state;
     const other = state.shown !== this.shownObject;
-    if (this.edited?.hand !== studio.hand) this.editing.setSkin(await this.skin(studio.hand));
+    const skin = await this.skin(studio.hand);
     if (other) {
       await this.#object(state);
       if (this.player.motion) this.player.close();
@@ -93,6 +93,7 @@ class App {
       this.shownPaint = studio.painted;
       await this.repaint();
     }
+    if (this.edited?.hand !== studio.hand) this.editing.setSkin(skin);
     const { position, direction } = studio.arrow;
     this.edited = { ...studio, arrow: new Ray(new Vector3(...position), new Vector3(...direction)) };
     this.editing.take(studio);

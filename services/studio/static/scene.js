@@ -1,7 +1,7 @@
 // Everything that is seen: hand, object, constraints and contacts.
 
 import {
-  CircleGeometry, Color, CylinderGeometry, DirectionalLight, DoubleSide, EqualStencilFunc, Group, HemisphereLight,
+  Color, CylinderGeometry, DirectionalLight, DoubleSide, EqualStencilFunc, Group, HemisphereLight,
   IncrementStencilOp, LatheGeometry, LessDepth, LessEqualDepth, Mesh, MeshBasicMaterial, MeshLambertMaterial, ReplaceStencilOp, RingGeometry, Scene,
   SphereGeometry, TorusGeometry, Vector2, Vector3,
 } from "./vendor/three.module.min.js";
@@ -23,6 +23,7 @@ const FORCE_LENGTH = 0.015; // m per newton
 const LONGEST = 0.09; // m
 const TABLE = 0.3; // m
 const RING = 0.05; // m between two lines of the table
+const LINE = 0.0006; // m
 const KEY = new Vector3(0.35, -0.5, 0.8); // towards the light that casts shadows
 const SHADE = 0.2; // of a shadow
 const OVERRULED = 0.45; // opacities
@@ -105,9 +106,11 @@ class Table extends Group {
     super();
     const ground = { stencilWrite: true, stencilRef: 1, stencilZPass: ReplaceStencilOp };
     this.top = new MeshBasicMaterial(ground);
-    this.line = new MeshBasicMaterial({ ...ground, polygonOffset: true, polygonOffsetFactor: -1, polygonOffsetUnits: -1 });
-    const rings = Array.from({ length: Math.round(TABLE / RING) }, (_, i) => (i + 1) * RING);
-    this.add(new Mesh(new CircleGeometry(TABLE, 96), this.top), ...rings.map((radius) => new Mesh(new RingGeometry(radius - 0.0006, radius, 96), this.line)));
+    this.line = new MeshBasicMaterial(ground);
+    for (let outer = RING; outer < TABLE + 1e-9; outer += RING) {
+      const inner = outer - LINE;
+      this.add(new Mesh(new RingGeometry(outer - RING, inner, 96), this.top), new Mesh(new RingGeometry(inner, outer, 96), this.line));
+    }
   }
 
   at({ x, y }) {
