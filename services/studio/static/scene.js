@@ -1,9 +1,9 @@
 // Everything that is seen: hand, object, constraints and contacts.
 
 import {
-  Color, CylinderGeometry, DirectionalLight, DoubleSide, EqualStencilFunc, Group, HemisphereLight,
-  IncrementStencilOp, LatheGeometry, LessDepth, LessEqualDepth, Mesh, MeshBasicMaterial, MeshLambertMaterial, ReplaceStencilOp, RingGeometry, Scene,
-  SphereGeometry, TorusGeometry, Vector2, Vector3,
+  Color, CylinderGeometry, DirectionalLight, DoubleSide, EqualStencilFunc, Group, HemisphereLight, IncrementStencilOp,
+  LatheGeometry, LessDepth, LessEqualDepth, Mesh, MeshBasicMaterial, MeshLambertMaterial, ReplaceStencilOp, RingGeometry,
+  Scene, SphereGeometry, TorusGeometry, Vector2, Vector3,
 } from "./vendor/three.module.min.js";
 import { AVOID, Body } from "./body.js";
 import { Hand } from "./hand.js";
@@ -43,8 +43,12 @@ function arrow(radius, head) {
   return new LatheGeometry([[0, 0], ...sharp, [0, 1]].map((point) => new Vector2(...point)), 20).rotateX(Math.PI / 2);
 }
 
+function fade(material, opacity) {
+  return Object.assign(material, { opacity, transparent: opacity < 1, depthWrite: opacity === 1, needsUpdate: true });
+}
+
 function lit(color, opacity = 1) {
-  return new MeshLambertMaterial({ color, opacity, transparent: opacity < 1, depthWrite: opacity === 1 });
+  return fade(new MeshLambertMaterial({ color }), opacity);
 }
 
 // Of shadows, which darken each place of the table once.
@@ -188,7 +192,7 @@ export class Editing extends Pair {
     this.mark(markers.map(marker), 1);
     // An arrow that the rules overrule is faint, and beside it is the one that counts.
     this.counts.visible = active.overruled;
-    Object.assign(this.arrow.material, { opacity: active.overruled ? OVERRULED : 1, transparent: active.overruled, depthWrite: !active.overruled });
+    fade(this.arrow.material, active.overruled ? OVERRULED : 1);
     approach(this.counts, new Vector3(...active.position), new Vector3(...active.direction));
     this.updateMatrixWorld(true);
   }
@@ -228,8 +232,8 @@ export class Playing extends Pair {
     this.faint = on;
     this.traverse(({ material }) => {
       if (!material) return;
-      const opacity = (material.userData.opacity ??= material.opacity) * (on ? BEHIND : 1);
-      Object.assign(material, { opacity, transparent: opacity < 1, depthWrite: opacity === 1, depthFunc: on ? LessDepth : LessEqualDepth });
+      material.userData.opacity ??= material.opacity;
+      fade(material, material.userData.opacity * (on ? BEHIND : 1)).depthFunc = on ? LessDepth : LessEqualDepth;
     });
   }
 
