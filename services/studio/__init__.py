@@ -4,5 +4,5 @@
 describes them, hands and motions to the page. `grasping` grasps by a policy, and `motions` keeps and saves the results.
 `catalogue` holds the objects, and `training` a run with its recorded episodes. None of them depends on a browser.
 `session` connects them, `server` serves a session to each browser over HTTP, `app` opens it all, and `static/` is the
-page. `static/vendor/` has three.js 0.185.1 under its MIT licence: `build/three.{module,core}.min.js` of the npm package.
+page. `static/vendor/` has three.js 0.185.1 (MIT licence): `build/three.{module,core}.min.js` of the npm package.
 """

@@ -25,6 +25,7 @@ from congrasp.services.grasp.grasper import costs, repeated, surface_of
 from congrasp.services.grasp.reach import with_planned_reach
 from congrasp.services.serve.server import Source
 from congrasp.services.studio.session import SECONDS, Progress
+from congrasp.services.studio.state import tool_of
 
 ATTEMPTS = 8
 """Number of parallel grasps: the drawn one, and others near it."""
@@ -208,5 +209,5 @@ def _weaker(request: GraspRequest) -> Iterator[tuple[str, GraspRequest]]:
     for name in request.constraints:
         if get_constraint(name).optional:
             kept = {other: fields for other, fields in request.constraints.items() if other != name}
-            avoid = None if get_constraint(name).needs else request.avoid
+            avoid = None if tool_of(get_constraint(name)) == "paint" else request.avoid
             yield name, dataclasses.replace(request, constraints=kept, avoid=avoid)

@@ -34,7 +34,7 @@ _MOST_EDITS = 100  # that can be undone
 
 def tool_of(constraint: Constraint) -> Tool:
     """Tool that sets the goal arrays of a constraint; empty for flags and numbers."""
-    if constraint.needs:
+    if "surface_avoid" in constraint.needs:
         return "paint"
     if set(constraint.arrays) == set(Poses._fields):
         return "hand"

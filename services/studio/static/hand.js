@@ -21,7 +21,7 @@ export class Skin {
 
 export class Hand extends SkinnedMesh {
   constructor({ geometry, inverses }, material) {
-    super(geometry.clone(), material); // the colours are its own
+    super(material.vertexColors ? geometry.clone() : geometry, material); // colours of contacts are its own
     this.bones = inverses.map(() => new Bone());
     this.add(...this.bones);
     this.bind(new Skeleton(this.bones, inverses), new Matrix4());

@@ -36,6 +36,16 @@ def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
     assert masks(studio) == set()
 
 
+def test_drawing_tools_follow_from_goal_arrays(studio: Studio) -> None:
+    tools = {row["name"]: row["tool"] for row in describe(studio)["constraints"]}
+    assert {name: tool for name, tool in tools.items() if tool} == {
+        "heading": "arrow", "affordance": "paint", "pose": "hand", "trajectory": "path",
+    }  # fmt: skip
+    lacking = Studio(HAND, dataclasses.replace(TASK, constraints=("heading",)), MUG)
+    with pytest.raises(CongraspError, match="no constraint of the tool 'path'. It supports heading"):
+        lacking.draw([[0.0, 0.0, 0.3], [0.0, 0.0, 0.1]])
+
+
 def test_the_hand_begins_before_the_arrow_and_aligned_with_it(studio: Studio) -> None:
     studio.task = dataclasses.replace(studio.task, preshape=False)
     hand, rest = studio.hand, MUG.rest_poses[0]
