@@ -42,7 +42,7 @@ def test_drawing_tools_follow_from_goal_arrays(studio: Studio) -> None:
         "heading": "arrow", "affordance": "paint", "pose": "hand", "trajectory": "path",
     }  # fmt: skip
     lacking = Studio(HAND, dataclasses.replace(TASK, constraints=("heading",)), MUG)
-    with pytest.raises(CongraspError, match="no constraint of the tool 'path'. It supports heading"):
+    with pytest.raises(CongraspError, match=r"no constraint of the tool 'path'\. It supports heading"):
         lacking.draw([[0.0, 0.0, 0.3], [0.0, 0.0, 0.1]])
 
 
