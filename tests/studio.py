@@ -19,8 +19,7 @@ from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.scene import episode_entries
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.studio.catalogue import Catalogue
-from congrasp.services.studio.jobs import Progress
-from congrasp.services.studio.session import Session
+from congrasp.services.studio.session import Progress, Session
 from congrasp.services.studio.training import TrainingWindow
 from tests.episodes import episode
 

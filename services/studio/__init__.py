@@ -1,8 +1,8 @@
 """`congrasp view`: the constraint studio and the window on a training, in a browser.
 
-`state` holds the constraints that the user sets, `history` undoes and redoes changes, `description` describes them to
-the page. `motions` keeps the grasps, `lanes` rates them by the constraints, `files` saves them, and `diagnosis`
-explains failures. `training` holds the state of a run and `recordings` its episodes on disk. None of them depends on a
-browser. `session` connects them to a policy, `sessions` keeps one per browser, `server` serves them over HTTP, and
-`static/` is the page.
+`state` holds the constraints that the user sets with the arrow and the paint of `drawing`, and undoes changes; `page`
+describes them, hands and motions to the page. `grasping` grasps by a policy, and `motions` keeps and saves the results.
+`catalogue` holds the objects, and `training` a run with its recorded episodes. None of them depends on a browser.
+`session` connects them, `server` serves a session to each browser over HTTP, `app` opens it all, and `static/` is the
+page. `static/vendor/` has three.js 0.185.1 (MIT licence): `build/three.{module,core}.min.js` of the npm package.
 """

@@ -24,11 +24,9 @@ from congrasp.services.ops.logs import log
 from congrasp.services.serve.server import follow_file, follow_run
 from congrasp.services.studio.catalogue import Catalogue
 from congrasp.services.studio.grasping import PolicyGrasping
-from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.server import PageServer
+from congrasp.services.studio.server import PageServer, Sessions
 from congrasp.services.studio.session import Session
-from congrasp.services.studio.sessions import Sessions
-from congrasp.services.studio.training import Follower, TrainingWindow
+from congrasp.services.studio.training import Follower, Recordings, TrainingWindow
 
 _GUESS = ImportOptions(unit="guess")
 _FIRST = "mug"
@@ -60,10 +58,13 @@ def open_view(
         )
     check_exposure(f"tcp/{f'[{host}]' if ':' in host else host}:{port}", None, insecure=insecure)
     with contextlib.ExitStack() as stack:
-        window = TrainingWindow(run if connect else _run_of(recordings)) if connect or recordings else None
-        if recordings is not None and window is not None:
-            _read(window, recordings)
-        if connect and window is not None:
+        window = None
+        if connect or recordings:
+            recorded = Recordings(recordings) if recordings else None
+            window = TrainingWindow(run if connect else _run_of(recordings), recorded)
+            # In the background: the curves of a long run take a while.
+            threading.Thread(target=window.load, daemon=True, name="curves").start()
+        if window is not None and connect:
             watching = stack.enter_context(urls.connect(connect, "observer", certs=certs))
             stack.callback(Follower(watching, window).close)
             hands = _of_run(connect, run, certs, watching, stack)
@@ -71,12 +72,11 @@ def open_view(
             hands = {"of the policy": functools.partial(PolicyGrasping, follow_file(policy), policy.name)}
         else:
             hands = _pretrained()
-        recorded = Recordings(recordings) if recordings else None
         loaded = {name: functools.cache(load) for name, load in hands.items()}  # all browsers share compiled programs
         opened: list[Sessions] = []  # the port is taken before they compile
         server = PageServer(lambda browser: opened[0].routes(browser), host, port, names)
         stack.callback(server.close)
-        opened.append(Sessions(lambda: Session(loaded, catalogue(objects), MeshImporter(), window, recorded)))
+        opened.append(Sessions(lambda: Session(loaded, catalogue(objects), MeshImporter(), window)))
         stack.callback(opened[0].close)
         yield server.url
 
@@ -136,17 +136,3 @@ def _run_of(recordings: pathlib.Path | None) -> str:
     """The name of a run, from the folder of its recordings."""
     names = [part for part in recordings.resolve().parts if part != LOGS] if recordings else []
     return names[-1] if names else ""
-
-
-def _read(window: TrainingWindow, recordings: pathlib.Path) -> None:
-    """Reads curves in the background: a long run's recordings take a while."""
-    Recordings(recordings).check()
-
-    def work() -> None:
-        """Reads all files."""
-        try:
-            window.load(recordings)
-        except CongraspError as error:
-            log("warning", str(error))
-
-    threading.Thread(target=work, daemon=True, name="curves").start()

@@ -1,17 +1,21 @@
-"""Objects that a studio offers, and uploaded meshes among them, whose unit the user may choose."""
+"""Objects that a studio offers, uploaded meshes among them, and pictures of their resting poses."""
 
 import dataclasses
 import pathlib
 import tempfile
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.assets.objects.sizes import UNIT_NAMES, guessed_unit, sizes_by_unit
-from congrasp.services.studio.server import BadRequest
+from congrasp.services.studio.server import BadRequest, Picture
+from congrasp.services.viz.object_sheet import rest_picture
+from congrasp.services.viz.sheets import png_of
 
 _LONGEST_NAME = 255  # bytes, of Linux
+_SIZE = (150, 112)  # pixels of a thumbnail
 
 
 class Importer(Protocol):
@@ -141,3 +145,24 @@ class Uploads:
     def _told(self, error: CongraspError, path: pathlib.Path) -> CongraspError:
         """The error with the file's name in place of its path on the server."""
         return CongraspError(str(error).replace(str(path), path.name))
+
+
+class Thumbnails:
+    """Pictures of the resting poses of one object at a time."""
+
+    def __init__(self) -> None:
+        """Renders nothing yet."""
+        self._lock = threading.Lock()
+        self._object: GraspObject | None = None
+        self._drawn: dict[int, Picture] = {}
+
+    def picture(self, obj: GraspObject, rest: int) -> Picture:
+        """An object in one of its resting poses, from 0; raises a CongraspError if there is none of this number."""
+        if not 0 <= rest < len(obj.rest_poses):
+            raise CongraspError(f"The object '{obj.name}' has no resting pose {rest + 1}.")
+        with self._lock:
+            if self._object is not obj:
+                self._object, self._drawn = obj, {}
+            if rest not in self._drawn:
+                self._drawn[rest] = Picture(png_of(rest_picture(obj, rest, _SIZE)))
+            return self._drawn[rest]

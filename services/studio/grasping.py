@@ -1,8 +1,8 @@
-"""Grasps of a policy for the studio: exactly as drawn, or close to that where it fails."""
+"""Grasps of a policy for the studio: exactly as drawn, or close to that where it fails; and the reason if none held."""
 
 import dataclasses
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -20,11 +20,12 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, known, require_known
 from congrasp.common.task.constraints.priority import explain
 from congrasp.common.wire.codec import Message
+from congrasp.services.evaluate.failures import cause
 from congrasp.services.grasp.grasper import costs, repeated, surface_of
 from congrasp.services.grasp.reach import with_planned_reach
 from congrasp.services.serve.server import Source
-from congrasp.services.studio.diagnosis import why_nothing_held
-from congrasp.services.studio.jobs import SECONDS, Progress
+from congrasp.services.studio.session import SECONDS, Progress
+from congrasp.services.studio.state import tool_of
 
 ATTEMPTS = 8
 """Number of parallel grasps: the drawn one, and others near it."""
@@ -34,6 +35,8 @@ _COMPILING = 60
 """Seconds of the first grasp on two cores of a laptop, with an empty compilation cache."""
 _OTHER = 2.0
 """Cost of deviating from the drawn grasp, in addition to the costs of `services.grasp.grasper`."""
+Held = Callable[[GraspRequest, str], int]
+"""(weaker request, name of the omitted constraint) -> number of attempts that hold."""
 
 
 class PolicyGrasping:
@@ -175,3 +178,36 @@ def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
         why = "did better" if held[0] else "held, which what was drawn did not"
         return f"Of {ATTEMPTS - 1} others near what was drawn, this one {why}: {1000 * aside[index]:.0f} mm beside it."
     return ""
+
+
+def why_nothing_held(
+    episode: Message, request: GraspRequest, explanation: list[str], held: Held, *, attempts: int, drop_height: float
+) -> str:
+    """Explains a failed grasp to the user in a few sentences.
+
+    Args:
+      episode: the shown attempt.
+      request: its request.
+      explanation: effects of the priority rules on it, strongest constraint first.
+      held: repeats the attempts under a weaker request.
+      attempts: number of attempts.
+      drop_height: drop at which the object counts as fallen, m.
+    """
+    text = f"None of {attempts} attempts held. The one shown: {cause(episode, drop_height)}."
+    found = {name: held(weaker, name) for name, weaker in _weaker(request)}
+    best = max(found, key=lambda name: found[name], default="")
+    if best and found[best]:
+        title = get_constraint(best).title
+        return f"{text} The {title} decided: without it {found[best]} of {attempts} hold."
+    guides = [name for name in request.constraints if "heading" in get_constraint(name).overrides]
+    advice = f"{explanation[0]} Try another {get_constraint(guides[-1] if guides else 'heading').title}."
+    return f"{text} None holds without any one of the constraints either. {advice}" if found else f"{text} {advice}"
+
+
+def _weaker(request: GraspRequest) -> Iterator[tuple[str, GraspRequest]]:
+    """The request without one of its optional constraints, for each of them."""
+    for name in request.constraints:
+        if get_constraint(name).optional:
+            kept = {other: fields for other, fields in request.constraints.items() if other != name}
+            avoid = None if tool_of(get_constraint(name)) == "paint" else request.avoid
+            yield name, dataclasses.replace(request, constraints=kept, avoid=avoid)

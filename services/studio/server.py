@@ -1,5 +1,6 @@
-"""Serves a studio over HTTP to browsers on this machine: files, JSON, and messages of arrays."""
+"""Serves a studio over HTTP to browsers on this machine: a session for each, files, JSON, and messages of arrays."""
 
+import collections
 import contextlib
 import http.cookies
 import http.server
@@ -9,9 +10,10 @@ import re
 import secrets
 import socket
 import threading
+import time
 import urllib.parse
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message, encode
@@ -20,6 +22,10 @@ from congrasp.services.ops.logs import log
 STATIC = pathlib.Path(__file__).with_name("static")
 MOST_BYTES = 128 << 20
 """Bytes of the largest request body, an uploaded mesh."""
+MOST = 16
+"""Maximum number of browsers; a further one ends the session that was used least recently, if it is idle."""
+IDLE = 1800.0
+"""Seconds without a request after which a session is idle."""
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -29,7 +35,7 @@ _TYPES = {
 _POLICY = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
 _ROUTES = "/api/"
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_OWN = re.compile("/(api|static)/[^/]*$")
+_OWN = re.compile("/(api|static(/vendor)?)/[^/]*$")
 _TOKEN = re.compile("[0-9a-f]{32}")
 _TIMEOUT = 30.0  # seconds that a request may take to arrive
 _DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes read of a refused body, so that the answer arrives before the close
@@ -66,6 +72,60 @@ class Routes(NamedTuple):
     posts: Mapping[str, Post]
 
 
+class Session(Protocol):
+    """Everything behind the page of one browser."""
+
+    routes: Routes
+
+    def close(self) -> None:
+        """Ends it."""
+
+
+class Sessions:
+    """One session per browser, so that edits in one do not change the objects of others."""
+
+    def __init__(self, new: Callable[[], Session]):
+        """Opens the session of the first browser.
+
+        Args:
+          new: opens a session.
+
+        Raises:
+          CongraspError: `new` failed.
+        """
+        self._new, self._spare = new, [new()]
+        self._open: collections.OrderedDict[str, tuple[Session, float]] = collections.OrderedDict()
+        self._lock = threading.Lock()
+
+    def routes(self, browser: str) -> Routes:
+        """Returns the routes of a browser's session, and opens one for a new browser.
+
+        Raises:
+          CongraspError: too many browsers use the studio.
+        """
+        with self._lock:
+            now = time.monotonic()
+            session, _ = self._open.pop(browser, (None, now))
+            if session is None and len(self._open) >= MOST:
+                oldest, used = next(iter(self._open.values()))
+                if now - used < IDLE:
+                    raise CongraspError(
+                        f"{MOST} browsers use this studio.",
+                        f"Come back when one has been idle for {IDLE / 60:.0f} minutes, or start another studio.",
+                    )
+                self._open.popitem(last=False)
+                oldest.close()
+            session = session or (self._spare.pop() if self._spare else self._new())
+            self._open[browser] = session, now
+            return session.routes
+
+    def close(self) -> None:
+        """Closes all sessions."""
+        with self._lock:
+            for session in (*self._spare, *(session for session, _ in self._open.values())):
+                session.close()
+
+
 class PageServer:
     """Serves the page and the routes of a studio until it is closed."""
 
@@ -81,27 +141,15 @@ class PageServer:
         Raises:
           CongraspError: the port is busy, or there is no such interface.
         """
-        server = self
-
-        class Handler(_Handler):
-            cookie = property(lambda handler: f"congrasp-{server.port}")  # a host's ports share their cookies
-
-            def routes(self) -> Routes:
-                """Routes of this browser."""
-                return routes(self.browser())
-
-            def fault(self) -> str:
-                """Reason why the request is refused; empty if it comes from the page itself."""
-                return server._fault(self)
-
         try:
-            self._server = _Server((host, port), Handler)
+            self._server = _Server((host, port), _Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise CongraspError(
                 f"The page cannot be offered at {host}:{port} ({reason}).",
                 "Choose another --port, or end what uses it.",
             ) from None
+        self.routes, self._server.page = routes, self
         self.host, self.port = host, int(self._server.server_address[1])
         self._names = {*_LOOPBACK, *names} if host in _LOOPBACK else None
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True, name="page")
@@ -119,7 +167,7 @@ class PageServer:
         self._server.server_close()
         self._thread.join(2.0)
 
-    def _fault(self, request: http.server.BaseHTTPRequestHandler) -> str:
+    def fault(self, request: http.server.BaseHTTPRequestHandler) -> str:
         """Reason why a request is refused, with the remedy; empty if it comes from the page itself.
 
         Other sites in the browser must not reach the page. A site's name may resolve to this machine (DNS rebinding),
@@ -137,6 +185,7 @@ class PageServer:
 
 
 class _Server(http.server.ThreadingHTTPServer):
+    page: PageServer
     daemon_threads = True
     request_queue_size = 128  # the client retries a connection that finds no room, after a second
 
@@ -153,15 +202,7 @@ class _Server(http.server.ThreadingHTTPServer):
 class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     timeout = _TIMEOUT
-    cookie: str
-
-    def routes(self) -> Routes:
-        """Routes of the requesting browser."""
-        raise NotImplementedError
-
-    def fault(self) -> str:
-        """Reason why the request is refused; empty if it may be answered."""
-        raise NotImplementedError
+    server: _Server
 
     def do_GET(self) -> None:
         """Answers by a route, or with a file."""
@@ -187,12 +228,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._drain(length)
         elif not 0 <= length <= MOST_BYTES:
             message = "The request has no length." if length < 0 else f"At most {MOST_BYTES >> 20} MiB can be sent."
-            self._send(413, "application/json", json.dumps({"error": message}).encode())
+            self._error(413, message)
             self._drain(length)
         elif (routes := self._routes()) is None:
             self._drain(length)
         elif (route := routes.posts.get(path)) is None:
-            self._send(404, "application/json", b'{"error": "There is nothing of this name."}')
+            self._error(404, "There is nothing of this name.")
             self._drain(length)
         else:
             body = self.rfile.read(length)
@@ -201,15 +242,20 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def _routes(self) -> Routes | None:
         """Routes of this browser; None if there is no room for it, which is answered."""
         try:
-            return self.routes()
+            return self.server.page.routes(self._browser())
         except CongraspError as error:
-            self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
+            self._error(200, str(error))
             return None
 
-    def browser(self) -> str:
+    @property
+    def _cookie(self) -> str:
+        """Name of the page's cookie; the ports of a host share theirs."""
+        return f"congrasp-{self.server.page.port}"
+
+    def _browser(self) -> str:
         """The token in the browser's cookie; empty without one."""
         with contextlib.suppress(http.cookies.CookieError):
-            found = http.cookies.SimpleCookie(self.headers.get("Cookie", "")).get(self.cookie)
+            found = http.cookies.SimpleCookie(self.headers.get("Cookie", "")).get(self._cookie)
             return found.value if found and _TOKEN.fullmatch(found.value) else ""
         return ""
 
@@ -228,9 +274,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def _refused(self, fault: str = "") -> bool:
         """Sends a refusal if the request is not allowed, or has another fault; returns True if it did."""
-        fault = self.fault() or fault
-        if fault:
-            self._send(403, "application/json", json.dumps({"error": fault}).encode())
+        if fault := self.server.page.fault(self) or fault:
+            self._error(403, fault)
         return bool(fault)
 
     def _drain(self, length: int) -> None:
@@ -242,13 +287,14 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def _file(self, name: str) -> None:
         """Sends a file of the page."""
-        file = next((file for file in STATIC.iterdir() if file.name == name and file.suffix in _TYPES), None)
+        files = (file for file in STATIC.rglob("*") if file.suffix in _TYPES)
+        file = next((file for file in files if file.relative_to(STATIC).as_posix() == name), None)
         if file is None:
             self._send(404, "text/plain", b"There is nothing of this name.")
             return
         new = {}
-        if file.suffix == ".html" and not self.browser():
-            new = {"Set-Cookie": f"{self.cookie}={secrets.token_hex(16)}; HttpOnly; SameSite=Strict"}
+        if file.suffix == ".html" and not self._browser():
+            new = {"Set-Cookie": f"{self._cookie}={secrets.token_hex(16)}; HttpOnly; SameSite=Strict"}
         self._send(200, _TYPES[file.suffix], file.read_bytes(), new)
 
     def _answer(self, work: Callable[[], Answer]) -> None:
@@ -256,17 +302,18 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         try:
             content = _content(work())
         except BadRequest as error:
-            self._send(400, "application/json", json.dumps({"error": str(error)}).encode())
-            return
+            return self._error(400, str(error))
         except CongraspError as error:
-            self._send(200, "application/json", json.dumps({"error": str(error)}).encode(), {"X-Refused": "yes"})
-            return
+            return self._error(200, str(error))
         except Exception as error:  # the server continues after any error of a request
             log("error", f"{self.path.partition('?')[0]}: {type(error).__name__}: {error}")
-            message = f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}."
-            self._send(500, "application/json", json.dumps({"error": message}).encode())
-            return
+            return self._error(500, f"This went wrong and is a fault of congrasp: {type(error).__name__}: {error}.")
         self._send(200, *content)
+
+    def _error(self, code: int, error: str) -> None:
+        """Sends an error; one with the code 200 is an answer of the studio, such as a wrong value."""
+        refused = {"X-Refused": "yes"} if code == 200 else {}
+        self._send(code, "application/json", json.dumps({"error": error}).encode(), refused)
 
     def _send(self, code: int, kind: str, data: bytes, more: Mapping[str, str] | None = None) -> None:
         """Sends a whole answer."""

@@ -1,4 +1,4 @@
-"""The session of one browser: studio, policy, objects and motions, and the training window; handles its requests."""
+"""The session of one browser: studio, policy, objects, motions, training window and background job; and its routes."""
 
 import functools
 import json
@@ -6,15 +6,14 @@ import math
 import pathlib
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
-
-import numpy as np
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol, TypeVar
 
 from congrasp.actors.attempts import PLAIN, Phases
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
-from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
@@ -22,20 +21,15 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.materials import MATERIALS, with_mass
 from congrasp.services.assets.objects.sizes import METRES
-from congrasp.services.studio.catalogue import Catalogue, Importer, Uploads
-from congrasp.services.studio.description import describe
-from congrasp.services.studio.files import DATA, DRAWN, data_file, drawing
-from congrasp.services.studio.history import ACTIONS, History
-from congrasp.services.studio.jobs import Jobs, Progress
-from congrasp.services.studio.lanes import for_page
-from congrasp.services.studio.motions import Motions
-from congrasp.services.studio.recordings import Recordings
+from congrasp.services.ops.logs import log
+from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads
+from congrasp.services.studio.motions import DATA, DRAWN, Motions, data_file, drawing
+from congrasp.services.studio.page import describe, for_page, hand_message
 from congrasp.services.studio.server import BadRequest, Download, Get, Picture, Routes
-from congrasp.services.studio.state import Studio
-from congrasp.services.studio.thumbnails import Thumbnails
+from congrasp.services.studio.state import ACTIONS, History, Studio
 from congrasp.services.studio.training import TrainingWindow
-from congrasp.services.viz.shapes import skin_colours
 
+_T = TypeVar("_T")
 LIGHTEST_G, HEAVIEST_G = 1, 5000
 LONGEST = Phases(approach=10.0, lift=0.5, hold=10.0)
 _OWN_WEIGHT = {"mass_g": 0.0, "material": ""}
@@ -44,6 +38,10 @@ _DRAWING = "drawing"
 """Result of a job that rendered a picture or a video, in place of a motion's number."""
 _LATEST = 1e10
 """Seconds since 1970 beyond which nothing was recorded."""
+SECONDS = "{seconds}"
+"""Placeholder in the text of a job for its elapsed seconds."""
+Progress = Callable[[str, float], None]
+"""(current activity, completed share from 0 to 1)."""
 
 
 class Grasping(Protocol):
@@ -68,7 +66,6 @@ class Session:
         objects: Catalogue,
         importer: Importer,
         window: TrainingWindow | None = None,
-        recordings: Recordings | None = None,
     ):
         """Loads the first hand's policy and the first object.
 
@@ -77,10 +74,8 @@ class Session:
           objects: objects to choose from.
           importer: makes objects from uploaded meshes.
           window: state of a run, or None.
-          recordings: its episodes on disk, or None.
         """
-        self._hands, self._objects = hands, objects
-        self._window, self._recordings = window, recordings
+        self._hands, self._objects, self._window = hands, objects, window
         self._folder = tempfile.TemporaryDirectory(prefix="congrasp-view-")
         self._uploads = Uploads(pathlib.Path(self._folder.name), objects, importer)
         self._lock = threading.RLock()
@@ -128,7 +123,6 @@ class Session:
                 "policy": self._grasping.newest(),
                 "motions": self._motions.view(),
                 "training": self._window is not None,
-                "recordings": self._recordings is not None,
                 "weight": {**self._weight, "materials": list(MATERIALS)},
                 "phases": self._phases._asdict(),
                 "saves": [*DRAWN, *DATA],
@@ -160,8 +154,8 @@ class Session:
         kind, _, name = key.partition(":")
         if kind == "actor" and self._window is not None:
             return self._window.episode(name)
-        if kind == "record" and self._recordings is not None:
-            return self._recordings.episode(name)
+        if kind == "record" and self._window is not None and self._window.recordings is not None:
+            return self._window.recordings.episode(name)
         with self._lock:
             return self._motions.get(key)
 
@@ -183,7 +177,7 @@ class Session:
 
     def episodes_around(self, time: str, seconds: str) -> dict[str, Any]:
         """Episodes that were recorded around a time."""
-        if self._recordings is None:
+        if self._window is None or self._window.recordings is None:
             raise CongraspError("No recordings were named.", "Start the studio with --recordings FOLDER.")
         try:
             when, around = float(time), float(seconds)
@@ -191,7 +185,7 @@ class Session:
             when = around = math.nan
         if not (0.0 <= when < _LATEST and math.isfinite(around)):
             raise BadRequest("A search for episodes needs two finite numbers: time and seconds.")
-        reach, episodes = self._recordings.around(when, min(max(around, 0.1), 3600.0))
+        reach, episodes = self._window.recordings.around(when, min(max(around, 0.1), 3600.0))
         return {"seconds": reach, "episodes": episodes}
 
     def _do(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
@@ -259,30 +253,31 @@ class Session:
 
     def _import(self, file: str, load: Callable[[], str]) -> dict[str, Any]:
         """Begins an import by `load`, which returns the object's name, and then shows the object."""
-
-        def work(progress: Progress) -> None:
-            """Imports it."""
-            progress(f"importing {file}: repair and convex pieces, up to a minute", 0.1)
-            name = load()
-            with self._lock:
-                self._show(name)
-
-        return self._jobs.start(f"importing {file}", work)
+        return self._load(f"importing {file}: repair and convex pieces, up to a minute", load, self._show)
 
     def _choose_hand(self, name: str) -> None:
         """Loads the policy of another hand."""
         if name not in self._hands:
             raise CongraspError(f"There is no policy for the hand '{name}'.", f"There is: {', '.join(self._hands)}.")
 
+        def show(grasping: Grasping) -> None:
+            """Begins a request for it."""
+            self._hand = name
+            self._take_hand(grasping, self._studio.obj)
+
+        self._load(f"loading the policy of the hand {name}", self._hands[name], show)
+
+    def _load(self, text: str, load: Callable[[], _T], show: Callable[[_T], None]) -> dict[str, Any]:
+        """Begins a job that loads something, and shows it afterwards; returns the state of the job."""
+
         def work(progress: Progress) -> None:
             """Loads it."""
-            progress(f"loading the policy of the hand {name}", 0.2)
-            grasping = self._hands[name]()
+            progress(text, 0.2)
+            loaded = load()
             with self._lock:
-                self._hand = name
-                self._take_hand(grasping, self._studio.obj)
+                show(loaded)
 
-        self._jobs.start(f"loading the policy of the hand {name}", work)
+        return self._jobs.start(text, work)
 
     def _take_hand(self, grasping: Grasping, obj: GraspObject) -> None:
         """Opens a studio for a policy's hand."""
@@ -292,17 +287,9 @@ class Session:
 
     def _choose_object(self, name: str) -> None:
         """Makes or imports another object."""
-
-        def work(progress: Progress) -> None:
-            """Makes it."""
-            progress(f"loading {name}", 0.2)
-            self._objects.get(name)
-            with self._lock:
-                self._show(name)
-
         if name not in self._objects.names:
             self._objects.get(name)
-        self._jobs.start(f"loading {name}", work)
+        self._load(f"loading {name}", lambda: self._objects.get(name), lambda obj: self._show(name))
         self._uploads.pending = None
 
     def _show(self, name: str) -> None:
@@ -340,25 +327,74 @@ class Session:
         self._jobs.start(f"drawing the {kind}", work)
 
 
-def hand_message(hand: Hand) -> Message:
-    """A hand's skin (see `common.hands.skin`), and its links' names."""
-    skin = skin_of(hand)
-    links, weights = skin.influences()
-    arrays = {
-        "skin_points": skin.points,
-        "skin_normals": skin.normals,
-        "skin_faces": skin.faces,
-        "skin_joints": links.astype(np.int32),
-        "skin_weights": weights,
-        "skin_origins": skin.origins.astype(np.float32),
-        "skin_colours": skin_colours(skin),
-    }
-    return Message(arrays, {"hand": hand.name, "links": [link.name for link in hand.links]})
-
-
 def json_object(body: bytes) -> dict[str, Any]:
     """A JSON object; a ValueError for anything else."""
     value = json.loads(body)
     if not isinstance(value, dict):
         raise ValueError("not an object")
     return value
+
+
+class Jobs:
+    """Runs one job at a time in a separate thread."""
+
+    def __init__(self) -> None:
+        """Begins without a job."""
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="studio")
+        self._lock = threading.RLock()
+        self._number = 0
+        self._since = 0.0
+        self._state: dict[str, Any] = _state(0, running=False)
+
+    def start(self, text: str, work: Callable[[Progress], str | None]) -> dict[str, Any]:
+        """Begins a job, which may return the key of its result; returns the job's state.
+
+        Raises:
+          CongraspError: another job is still running.
+        """
+        with self._lock:
+            self.require_idle()
+            self._number += 1
+            self._since = time.monotonic()
+            self._state = _state(self._number, text=text)
+            self._pool.submit(self._run, work)
+            return dict(self._state)
+
+    def require_idle(self) -> None:
+        """Raises a CongraspError while a job is running."""
+        with self._lock:
+            if self._state["running"]:
+                raise CongraspError(f"Please wait: {self.state()['text']}.")
+
+    def state(self) -> dict[str, Any]:
+        """The current job, or the last one: number, running, text, share, error, and the key of its result (made)."""
+        with self._lock:
+            seconds = f"{time.monotonic() - self._since:.0f}"
+            return {**self._state, "text": self._state["text"].replace(SECONDS, seconds)}
+
+    def close(self) -> None:
+        """Rejects further jobs, without waiting for a running one."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _run(self, work: Callable[[Progress], str | None]) -> None:
+        """Runs a job to its end and stores its result or error."""
+        error, made = "", None
+        try:
+            made = work(self._progress)
+        except CongraspError as found:
+            error = str(found)
+        except Exception as found:  # the page shows any error of a job, and the studio continues
+            error = f"This went wrong and is a fault of congrasp: {type(found).__name__}: {found}."
+            log("error", error)
+        with self._lock:
+            self._state |= {"running": False, "share": 1.0, "error": error, "made": made}
+
+    def _progress(self, text: str, share: float) -> None:
+        """Stores the progress of the job."""
+        with self._lock:
+            self._state |= {"text": text, "share": min(1.0, max(0.0, share))}
+
+
+def _state(number: int, *, running: bool = True, text: str = "") -> dict[str, Any]:
+    """A job's state at its start."""
+    return {"number": number, "running": running, "text": text, "share": 0.0, "error": "", "made": None}

@@ -1,9 +1,10 @@
-"""The request of the studio's user: object, constraints, and the effects of the priority rules; without a browser."""
+"""The request of the studio's user: object, constraints, and the effects of the priority rules; with undo and redo."""
 
+import collections
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -14,29 +15,31 @@ from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import get_constraint, goal_of, optional, require_known
+from congrasp.common.task.constraints import Constraint, get_constraint, goal_of, known, optional, require_known
 from congrasp.common.task.constraints.priority import Resolution, explain, resolve
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
-from congrasp.common.task.sampling.headings import BACK_OFF, INWARD
+from congrasp.common.task.sampling.headings import BACK_OFF
 from congrasp.common.task.sampling.write_sets import make_sets
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
 from congrasp.services.grasp.grasper import with_avoid
-from congrasp.services.studio.arrow import LARGEST, Arrow, arrow_of, from_above, vector
-from congrasp.services.studio.canvas import Canvas, Paint
+from congrasp.services.studio.drawing import Arrow, Canvas, Paint, arrow_through, from_above, stroke, vector
 
-TOOLS = ("affordance", "pose", "trajectory")
-"""Constraints with drawing tools; the page makes toggles for the flags of the others."""
+Fields = Mapping[str, np.ndarray]
+"""Goal arrays of a constraint by field, without batch axis."""
+Tool = Literal["arrow", "paint", "hand", "path", ""]
 _LEAST_PATH = 0.03  # m
+_MOST_EDITS = 100  # that can be undone
 
 
-class Path(NamedTuple):
-    """Waypoints of the wrist in the object frame."""
-
-    position: np.ndarray
-    """(K, 3) m."""
-    quaternion: np.ndarray
-    """(K, 4) w x y z."""
+def tool_of(constraint: Constraint) -> Tool:
+    """Tool that sets the goal arrays of a constraint; empty for flags and numbers."""
+    if "surface_avoid" in constraint.needs:
+        return "paint"
+    if set(constraint.arrays) == set(Poses._fields):
+        return "hand"
+    place = constraint.arrays.get("position")
+    return "" if place is None else "path" if place.shape[0] == "K" else "arrow"
 
 
 class Edit(NamedTuple):
@@ -44,10 +47,7 @@ class Edit(NamedTuple):
 
     rest: int
     asked: frozenset[str]
-    arrow: Arrow
-    pose: Poses | None
-    path: Path | None
-    others: Mapping[str, Mapping[str, np.ndarray]]
+    fields: Mapping[str, Fields]
     paint: Paint
 
 
@@ -58,10 +58,7 @@ class Studio:
       obj: the object, without paint.
       rest: index of its resting pose.
       asked: names of the optional constraints that are switched on.
-      arrow: the heading.
-      pose: the reference pose, or None.
-      path: the wrist path, or None.
-      others: flags of the constraints without drawing tools.
+      fields: goal arrays of the constraints that have been set, on or off; those with flags have some from the start.
       canvas: the object's surface, with the painted avoid region.
     """
 
@@ -75,23 +72,30 @@ class Studio:
         self.obj, self.rest = obj, 0
         self.asked: frozenset[str] = frozenset()
         self.canvas = Canvas(obj)
-        self.pose: Poses | None = None
-        self.path: Path | None = None
-        self.others: Mapping[str, Mapping[str, np.ndarray]] = {
-            c.name: c.suggested(self.hand, self.task) for c in optional(self.task) if c.name not in TOOLS
+        self.fields: Mapping[str, Fields] = {
+            c.name: c.suggested(self.hand, self.task) for c in optional(self.task) if not tool_of(c)
         }
         self._sets: tuple[bytes, Message] | None = None
-        self._next = {"heading": 0, "pose": 0, "trajectory": 0}
+        self._suggested: collections.Counter[str] = collections.Counter()
         self.arrow = from_above(obj, self.rest)
 
     @property
     def edit(self) -> Edit:
         """Everything that the user has set; setting it restores another state."""
-        return Edit(self.rest, self.asked, self.arrow, self.pose, self.path, self.others, self.canvas.paint)
+        return Edit(self.rest, self.asked, self.fields, self.canvas.paint)
 
     @edit.setter
     def edit(self, edit: Edit) -> None:
-        self.rest, self.asked, self.arrow, self.pose, self.path, self.others, self.canvas.paint = edit
+        self.rest, self.asked, self.fields, self.canvas.paint = edit
+
+    @property
+    def arrow(self) -> Arrow:
+        """The heading."""
+        return Arrow(**self.fields["heading"])
+
+    @arrow.setter
+    def arrow(self, arrow: Arrow) -> None:
+        self._set("heading", arrow._asdict())
 
     def set_rest_pose(self, rest: int) -> None:
         """Sets the resting pose, and resets the heading to one from above."""
@@ -106,40 +110,33 @@ class Studio:
         require_known([constraint], self.task)
         if not get_constraint(constraint).optional:
             raise CongraspError(f"The {constraint} is always active.", "Set it with the arrow.")
-        if on and constraint == "affordance" and not self.canvas.avoid.any():
+        tool = tool_of(get_constraint(constraint))
+        if on and tool == "paint" and not self.canvas.avoid.any():
             self.canvas.take_parts()
-        if on and constraint == "pose" and self.pose is None:
-            self._close()
-        if on and constraint == "trajectory" and self.path is None:
-            self._suggest("trajectory")
+        elif on and tool == "hand" and constraint not in self.fields:
+            self._set(constraint, self._closed())
+        elif on and tool == "path" and constraint not in self.fields:
+            self._suggest(constraint)
         self._switch(constraint, on)
 
     def choose(self, constraint: str, field: str, values: Any) -> None:
-        """Sets the flags of a constraint without drawing tools, and switches it on."""
+        """Sets the flags of a constraint without a drawing tool, and switches it on."""
         require_known([constraint], self.task)
-        if constraint not in self.others or field not in get_constraint(constraint).labels(self.hand):
-            raise CongraspError(f"There is nothing to choose for '{constraint}'.", f"Choose for: {list(self.others)}.")
-        flags = self.others[constraint][field]
+        if tool_of(get_constraint(constraint)) or field not in get_constraint(constraint).labels(self.hand):
+            others = [c.name for c in optional(self.task) if not tool_of(c)]
+            raise CongraspError(f"There is nothing to choose for '{constraint}'.", f"Choose for: {others}.")
+        flags = self.fields[constraint][field]
         if not isinstance(values, list) or len(values) != len(flags):
             raise CongraspError(f"'{constraint}' takes {len(flags)} flags.")
-        chosen = {**self.others[constraint], field: np.array([bool(value) for value in values])}
-        self.others = {**self.others, constraint: chosen}
+        self._set(constraint, {**self.fields[constraint], field: np.array([bool(value) for value in values])})
         self._switch(constraint, True)
 
-    def set_heading(self, position: Any, direction: Any, cross: Any = None) -> None:
-        """Sets the heading.
+    def set_heading(self, surface: Any, direction: Any) -> None:
+        """Sets the heading through a point (3,) of the surface in a direction (3,) of any length above zero.
 
-        Args:
-          position: (3,) target in the object frame, m.
-          direction: (3,) of any length above zero.
-          cross: (3,) along the cross-finger axis, made orthogonal; the current one by default.
+        Its target is `INWARD` beyond the point, as in training, and its roll changes as little as possible.
         """
-        self.arrow = arrow_of(position, direction, self.arrow.cross if cross is None else cross)
-
-    def snap_heading(self, surface: Any, direction: Any) -> None:
-        """Sets the heading through a point (3,) of the surface; its target is `INWARD` beyond it, as in training."""
-        surface, direction = vector("point", surface), vector("arrow's direction", direction)
-        self.set_heading(surface + INWARD * direction / max(1e-6, float(np.linalg.norm(direction))), direction)
+        self.arrow = arrow_through(surface, direction, self.arrow.cross)
 
     def set_roll(self, angle: float) -> None:
         """Sets the angle of the hand around the arrow, in rad; see `Arrow.roll`."""
@@ -149,27 +146,21 @@ class Studio:
     def paint(self, points: Any, radius: float, avoid: bool) -> None:
         """Adds the surface near points (N, 3) to the avoid region, or removes it; see `Canvas.brush`.
 
-        The affordance is requested while there is paint.
+        The constraint on the region is requested while there is paint.
         """
         self.canvas.brush(points, radius, avoid)
-        self._repainted()
+        self._switch(self._drawn_by("paint"), bool(self.canvas.avoid.any()))
 
     def fill(self, avoid: bool) -> None:
         """Paints everything, or removes all paint if `avoid` is False."""
         self.canvas.fill(avoid)
-        self._repainted()
+        self._switch(self._drawn_by("paint"), bool(self.canvas.avoid.any()))
 
     def close_hand(self) -> None:
         """Requests a reference pose: the hand at the arrow, closed around the object."""
-        require_known(["pose"], self.task)
-        self._close()
-        self._switch("pose", True)
-
-    def _close(self) -> None:
-        """Sets the pose of `close_hand`."""
-        arrow = (np.asarray(part, np.float32)[None] for part in self.arrow)
-        pose = closed_poses(self.hand, np.asarray(self.obj.points), np.asarray(self.obj.normals), *arrow)
-        self.pose = Poses(*(np.asarray(field)[0] for field in pose))
+        name = self._drawn_by("hand")
+        self._set(name, self._closed())
+        self._switch(name, True)
 
     def draw(self, points: Any) -> None:
         """Requests a wrist path through points (N, 3) of the object frame, from far to near.
@@ -177,25 +168,19 @@ class Studio:
         A displacement that grows along the path makes it end at the wrist of the reference pose, or of the hand closed
         at the arrow. The orientation of the wrist is that of the end throughout.
         """
-        require_known(["trajectory"], self.task)
-        drawn = np.asarray(points, float)
-        if drawn.ndim != 2 or drawn.shape[1:] != (3,) or not 2 <= len(drawn) <= 2000 or not np.isfinite(drawn).all():
-            raise CongraspError("A path must be 2 to 2000 points of three numbers.")
-        if np.abs(drawn).max() > LARGEST:
-            raise CongraspError(f"A path must be within {LARGEST:g} m of the object.")
+        name, drawn = self._drawn_by("path"), stroke("path", points)
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(drawn, axis=0), axis=-1))])
         if along[-1] < _LEAST_PATH:
             raise CongraspError(
                 f"The path is {100 * along[-1]:.1f} cm long.", f"Draw {100 * _LEAST_PATH:.0f} cm or more."
             )
-        if self.pose is None:
-            self._close()
-        assert self.pose is not None
+        poses = [self.fields[c.name] for c in known(self.task) if tool_of(c) == "hand" and c.name in self.fields]
+        end = poses[0] if poses else self._closed()
         share = np.linspace(0.0, 1.0, self.task.trajectory_points)
         even = np.stack([np.interp(share * along[-1], along, drawn[:, i]) for i in range(3)], -1)
-        position = even + share[:, None] * (self.pose.position - even[-1])
-        self.path = Path(position, np.tile(self.pose.quaternion, (len(share), 1)))
-        self._switch("trajectory", True)
+        position = even + share[:, None] * (end["position"] - even[-1])
+        self._set(name, {"position": position, "quaternion": np.tile(end["quaternion"], (len(share), 1))})
+        self._switch(name, True)
 
     def suggest(self, constraint: str) -> None:
         """Requests the next heading, reference pose or wrist path that training would draw for this object.
@@ -203,35 +188,35 @@ class Studio:
         Raises:
           CongraspError: there are none in this resting pose.
         """
-        if constraint not in self._next:
-            raise CongraspError(f"Nothing can be suggested for '{constraint}'.", "Choose heading, pose or trajectory.")
         require_known([constraint], self.task)
+        if tool_of(get_constraint(constraint)) in ("", "paint"):
+            placed = [c.name for c in known(self.task) if tool_of(c) not in ("", "paint")]
+            raise CongraspError(f"Nothing can be suggested for '{constraint}'.", f"Choose from: {', '.join(placed)}.")
         self._suggest(constraint)
         if get_constraint(constraint).optional:
             self._switch(constraint, True)
 
-    def _suggest(self, constraint: str) -> None:
-        """Sets the heading, pose or path of `suggest`."""
-        sets = self._constraint_sets().arrays
-        region = int("affordance" in self.asked and bool(self.canvas.avoid.any()))
-        allowed = sets["heading/allowed" if constraint == "heading" else "pose/allowed"][region, self.rest]
-        found = np.flatnonzero(allowed)
-        if not len(found):
+    def _suggest(self, name: str) -> None:
+        """Sets the goal arrays of `suggest`; those of a reference also for weaker constraints from references."""
+        sets, reference = self._constraint_sets().arrays, get_constraint(name).from_reference
+        same = [c.name for c in known(self.task) if c.from_reference == reference]
+        region = max((get_constraint(asked).region for asked in self.asked), default=0) * self.canvas.avoid.any()
+        allowed = next(sets[f"{other}/allowed"] for other in same if f"{other}/allowed" in sets)[region, self.rest]
+        slots = np.flatnonzero(allowed)
+        if not len(slots):
             raise CongraspError(
-                f"The table leaves no room for a {constraint} in this resting pose.",
+                f"The table leaves no room for a {name} in this resting pose.",
                 "Take another resting pose, or paint less.",
             )
-        pick = found[(self._next[constraint] * 7919) % len(found)]
-        self._next[constraint] += 1
-        at = (region, pick)
-        if constraint == "heading":
-            direction = sets["heading/direction"][at]
-            position = sets["heading/position"][at] - sets["heading/back"][region, self.rest, pick] * direction
-            self.set_heading(position, direction, sets["heading/cross"][at])
-            return
-        self.pose = Poses(*(sets[f"pose/{name}"][at] for name in Poses._fields))
-        if constraint == "trajectory":
-            self.path = Path(sets["trajectory/position"][at], sets["trajectory/quaternion"][at])
+        slot = slots[(self._suggested[name] * 7919) % len(slots)]
+        self._suggested[name] += 1
+        for other in same[: same.index(name) + 1]:
+            fields = {field: sets[f"{other}/{field}"][region, slot] for field in get_constraint(other).arrays}
+            if f"{other}/back" in sets:
+                fields["position"] = (
+                    fields["position"] - sets[f"{other}/back"][region, self.rest, slot] * fields["direction"]
+                )
+            self._set(other, fields)
 
     @property
     def labelled(self) -> GraspObject:
@@ -250,21 +235,22 @@ class Studio:
         return self._request()
 
     def _request(self) -> GraspRequest:
-        """The request, whether or not it is possible."""
-        given: dict[str, Mapping[str, np.ndarray]] = {"affordance": {}, **self.others}
-        given |= {name: part._asdict() for name, part in (("pose", self.pose), ("trajectory", self.path)) if part}
-        constraints: dict[str, Mapping[str, np.ndarray]] = {"heading": self.arrow._asdict()}
-        constraints |= {c.name: given[c.name] for c in optional(self.task) if c.name in self.asked}
-        avoid = self.canvas.avoid if "affordance" in self.asked else None
-        return GraspRequest(constraints, avoid, rest=self.rest)
+        """The request, possible or not."""
+        active = [c for c in known(self.task) if not c.optional or c.name in self.asked]
+        avoid = self.canvas.avoid if any(tool_of(c) == "paint" for c in active) else None
+        return GraspRequest({c.name: self.fields.get(c.name, {}) for c in active}, avoid, rest=self.rest)
+
+    @property
+    def goal(self) -> Goal:
+        """Goal arrays of the request before the priority rules, without batch axis."""
+        return goal_of(self.hand, self.task, self._request())
 
     @property
     def resolution(self) -> Resolution:
         """The request after the priority rules, without batch axes."""
         asked = {c.name: np.array([c.name in self.asked]) for c in optional(self.task)}
-        goal = jax.tree.map(lambda array: np.asarray(array)[None], goal_of(self.hand, self.task, self._request()))
-        surface = Surface(np.asarray(self.obj.points, np.float32)[None], self.canvas.avoid[None])
-        found = _resolve(self.hand, surface, goal, asked)
+        goal = jax.tree.map(lambda array: np.asarray(array)[None], self.goal)
+        found = _resolve(self.hand, self._surface, goal, asked)
         return Resolution(found.goal.row(0), np.asarray(found.redirected)[0], np.asarray(found.aligned)[0])
 
     @property
@@ -275,40 +261,56 @@ class Studio:
     @property
     def trouble(self) -> str:
         """Reason why the request is impossible, with a remedy; empty if it is possible."""
-        if "affordance" in self.asked and (self.canvas.avoid.all() or not self.canvas.avoid.any()):
-            what = "Everything is" if self.canvas.avoid.any() else "Nothing is"
-            return f"{what} painted as avoid region. Paint a part of the object with the brush."
-        for name in self.asked - {"affordance"}:
-            own = jax.tree.map(
-                lambda array: np.asarray(array)[None], goal_of(self.hand, self.task, self._request())[name]
-            )
-            if not get_constraint(name).valid(Surface(np.asarray(self.obj.points)[None], self.canvas.avoid[None]), own)[
-                0
-            ]:
-                return " ".join(get_constraint(name).invalid)
+        goal = jax.tree.map(lambda array: np.asarray(array)[None], self.goal)
+        asked = [c for c in optional(self.task) if c.name in self.asked]
+        for constraint in asked:
+            if tool_of(constraint) == "paint" and (self.canvas.avoid.all() or not self.canvas.avoid.any()):
+                what = "Everything is" if self.canvas.avoid.any() else "Nothing is"
+                return f"{what} painted as avoid region. Paint a part of the object with the brush."
+            if not constraint.valid(self._surface, goal[constraint.name])[0]:
+                return " ".join(constraint.invalid)
         found = self.resolution
         if not found.aligned:
             return "The wrist path ends nearer to the avoid region. Draw another path, or paint elsewhere."
-        heading = found.goal["heading"]
-        start = self._world(heading.position - BACK_OFF * heading.direction)
-        if "trajectory" not in self.asked and start[2] < 0:
-            return "The approach begins under the table. Turn the arrow so that it comes from above."
-        if "trajectory" in self.asked and min(self._world(p)[2] for p in found.goal["trajectory"].position) < 0:
+        paths = [found.goal[c.name].position for c in asked if tool_of(c) == "path"]
+        if any(self._world(point)[2] < 0 for path in paths for point in path):
             return "The wrist path goes through the table. Draw it higher, or take another suggestion."
+        heading = found.goal["heading"]
+        if not paths and self._world(heading.position - BACK_OFF * heading.direction)[2] < 0:
+            return "The approach begins under the table. Turn the arrow so that it comes from above."
         return ""
-
-    def _repainted(self) -> None:
-        """Requests the affordance if there is paint."""
-        self._switch("affordance", bool(self.canvas.avoid.any()))
-
-    def _switch(self, constraint: str, on: bool) -> None:
-        """Switches a constraint on or off."""
-        self.asked = self.asked | {constraint} if on else self.asked - {constraint}
 
     @property
     def up(self) -> np.ndarray:
         """(3,) unit, away from the table in the object frame."""
         return matrix(self.obj.rest_poses[self.rest][3:])[2]
+
+    @property
+    def _surface(self) -> Surface:
+        """The labelled surface, with a batch axis."""
+        return Surface(np.asarray(self.obj.points, np.float32)[None], self.canvas.avoid[None])
+
+    def _drawn_by(self, tool: Tool) -> str:
+        """Name of the constraint of a drawing tool; raises a CongraspError if the policy supports none."""
+        for constraint in known(self.task):
+            if tool_of(constraint) == tool:
+                return constraint.name
+        names = ", ".join(self.task.constraints)
+        raise CongraspError(f"The policy supports no constraint of the tool '{tool}'.", f"It supports {names}.")
+
+    def _closed(self) -> Fields:
+        """Reference pose of the hand at the arrow, closed around the object."""
+        arrow = (np.asarray(part, np.float32)[None] for part in self.arrow)
+        pose = closed_poses(self.hand, np.asarray(self.obj.points), np.asarray(self.obj.normals), *arrow)
+        return {name: np.asarray(field)[0] for name, field in pose._asdict().items()}
+
+    def _set(self, constraint: str, fields: Fields) -> None:
+        """Sets the goal arrays of a constraint."""
+        self.fields = {**self.fields, constraint: fields}
+
+    def _switch(self, constraint: str, on: bool) -> None:
+        """Switches a constraint on or off."""
+        self.asked = self.asked | {constraint} if on else self.asked - {constraint}
 
     def _constraint_sets(self) -> Message:
         """The constraint set of the object with its current paint, generated on demand."""
@@ -327,3 +329,67 @@ class Studio:
 def _resolve(hand: Hand, surface: Surface, goal: Goal, asked: dict[str, jax.Array]) -> Resolution:
     """`resolve`, compiled."""
     return resolve(hand, surface, goal, asked)
+
+
+ACTIONS = {
+    "set_rest_pose": "resting pose",
+    "ask": "constraint on or off",
+    "choose": "choice of flags",
+    "set_heading": "heading",
+    "set_roll": "roll",
+    "paint": "brush stroke",
+    "fill": "painting of everything",
+    "close_hand": "reference pose",
+    "draw": "wrist path",
+    "suggest": "suggestion",
+}
+"""Methods of `Studio` that a page may call, with their arguments by name, and their labels on the page."""
+
+
+class History:
+    """Makes edits and undoes them one by one; an edit that fails changes nothing."""
+
+    def __init__(self, studio: Studio):
+        """Begins without edits."""
+        self._studio = studio
+        self._done: list[tuple[str, Edit]] = []
+        self._undone: list[tuple[str, Edit]] = []
+        self._gesture: Any = None
+
+    def do(self, action: str, *, gesture: Any = None, **values: Any) -> None:
+        """Calls one of `ACTIONS`. Successive calls of one gesture, such as dragging a slider, are one edit.
+
+        Raises:
+          CongraspError: the action fails.
+        """
+        before = self._studio.edit
+        try:
+            getattr(self._studio, action)(**values)
+        except BaseException:
+            self._studio.edit = before
+            raise
+        if gesture is None or gesture != self._gesture:
+            self._done = [*self._done, (action, before)][-_MOST_EDITS:]
+        self._gesture = gesture
+        self._undone.clear()
+
+    def undo(self) -> None:
+        """Undoes the last edit, if there is one."""
+        self._swap(self._done, self._undone)
+
+    def redo(self) -> None:
+        """Repeats the edit that was undone last, if no other followed."""
+        self._swap(self._undone, self._done)
+
+    def view(self) -> dict[str, str]:
+        """Labels of the next undo and redo; empty if there is none."""
+        found = {"undo": self._done, "redo": self._undone}
+        return {name: ACTIONS[edits[-1][0]] if edits else "" for name, edits in found.items()}
+
+    def _swap(self, source: list[tuple[str, Edit]], target: list[tuple[str, Edit]]) -> None:
+        """Restores the last edit of `source`, and keeps the current one in `target`."""
+        self._gesture = None
+        if source:
+            action, edit = source.pop()
+            target.append((action, self._studio.edit))
+            self._studio.edit = edit

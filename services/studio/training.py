@@ -1,4 +1,4 @@
-"""State of a run while it trains: curves, events, the learner's counters, and every actor's newest episode.
+"""State of a run while it trains, and its recorded episodes: curves, events, counters, and newest episodes of actors.
 
 It accepts log messages and the learner's status from any receiver, and is independent of network and browser.
 """
@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from mcap.reader import make_reader
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.task.constraints import CONSTRAINTS
@@ -21,12 +22,19 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.ops import status as statuses
+from congrasp.services.ops.logs import log
 from congrasp.services.record.channels import flatten
 from congrasp.services.record.reader import Record, is_episode, log_files, metrics_of, read_records
+from congrasp.services.record.salvage import DAMAGE, intact_summary
+from congrasp.services.record.scene import EPISODE_SCHEMA
 from congrasp.services.viz.plots import figures
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows by default."""
+MOST = 60
+"""Maximum number of episodes of one search: those nearest to the time."""
+FARTHER = (1.0, 5.0, 25.0)
+"""Factors on the time searched, tried in turn until there is an episode."""
 _LAST = {"success": "episode/success", "steps_per_second": "steps_per_second"}
 _REPORTED = ("version", "rollouts", "steps_per_second")
 _READ = ("/metrics/", "/events/")
@@ -84,11 +92,12 @@ class TrainingWindow:
     Attributes:
       live: True if the run is followed; False if it is only read from its recordings.
       damaged: number of messages whose content did not match their key.
+      recordings: recorded episodes of the run, or None.
     """
 
-    def __init__(self, run: str):
+    def __init__(self, run: str, recordings: "Recordings | None" = None):
         """Begins without messages."""
-        self.run, self.live, self.damaged = run, False, 0
+        self.run, self.recordings, self.live, self.damaged = run, recordings, False, 0
         self._lock = threading.Lock()
         self._curves: dict[str, Curve] = {}
         self._actors: dict[str, Actor] = {}
@@ -126,15 +135,18 @@ class TrainingWindow:
                 if now - self._actors[name].seen > _STALE:
                     del self._actors[name]
 
-    def load(self, path: pathlib.Path) -> None:
-        """Reads curves and events from a run's recordings, and the last report and newest episode of every actor.
+    def load(self) -> None:
+        """Reads curves and events from the recordings, and the last report and newest episode of every actor.
 
-        Raises:
-          CongraspError: there are no recordings.
+        Logs a warning if they cannot be read.
         """
+        if self.recordings is None:
+            return
         self._loading = True
         try:
-            self._read(path)
+            self._read(self.recordings.path)
+        except CongraspError as error:
+            log("warning", str(error))
         finally:
             self._loading = False
 
@@ -291,8 +303,8 @@ def labels_of(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
 
 def _logged(record: Record) -> tuple[float, str, str]:
     """Time (seconds since 1970), level and text of a recorded event."""
-    log = Log.FromString(record.data)
-    return record.time / 1e9, Log.Level.Name(log.level).lower(), log.message
+    event = Log.FromString(record.data)
+    return record.time / 1e9, Log.Level.Name(event.level).lower(), event.message
 
 
 class Follower:
@@ -332,3 +344,110 @@ class Follower:
             self._window.take_status(found, time.time())
             if self._stop.wait(self._every):
                 return
+
+
+class Recordings:
+    """The episodes in a folder of recordings, found by their time.
+
+    Episodes of the last search stay in memory, for the player.
+    """
+
+    def __init__(self, path: pathlib.Path):
+        """Reads nothing until the first search, because files may appear and grow.
+
+        Raises:
+          CongraspError: there is no folder or recording of this name.
+        """
+        remedy = "Name a run's folder, or its recordings."
+        if not path.exists():
+            raise CongraspError(f"There is no file or folder {path}.", remedy)
+        if not path.is_dir() and ".mcap" not in path.suffixes:
+            raise CongraspError(f"{path} is no recording (*.mcap).", remedy)
+        self.path = path
+        self._lock = threading.Lock()
+        self._found: dict[str, Message] = {}
+
+    def around(self, time: float, seconds: float) -> tuple[float, list[dict[str, Any]]]:
+        """Episodes that were recorded around a time, in the order of their times.
+
+        Args:
+          time: seconds since 1970.
+          seconds: largest distance from it; the search widens by `FARTHER` while it finds none.
+
+        Returns:
+          The distance searched (s), and the list entry of each episode; its `id` is for `episode`.
+
+        Raises:
+          CongraspError: there are no recordings, or a file cannot be read.
+        """
+        files = log_files(self.path)
+        for farther in FARTHER:
+            begin, end = (int(1e9 * (time + sign * farther * seconds)) for sign in (-1, 1))
+            found = [item for file in files for item in _within(file, begin, end)]
+            if found:
+                break
+        found = sorted(found, key=lambda item: abs(item[0] - 1e9 * time))[:MOST]
+        kept = {f"{when}{topic}": decode(data) for when, topic, data in sorted(found, key=lambda item: item[0])}
+        with self._lock:
+            self._found = kept
+        return farther * seconds, [_recorded(key, message) for key, message in kept.items()]
+
+    def episode(self, key: str) -> Message:
+        """An episode of the last search.
+
+        Raises:
+          CongraspError: the last search did not find it.
+        """
+        with self._lock:
+            if key not in self._found:
+                raise CongraspError("This episode is not among those found last.", "Click the curve again.")
+            return self._found[key]
+
+
+def _recorded(key: str, message: Message) -> dict[str, Any]:
+    """List entry of an episode."""
+    time, _, topic = key.partition("/")
+    return {
+        "id": key,
+        "time": int(time) / 1e9,
+        "actor": topic.split("/")[1],
+        "object": message.meta.get("object"),
+        "version": message.meta.get("version"),
+        "success": bool(message.meta.get("success")),
+    }
+
+
+def _within(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, bytes]]:
+    """Time (ns), topic and bytes of a file's raw episodes between two times."""
+    if (found := _by_index(file, begin, end)) is not None:
+        return found
+    return [
+        (record.time, record.topic, record.data)
+        for record in read_records(file, is_episode)
+        if record.schema == EPISODE_SCHEMA and begin <= record.time <= end
+    ]
+
+
+def _by_index(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, bytes]] | None:
+    """Does the work of `_within` by the index of a finished file; None if it is unfinished, or damaged where read."""
+    try:
+        with file.open("rb") as stream:
+            if (summary := intact_summary(stream)) is None or (statistics := summary.statistics) is None:
+                return None
+            if statistics.message_start_time > end or statistics.message_end_time < begin:
+                return []
+            topics = [channel.topic for channel in summary.channels.values() if is_episode(channel.topic)]
+            messages = (
+                make_reader(stream, validate_crcs=True).iter_messages(topics, starting_at=begin, ending_before=end)
+                if topics
+                else ()
+            )
+            return [
+                (message.log_time, channel.topic, message.data)
+                for schema, channel, message in messages
+                if schema is not None and schema.name == EPISODE_SCHEMA
+            ]
+    except DAMAGE:
+        return None
+    except OSError as error:
+        raise CongraspError(f"{file} cannot be read: {error.strerror}.") from None

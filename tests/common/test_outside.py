@@ -226,12 +226,13 @@ def studio(task):
     """Its toggle."""
     from congrasp.common.hands import get_hand
     from congrasp.common.objects import procedural
-    from congrasp.services.studio.description import describe
+    from congrasp.services.studio.page import describe
     from congrasp.services.studio.state import Studio
 
     made = Studio(get_hand("human"), task, procedural.generate(0, "box"))
     made.choose("level", "wrist", [True])
-    assert {"name": "level", "title": "level hand", "flags": {"wrist": {"wrist": True}}} in describe(made)["others"]
+    row = {"name": "level", "title": "level hand", "tool": "", "flags": {"wrist": {"wrist": True}}}
+    assert row in describe(made)["constraints"]
     assert made.asked == {"level"} and made.request.constraints["level"]["wrist"].tolist() == [True]
 
 

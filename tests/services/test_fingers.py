@@ -26,9 +26,9 @@ from congrasp.services.grasp.parse import read_request
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import Example
 from congrasp.services.serve.requests import Layout
-from congrasp.services.studio import description
 from congrasp.services.studio.grasping import PolicyGrasping
-from congrasp.services.studio.lanes import for_page, lanes
+from congrasp.services.studio.page import describe as describe_request
+from congrasp.services.studio.page import for_page, lanes
 from congrasp.services.studio.state import Studio
 from congrasp.services.train.command import untrained
 from tests.exported_policies import difference
@@ -93,11 +93,7 @@ def test_the_studio_refuses_it_in_one_line() -> None:
         studio.ask("fingers", True)
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
         studio.choose("fingers", "allowed", PINCH.tolist())
-    assert (
-        studio.asked == set()
-        and description.describe(studio)["others"] == []
-        and "fingers" not in description.describe(studio)["known"]
-    )
+    assert studio.asked == set() and [row["name"] for row in describe_request(studio)["constraints"]] == list(PAPER)
 
 
 def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
@@ -187,13 +183,13 @@ def test_queries_for_a_force_limit_are_answered_and_checked(ask) -> None:
 def test_the_studio_has_its_toggles(policy: PolicyBundle) -> None:
     studio = Studio(HAND, TASK, MUG)
     flags = dict(zip(HAND.fingers, PINCH.tolist(), strict=True))
-    shown = {"name": "fingers", "title": "fingers", "flags": {"allowed": flags}}
-    assert description.describe(studio)["others"][0] == shown
+    shown = {"name": "fingers", "title": "fingers", "tool": "", "flags": {"allowed": flags}}
+    assert describe_request(studio)["constraints"][4] == shown
     studio.ask("fingers", True)
-    assert description.describe(studio)["active"]["masks"]["fingers"] and studio.trouble == ""
+    assert describe_request(studio)["active"]["masks"]["fingers"] and studio.trouble == ""
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), PINCH)
     studio.choose("fingers", "allowed", [True, True, True, False, False])
-    assert json.loads(json.dumps(description.describe(studio)))["others"][0]["flags"]["allowed"]["middle"]
+    assert json.loads(json.dumps(describe_request(studio)))["constraints"][4]["flags"]["allowed"]["middle"]
     np.testing.assert_array_equal(studio.request.given("fingers", "allowed"), [1, 1, 1, 0, 0])
     studio.choose("fingers", "allowed", [True, False, False, False, False])
     assert studio.trouble == "The constraint 'fingers' needs the thumb and another finger. Allow both."
@@ -237,8 +233,8 @@ def test_its_block_is_described_in_the_exported_policy(policy: PolicyBundle, tmp
 def test_the_studio_has_a_box_for_a_force_limit() -> None:
     studio = Studio(HAND, TASK, MUG)
     studio.ask("force", True)
-    assert {"name": "force", "title": "force limit", "flags": {}} in json.loads(
-        json.dumps(description.describe(studio)["others"])
+    assert {"name": "force", "title": "force limit", "tool": "", "flags": {}} in json.loads(
+        json.dumps(describe_request(studio)["constraints"])
     )
     assert studio.request.given("force", "limit") == 5.0 and studio.trouble == ""
     with pytest.raises(CongraspError, match="nothing to choose for 'force'"):

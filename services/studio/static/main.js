@@ -1,13 +1,16 @@
 // Joins scene, tools, player and panels.
 
-import { Camera } from "./camera.js";
-import { Renderer } from "./gl.js";
+import { Body } from "./body.js";
+import { OrbitCamera } from "./camera.js";
+import { Skin } from "./hand.js";
+import { Picture } from "./picture.js";
 import { Player } from "./player.js";
-import { Scene } from "./scene.js";
+import { Editing, Stage } from "./scene.js";
 import { StudioPanel } from "./studio.js";
-import { onTheme, rgb } from "./theme.js";
+import { onTheme } from "./theme.js";
 import { Tools } from "./tools.js";
 import { TrainingPanel } from "./training.js";
+import { Box3, Ray, Vector3 } from "./vendor/three.module.min.js";
 import { ask, fetchMessage } from "./wire.js";
 
 const $ = (id) => document.getElementById(id);
@@ -16,9 +19,12 @@ const SLOWEST = 34; // ms between two frames while something moves
 class App {
   constructor() {
     this.canvas = $("scene");
-    this.camera = new Camera();
-    this.renderer = new Renderer(this.canvas);
-    this.scene = new Scene(this.renderer);
+    this.camera = new OrbitCamera();
+    this.picture = new Picture(this.canvas);
+    this.stage = new Stage();
+    this.editing = new Editing();
+    this.stage.add(this.editing);
+    this.skins = new Map(); // by hand
     this.edited = null; // the studio's state
     this.drawn = [];
     this.tools = new Tools(this);
@@ -38,7 +44,7 @@ class App {
   }
 
   get body() {
-    return this.scene.body;
+    return this.editing.body;
   }
 
   act(action, values) {
@@ -47,30 +53,29 @@ class App {
 
   async start() {
     const state = await ask("api/state");
-    await Promise.all([this.hand(state.studio.hand), this.#object(state)]);
     await this.panel.show(state);
-    this.#frameAll(state.studio);
     $("show-training").hidden = !state.training;
     if (new URLSearchParams(location.search).get("view") === "training" && state.training) this.view("training");
     this.redraw();
   }
 
   // Looks at the object and at the hand above it.
-  #frameAll({ rest, start }) {
-    const points = [rest.position, ...start.position];
-    const low = [0, 1, 2].map((i) => Math.min(...points.map((point) => point[i])) - this.body.radius * (i < 2 ? 0.4 : 0));
-    const high = [0, 1, 2].map((i) => Math.max(...points.map((point) => point[i])) + this.body.radius * (i < 2 ? 0.4 : 0));
-    this.camera.frame(low.map((x, i) => (x + high[i]) / 2), 0.06 + 0.42 * Math.hypot(...low.map((x, i) => high[i] - x)));
+  #frameAll() {
+    const { object, hand } = this.editing;
+    const reach = new Vector3(0.4, 0.4, 0).multiplyScalar(this.body.radius);
+    const seen = new Box3().setFromPoints([object.position, ...hand.bones.map((bone) => bone.position)]).expandByVector(reach);
+    this.camera.frame(seen.getCenter(new Vector3()), 0.06 + 0.42 * seen.getSize(new Vector3()).length());
   }
 
-  // Resolves when a hand can be drawn.
-  async hand(name) {
-    if (!this.scene.hands.has(name)) this.scene.setHand(name, await fetchMessage("api/hand", { name }));
+  // The surface of a hand.
+  async skin(name) {
+    if (!this.skins.has(name)) this.skins.set(name, new Skin(await fetchMessage("api/hand", { name })));
+    return this.skins.get(name);
   }
 
   async #object({ studio, shown }) {
     const [mesh, paint] = await Promise.all([fetchMessage("api/object"), fetchMessage("api/paint")]);
-    this.scene.setObject(mesh.arrays.vertices.data, mesh.arrays.faces.data, mesh.arrays.colours?.data);
+    this.editing.setBody(new Body(mesh.arrays.vertices.data, mesh.arrays.faces.data, mesh.arrays.colours?.data));
     this.body.paint(paint.arrays.avoid.data);
     this.shownObject = shown;
     this.shownPaint = studio.painted;
@@ -79,16 +84,20 @@ class App {
   // The studio's state after something was done.
   async takeState(state) {
     const { studio } = state;
-    if (this.edited && this.edited.hand !== studio.hand) await this.hand(studio.hand);
-    if (state.shown !== this.shownObject) {
+    const other = state.shown !== this.shownObject;
+    const skin = await this.skin(studio.hand);
+    if (other) {
       await this.#object(state);
       if (this.player.motion) this.player.close();
-      this.#frameAll(studio);
     } else if (studio.painted !== this.shownPaint) {
       this.shownPaint = studio.painted;
       await this.repaint();
     }
-    this.edited = studio;
+    if (this.edited?.hand !== studio.hand) this.editing.setSkin(skin);
+    const { position, direction } = studio.arrow;
+    this.edited = { ...studio, arrow: new Ray(new Vector3(...position), new Vector3(...direction)) };
+    this.editing.take(studio);
+    if (other) this.#frameAll();
     this.redraw();
   }
 
@@ -110,15 +119,16 @@ class App {
   // The player shows a motion.
   shown(motion) {
     $("tools").hidden = $("hint").hidden = true;
-    this.looked ??= { target: this.camera.target, distance: this.camera.distance };
-    this.camera.target = [motion.center[0], motion.center[1], motion.center[2] + 0.04];
+    this.looked ??= { target: this.camera.target.clone(), distance: this.camera.distance };
+    this.camera.target.copy(motion.center).z += 0.04;
     this.camera.distance = Math.min(this.camera.distance, 0.8);
     this.panel.mark();
   }
 
   // The player has closed: the constraints are seen as before.
   closed() {
-    Object.assign(this.camera, this.looked);
+    this.camera.target.copy(this.looked.target);
+    this.camera.distance = this.looked.distance;
     this.looked = null;
     $("tools").hidden = $("hint").hidden = false;
     this.panel.mark();
@@ -143,27 +153,24 @@ class App {
     this.asked = 0;
     if (this.player.tick(now)) this.redraw();
     const moving = this.player.playing && now - (this.before ?? 0) < 200;
-    if (moving) this.renderer.pace(now - this.before, SLOWEST);
+    if (moving) this.picture.pace(now - this.before, SLOWEST);
     this.before = now;
-    const views = this.#views();
-    for (const view of views) {
-      this.camera.aspect = ((view.width ?? 1) * this.canvas.clientWidth) / Math.max(1, this.canvas.clientHeight);
-      view.matrix = this.camera.matrix;
-    }
-    this.renderer.draw(views, rgb("--stage"), moving);
+    this.picture.draw(this.stage, this.camera, this.#parts(), moving);
     this.drawn.push(now);
     if (this.edited && !document.body.dataset.firstPicture) document.body.dataset.firstPicture = Math.round(performance.now());
   }
 
-  #views() {
-    if (this.player.motion) return this.player.views();
-    if (!this.edited) return [];
-    this.camera.aspect = this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight);
+  // Groups of the stage that each part of the canvas shows.
+  #parts() {
+    if (this.player.motion) return this.player.parts();
+    if (!this.edited) return [[]];
+    this.camera.shape(this.canvas.clientWidth / Math.max(1, this.canvas.clientHeight));
     const arrow = this.tools.shown();
-    const handles = this.tools.handles(arrow);
-    const ends = Object.entries(handles.points).map(([name, point]) => [name, this.camera.project(point)]);
-    this.canvas.dataset.handles = JSON.stringify(Object.fromEntries(ends)); // for who operates the page without eyes
-    return [{ things: this.scene.editing(this.edited, arrow, handles, this.tools.brush) }];
+    const ends = this.tools.ends(arrow);
+    const places = Object.entries(ends).map(([name, point]) => [name, this.camera.locate(this.body.localToWorld(point.clone()))]);
+    this.canvas.dataset.handles = JSON.stringify(Object.fromEntries(places)); // for programs that operate the page
+    this.editing.frame(arrow, ends, this.tools.hover, this.tools.brush);
+    return [[this.editing]];
   }
 
   #count() {

@@ -1,57 +1,68 @@
 // A recorded motion: its frame at a time, between two steps too.
 
-import { blend, mix, norm } from "./math.js";
+import { Quaternion, Vector3 } from "./vendor/three.module.min.js";
 
-
-function rows({ shape, data }) {
-  const width = shape[shape.length - 1];
-  const pick = (i) => Array.from(data.subarray(i * width, (i + 1) * width));
-  if (shape.length === 2) return Array.from({ length: shape[0] }, (_, i) => pick(i));
-  return Array.from({ length: shape[0] }, (_, t) => Array.from({ length: shape[1] }, (_, k) => pick(t * shape[1] + k)));
+// Points of rows x y z, or of all their numbers in one row.
+function points(rows) {
+  const numbers = Array.from(rows).flat();
+  return Array.from({ length: numbers.length / 3 }, (_, i) => new Vector3().fromArray(numbers, 3 * i));
 }
 
-// Markers of one kind: their arrays are named KIND/CONSTRAINT/FIELD.
-function markers(arrays, kind, make) {
-  const found = {};
-  for (const [name, array] of Object.entries(arrays)) {
-    const [which, constraint, field] = name.split("/");
-    if (which === kind) (found[constraint] ??= {})[field] = array;
-  }
-  return Object.values(found).map(make);
+// Poses of positions x y z and quaternions w x y z; the same.
+export function poses({ position, quaternion }) {
+  const q = Array.from(quaternion).flat();
+  return points(position).map((place, i) => ({
+    position: place, quaternion: new Quaternion(q[4 * i + 1], q[4 * i + 2], q[4 * i + 3], q[4 * i]),
+  }));
+}
+
+// A constraint's marker as the server describes it; a ghost has poses of links.
+export function marker({ kind, tip, direction, points: line, position, quaternion }) {
+  return {
+    kind, tip: tip && points(tip)[0], direction: direction && points(direction)[0], points: line && points(line),
+    links: position && poses({ position, quaternion }),
+  };
+}
+
+function between(before, after, share) {
+  return { position: before.position.clone().lerp(after.position, share), quaternion: before.quaternion.clone().slerp(after.quaternion, share) };
+}
+
+// Rows of a list, as many in each as a step has.
+function steps(list, count) {
+  const width = list.length / count;
+  return Array.from({ length: count }, (_, t) => list.slice(t * width, (t + 1) * width));
 }
 
 export class Motion {
   constructor(id, { arrays, meta }) {
+    const data = (name) => arrays[name].data;
     this.id = id;
     this.meta = meta;
     this.hand = meta.hand;
     this.dt = meta.control_dt;
-    this.vertices = arrays.visual_vertices.data;
-    this.faces = arrays.visual_faces.data;
+    this.vertices = data("visual_vertices");
+    this.faces = data("visual_faces");
     this.colours = arrays.visual_colours?.data;
-    this.positions = rows(arrays.link_position);
-    this.quaternions = rows(arrays.link_quaternion);
-    this.objects = rows(arrays.object_position);
-    this.turns = rows(arrays.object_quaternion);
-    this.forces = rows(arrays.contact_force);
-    this.table = arrays.table.data;
-    this.steps = this.objects.length;
-    this.center = this.objects[0];
-    this.arrows = markers(arrays, "arrow", ({ tip, direction }) => ({ tip: Array.from(tip.data), direction: Array.from(direction.data) }));
-    this.paths = markers(arrays, "polyline", ({ points }) => rows(points));
-    this.ghosts = markers(arrays, "ghost", ({ position, quaternion }) => ({ position: rows(position), quaternion: rows(quaternion) }));
-    this.avoid = markers(arrays, "paint", () => this.#labels(arrays))[0] ?? null;
+    this.table = data("table");
+    this.steps = this.table.length;
+    this.links = steps(poses({ position: data("link_position"), quaternion: data("link_quaternion") }), this.steps);
+    this.objects = poses({ position: data("object_position"), quaternion: data("object_quaternion") });
+    this.forces = steps(points(data("contact_force")), this.steps);
+    this.center = this.objects[0].position;
+    this.markers = this.#markers(arrays);
+    this.avoid = this.markers.some(({ kind }) => kind === "paint") ? this.#labels(arrays) : null;
     this.rewards = {};
     for (const [name, { data }] of Object.entries(arrays)) if (name.startsWith("reward/")) this.rewards[name.slice(7)] = data;
     this.lanes = Object.entries(meta.lanes).map(([name, legend]) => {
       const errors = {};
       for (const key of Object.keys(arrays)) {
         const [, lane, unit] = key.match(/^lane\/([^/]+)\/(.+)$/) ?? [];
-        if (lane === name && unit !== "met" && unit !== "counts") errors[unit] = arrays[key].data;
+        if (lane === name && unit !== "met" && unit !== "counts") errors[unit] = data(key);
       }
-      return { name, legend, errors, met: arrays[`lane/${name}/met`].data, counts: arrays[`lane/${name}/counts`].data };
+      return { name, legend, errors, met: data(`lane/${name}/met`), counts: data(`lane/${name}/counts`) };
     });
-    this.totalForce = this.forces.map((links) => links.reduce((sum, force) => sum + norm(force), 0));
+    this.totalForce = this.forces.map((links) => links.reduce((sum, force) => sum + force.length(), 0));
     this.totalReward = this.forces.map((_, t) => Object.values(this.rewards).reduce((sum, term) => sum + term[t], 0));
   }
 
@@ -59,22 +70,28 @@ export class Motion {
     return (this.steps - 1) * this.dt;
   }
 
+  // Markers of the constraints: their arrays are named KIND/CONSTRAINT/FIELD.
+  #markers(arrays) {
+    const found = {};
+    for (const [name, { data }] of Object.entries(arrays)) {
+      const [kind, constraint, field] = name.split("/");
+      if (["arrow", "polyline", "ghost", "paint"].includes(kind)) (found[`${kind}/${constraint}`] ??= { kind })[field] = data;
+    }
+    return Object.values(found).map(marker);
+  }
+
   // Each vertex has the label of the surface point nearest to it.
   #labels(arrays) {
-    const { data: points } = arrays.surface_points;
+    const surface = points(arrays.surface_points.data);
     const { data: avoid } = arrays.surface_avoid;
-    const labels = new Uint8Array(this.vertices.length / 3);
-    for (let v = 0; v < labels.length; v++) {
-      let nearest = Infinity;
-      for (let p = 0; p < avoid.length; p++) {
-        const x = points[3 * p] - this.vertices[3 * v];
-        const y = points[3 * p + 1] - this.vertices[3 * v + 1];
-        const z = points[3 * p + 2] - this.vertices[3 * v + 2];
-        const far = x * x + y * y + z * z;
-        if (far < nearest) [nearest, labels[v]] = [far, avoid[p]];
-      }
-    }
-    return labels;
+    return points(this.vertices).map((vertex) => {
+      let [nearest, label] = [Infinity, 0];
+      surface.forEach((point, i) => {
+        const far = point.distanceToSquared(vertex);
+        if (far < nearest) [nearest, label] = [far, avoid[i]];
+      });
+      return label;
+    });
   }
 
   step(time) {
@@ -83,14 +100,11 @@ export class Motion {
 
   at(time) {
     const exact = Math.min(Math.max(time / this.dt, 0), this.steps - 1);
-    const before = Math.min(Math.floor(exact), this.steps - 1);
+    const before = Math.floor(exact);
     const after = Math.min(before + 1, this.steps - 1);
-    const share = exact - before;
-    const between = (list, how) => list[before].map((row, i) => how(row, list[after][i], share));
     return {
-      step: this.step(time),
-      links: { position: between(this.positions, mix), quaternion: between(this.quaternions, blend) },
-      object: { position: mix(this.objects[before], this.objects[after], share), quaternion: blend(this.turns[before], this.turns[after], share) },
+      links: this.links[before].map((link, i) => between(link, this.links[after][i], exact - before)),
+      object: between(this.objects[before], this.objects[after], exact - before),
       forces: this.forces[this.step(time)],
       table: this.table[before] > 0,
     };

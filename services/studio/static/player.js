@@ -1,7 +1,7 @@
 // Plays a motion, or two of them side by side or one over the other.
 
 import { Motion } from "./motion.js";
-import { Body } from "./scene.js";
+import { Playing } from "./scene.js";
 import { Timeline } from "./timeline.js";
 import { fetchMessage } from "./wire.js";
 
@@ -9,10 +9,10 @@ const $ = (id) => document.getElementById(id);
 const READABLE = 200; // ms between two changes of the numbers while a motion plays
 
 export class Player {
-  // `app` has: scene, renderer, camera, hand(name), redraw(), shown(), closed().
+  // `app` has: stage, camera, skin(name), redraw(), shown(), closed().
   constructor(app) {
     this.app = app;
-    this.slots = []; // {motion, body, name}: the motion that is played, and one that it is compared with
+    this.slots = []; // {motion, playing, name}: the motion that is played, and one that it is compared with
     this.time = 0;
     this.playing = false;
     this.wanted = 0; // number of the last request to play: what comes for an earlier one is too late
@@ -57,7 +57,7 @@ export class Player {
   async play(id, name = "") {
     const slot = await this.#load(id, name, 0);
     if (!slot) return;
-    this.slots.splice(0).forEach(({ body }) => body.release());
+    this.slots.splice(0).forEach(({ playing }) => playing.release());
     this.slots.push(slot);
     $("player").hidden = false;
     this.#show();
@@ -68,14 +68,14 @@ export class Player {
     if (!this.motion) return this.play(id, name);
     const slot = await this.#load(id, name, 1);
     if (!slot) return;
-    this.slots.splice(1).forEach(({ body }) => body.release());
+    this.slots.splice(1).forEach(({ playing }) => playing.release());
     this.slots.push(slot);
     this.#show();
   }
 
   close() {
     this.wanted++;
-    this.slots.splice(0).forEach(({ body }) => body.release());
+    this.slots.splice(0).forEach(({ playing }) => playing.release());
     this.playing = false;
     $("player").hidden = $("now").hidden = $("banner").hidden = $("names").hidden = true;
     this.app.closed();
@@ -109,12 +109,11 @@ export class Player {
     return true;
   }
 
-  // What is seen: for each view its things, and its part of the canvas as shares of the width.
-  views() {
-    const { scene } = this.app;
-    const things = this.slots.map((slot, i) => scene.playing(slot, slot.motion.at(this.time), i, i > 0 && !this.beside));
-    if (this.beside) return things.map((list, i) => ({ things: list, left: i / 2, width: 1 / 2 }));
-    return [{ things: things.flat() }];
+  // Groups of the stage that each part of the canvas shows.
+  parts() {
+    this.slots.forEach(({ playing }) => playing.seek(this.time));
+    const groups = this.slots.map(({ playing }) => playing);
+    return this.beside ? groups.map((group) => [group]) : [groups];
   }
 
   // The motion with what it needs to be drawn; null if something else was asked for meanwhile, or it cannot be had.
@@ -122,11 +121,11 @@ export class Player {
     const number = ++this.wanted;
     try {
       const motion = new Motion(id, await fetchMessage("api/motion", { id }));
-      await this.app.hand(motion.hand);
+      const skin = await this.app.skin(motion.hand);
       if (number !== this.wanted) return null;
-      const body = new Body(this.app.renderer, motion.vertices, motion.faces, motion.colours);
-      body.paint(motion.avoid);
-      return { motion, body, name: name || motion.meta.object };
+      const playing = new Playing(motion, skin);
+      this.app.stage.add(playing);
+      return { motion, playing, name: name || motion.meta.object };
     } catch (error) {
       if (number === this.wanted) this.app.error(error.message);
       return null;
@@ -155,6 +154,7 @@ export class Player {
   }
 
   #names() {
+    this.slots.forEach(({ playing }, i) => (playing.behind = i > 0 && !this.beside));
     $("names").hidden = this.slots.length < 2;
     $("names").dataset.layout = $("layout").value;
     const texts = this.slots.map(({ name }, i) => (i && !this.beside ? `${name} (faint)` : name));

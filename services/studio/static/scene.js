@@ -1,18 +1,20 @@
-// What is seen: hand, object, constraints and contacts, as things for the renderer.
+// Everything that is seen: hand, object, constraints and contacts.
 
-import { add, cross, dot, multiply, norm, pose, rotate, scale, sub, toWorld, unit, perpendicular, IDENTITY } from "./math.js";
-import * as shapes from "./shapes.js";
-import { Skin } from "./skin.js";
-import { rgb } from "./theme.js";
+import {
+  Color, CylinderGeometry, DirectionalLight, DoubleSide, EqualStencilFunc, Group, HemisphereLight, IncrementStencilOp,
+  LatheGeometry, LessDepth, LessEqualDepth, Mesh, MeshBasicMaterial, MeshLambertMaterial, ReplaceStencilOp, RingGeometry,
+  Scene, SphereGeometry, TorusGeometry, Vector2, Vector3,
+} from "./vendor/three.module.min.js";
+import { AVOID, Body } from "./body.js";
+import { Hand } from "./hand.js";
+import { marker, poses } from "./motion.js";
+import { colour } from "./theme.js";
 
-const OBJECT = [0.95, 0.64, 0.28];
-const AVOID = [0.8, 0.22, 0.22];
-const TOUCHING = [0.13, 0.74, 0.63];
-const HEADING = [0.22, 0.4, 0.86];
-const COUNTS = [0.1, 0.62, 0.85];
-const PATH = [0.53, 0.3, 0.75];
-const FORCE = [0.98, 0.8, 0.12];
-const GHOST = [0.22, 0.4, 0.86];
+const HEADING = new Color(0.22, 0.4, 0.86);
+const HOVERED = new Color(1, 0.8, 0.2);
+const COUNTS = new Color(0.1, 0.62, 0.85);
+const PATH = new Color(0.53, 0.3, 0.75);
+const FORCE = new Color(0.98, 0.8, 0.12);
 
 export const ARROW = 0.1; // length of the approach arrow, m
 const FULL = 2; // N at which a link has most of its colour
@@ -20,209 +22,267 @@ const LEAST = 0.05; // N from which a force is drawn
 const FORCE_LENGTH = 0.015; // m per newton
 const LONGEST = 0.09; // m
 const TABLE = 0.3; // m
-const HINT = 0.55; // share of its colour that a brush shows before it paints
-const BEHIND = 0.4; // opacity of a motion that another is laid over
+const RING = 0.05; // m between two lines of the table
+const LINE = 0.0006; // m
+const KEY = new Vector3(0.35, -0.5, 0.8); // towards the light that casts shadows
+const SHADE = 0.2; // of a shadow
+const OVERRULED = 0.45; // opacities
+const GHOST = 0.4;
+const BEHIND = 0.4; // of a motion that another is laid over
 
-// The matrix that lays a mesh along +z onto a line from a point.
-function along(start, direction, stretch = 1) {
-  const x = perpendicular(direction);
-  const y = cross(direction, x);
-  return [...x, 0, ...y, 0, ...scale(direction, stretch), 0, ...start, 1];
+const FORWARD = new Vector3(0, 0, 1); // of the shapes below, which have the length 1
+const SHAFT = arrow(0.0028, 0.168);
+const PUSH = arrow(0.0027, 0.18);
+const ROD = new CylinderGeometry(0.0012, 0.0012, 1, 12).translate(0, 0.5, 0).rotateX(Math.PI / 2);
+const BEAD = new SphereGeometry(0.0035, 20, 12);
+const BALL = new SphereGeometry(0.006, 20, 12);
+
+// An arrow whose head is a share of its length.
+function arrow(radius, head) {
+  const sharp = [[radius, 0], [radius, 1 - head], [2.5 * radius, 1 - head]].flatMap((point) => [point, point]);
+  return new LatheGeometry([[0, 0], ...sharp, [0, 1]].map((point) => new Vector2(...point)), 20).rotateX(Math.PI / 2);
 }
 
-// An object's mesh for drawing, painting and picking; `own` are three bytes of colour for each vertex, if it has any.
-export class Body {
-  constructor(renderer, vertices, faces, own = null) {
-    this.renderer = renderer;
-    this.vertices = vertices;
-    this.faces = faces;
-    const mesh = shapes.smooth(vertices, faces);
-    this.points = mesh.positions;
-    this.vertex = mesh.vertex;
-    this.colours = mesh.colours;
-    this.bare = new Float32Array(this.colours.length); // without paint
-    mesh.vertex.forEach((vertex, i) => this.bare.set(own ? [0, 1, 2].map((k) => own[3 * vertex + k] / 255) : OBJECT, 3 * i));
-    this.normals = mesh.normals;
-    this.mesh = renderer.mesh(mesh);
-    this.paint(null);
-    this.radius = 0;
-    for (let i = 0; i < vertices.length; i += 3) this.radius = Math.max(this.radius, Math.hypot(vertices[i], vertices[i + 1], vertices[i + 2]));
-  }
+function fade(material, opacity) {
+  return Object.assign(material, { opacity, transparent: opacity < 1, depthWrite: opacity === 1, needsUpdate: true });
+}
 
-  // Colours by a label for each vertex; all alike without labels.
-  paint(avoid) {
-    this.vertex.forEach((vertex, i) => this.#colour(this.colours, 3 * i, Boolean(avoid?.[vertex])));
-    this.renderer.recolour(this.mesh, this.colours);
-  }
+function lit(color, opacity = 1) {
+  return fade(new MeshLambertMaterial({ color }), opacity);
+}
 
-  // Shows what a brush at a point of the object frame would paint; nothing without a point.
-  preview(point, radius, avoid) {
-    if (!point && !this.previewed) return;
-    this.previewed = Boolean(point);
-    const colours = point ? this.colours.slice() : this.colours;
-    if (point) this.#within(point, radius, (i) => this.#colour(colours, i, avoid, HINT));
-    this.renderer.recolour(this.mesh, colours);
-  }
+// Of shadows, which darken each place of the table once.
+function shade() {
+  const once = { stencilWrite: true, stencilRef: 1, stencilFunc: EqualStencilFunc, stencilZPass: IncrementStencilOp };
+  return new MeshBasicMaterial({ color: 0, opacity: SHADE, transparent: true, depthWrite: false, side: DoubleSide, forceSinglePass: true, ...once });
+}
 
-  // Moves the colour at a place of an array by a share towards the paint, or what is below it.
-  #colour(colours, i, avoid, share = 1) {
-    for (let k = 0; k < 3; k++) colours[i + k] += share * ((avoid ? AVOID[k] : this.bare[i + k]) - colours[i + k]);
-  }
+// Lays a shape onto a line from a point.
+function along(part, start, direction, length) {
+  part.position.copy(start);
+  part.quaternion.setFromUnitVectors(FORWARD, direction);
+  part.scale.z = length;
+  return part;
+}
 
-  #within(point, radius, act) {
-    for (let i = 0; i < this.points.length; i += 3) {
-      const [x, y, z] = [this.points[i] - point[0], this.points[i + 1] - point[1], this.points[i + 2] - point[2]];
-      if (x * x + y * y + z * z <= radius * radius) act(i);
+function approach(part, tip, direction) {
+  return along(part, tip.clone().addScaledVector(direction, -ARROW), direction, ARROW);
+}
+
+// Shapes of the constraints' markers, in the object frame, by kind; paint is part of the body.
+const MARKERS = {
+  arrow: ({ tip, direction }, skin, opacity) => approach(new Mesh(SHAFT, lit(HEADING, opacity)), tip, direction),
+  polyline: ({ points }, skin, opacity) => {
+    const [string, material] = [new Group(), lit(PATH, opacity)];
+    points.forEach((point, i) => {
+      const bead = new Mesh(BEAD, material);
+      bead.position.copy(point);
+      if (i === points.length - 1) bead.scale.setScalar(1.6);
+      string.add(bead);
+      const step = points[i - 1]?.clone().sub(point);
+      if (step) string.add(along(new Mesh(ROD, material), point, step.clone().normalize(), step.length()));
+    });
+    return string;
+  },
+  ghost: ({ links }, skin) => {
+    const hidden = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 8 }; // where the hand has its pose
+    const hand = new Hand(skin, Object.assign(lit(HEADING, GHOST), hidden));
+    hand.follow(links);
+    return hand;
+  },
+};
+
+function marked(markers, skin, opacity) {
+  const group = new Group();
+  for (const marker of markers) if (marker.kind in MARKERS) group.add(MARKERS[marker.kind](marker, skin, opacity));
+  return group;
+}
+
+// Frees what a part of the scene holds on the graphics card.
+function release(part) {
+  part?.removeFromParent();
+  part?.traverse(({ geometry, material, skeleton }) => [geometry, material, skeleton].forEach((held) => held?.dispose()));
+}
+
+// A round table top at height zero with lines that show its scale.
+class Table extends Group {
+  constructor() {
+    super();
+    const ground = { stencilWrite: true, stencilRef: 1, stencilZPass: ReplaceStencilOp };
+    this.top = new MeshBasicMaterial(ground);
+    this.line = new MeshBasicMaterial(ground);
+    for (let outer = RING; outer < TABLE + 1e-9; outer += RING) {
+      const inner = outer - LINE;
+      this.add(new Mesh(new RingGeometry(outer - RING, inner, 96), this.top), new Mesh(new RingGeometry(inner, outer, 96), this.line));
     }
   }
 
-  // Colours what a brush at a point of the object frame touches, until the server's answer is there.
-  brush(point, radius, avoid) {
-    this.#within(point, radius, (i) => this.#colour(this.colours, i, avoid));
-    this.renderer.recolour(this.mesh, this.colours);
+  at({ x, y }) {
+    this.position.set(x, y, 0);
   }
 
-  // Where a ray of the object frame meets the surface first: {point, normal}, or null.
-  hit(origin, direction) {
-    let nearest = Infinity;
-    let normal = null;
-    const { vertices: v, faces } = this;
-    for (let f = 0; f < faces.length; f += 3) {
-      const [a, b, c] = [3 * faces[f], 3 * faces[f + 1], 3 * faces[f + 2]];
-      const e1x = v[b] - v[a], e1y = v[b + 1] - v[a + 1], e1z = v[b + 2] - v[a + 2];
-      const e2x = v[c] - v[a], e2y = v[c + 1] - v[a + 1], e2z = v[c + 2] - v[a + 2];
-      const px = direction[1] * e2z - direction[2] * e2y;
-      const py = direction[2] * e2x - direction[0] * e2z;
-      const pz = direction[0] * e2y - direction[1] * e2x;
-      const determinant = e1x * px + e1y * py + e1z * pz;
-      if (Math.abs(determinant) < 1e-14) continue;
-      const tx = origin[0] - v[a], ty = origin[1] - v[a + 1], tz = origin[2] - v[a + 2];
-      const u = (tx * px + ty * py + tz * pz) / determinant;
-      if (u < 0 || u > 1) continue;
-      const qx = ty * e1z - tz * e1y, qy = tz * e1x - tx * e1z, qz = tx * e1y - ty * e1x;
-      const w = (direction[0] * qx + direction[1] * qy + direction[2] * qz) / determinant;
-      if (w < 0 || u + w > 1) continue;
-      const far = (e2x * qx + e2y * qy + e2z * qz) / determinant;
-      if (far > 1e-6 && far < nearest) {
-        nearest = far;
-        normal = unit([e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, e1x * e2y - e1y * e2x]);
-      }
+  recolour() {
+    this.top.color.set(colour("--table"));
+    this.line.color.copy(this.top.color).multiplyScalar(0.913);
+  }
+}
+
+// A hand and an object on the table.
+class Pair extends Group {
+  constructor() {
+    super();
+    this.table = new Table();
+    this.object = new Group(); // its children are in the object frame
+    this.shadow = new Group();
+    this.shadow.matrixAutoUpdate = false;
+    this.shadow.matrix.set(1, 0, -KEY.x / KEY.z, 0, 0, 1, -KEY.y / KEY.z, 0, 0, 0, 0, 0.0004, 0, 0, 0, 1); // onto the table
+    this.add(this.table, this.object, this.shadow);
+  }
+
+  setBody(body) {
+    release(this.body);
+    release(this.bodyShadow);
+    this.body = body;
+    this.bodyShadow = new Mesh(body.geometry, shade());
+    this.object.add(body);
+    this.shadow.add(this.bodyShadow);
+  }
+
+  setSkin(skin) {
+    release(this.hand);
+    release(this.handShadow);
+    this.skin = skin;
+    this.hand = new Hand(skin, new MeshLambertMaterial({ vertexColors: true }));
+    this.handShadow = this.hand.shadow(shade());
+    this.add(this.hand);
+    this.shadow.add(this.handShadow);
+  }
+
+  mark(markers, opacity) {
+    release(this.marks);
+    this.marks = marked(markers, this.skin, opacity);
+    this.object.add(this.marks);
+  }
+
+  place({ position, quaternion }) {
+    for (const part of [this.object, this.bodyShadow]) {
+      part.position.copy(position);
+      part.quaternion.copy(quaternion);
     }
-    if (!normal) return null;
-    return { point: add(origin, scale(direction, nearest)), normal: dot(normal, direction) > 0 ? scale(normal, -1) : normal };
+  }
+}
+
+// The constraints while they are edited.
+export class Editing extends Pair {
+  constructor() {
+    super();
+    this.arrow = new Mesh(SHAFT, lit(HEADING, OVERRULED));
+    this.counts = new Mesh(SHAFT, lit(COUNTS));
+    this.balls = { tip: new Mesh(BALL, lit(HEADING)), tail: new Mesh(BALL, lit(HEADING)) };
+    this.ring = new Mesh(new TorusGeometry(1, 0.025, 8, 48), new MeshBasicMaterial({ depthTest: false, transparent: true }));
+    this.ring.renderOrder = 1;
+    this.object.add(this.arrow, this.counts, ...Object.values(this.balls), this.ring);
+  }
+
+  // Shows the studio's state.
+  take({ rest, start, active, markers }) {
+    this.place(poses(rest)[0]);
+    this.table.at(this.object.position);
+    this.hand.follow(poses(start));
+    this.mark(markers.map(marker), 1);
+    // An arrow that the rules overrule is faint, and beside it is the one that counts.
+    this.counts.visible = active.overruled;
+    fade(this.arrow.material, active.overruled ? OVERRULED : 1);
+    approach(this.counts, new Vector3(...active.position), new Vector3(...active.direction));
+    this.updateMatrixWorld(true);
+  }
+
+  // Shows the arrow, a ray of the object frame to its tip, with its ends by name, of which one is hovered; and the brush
+  // {point, normal, radius, avoid} over the object, or null.
+  frame({ origin, direction }, ends, hovered, brush) {
+    approach(this.arrow, origin, direction);
+    for (const [name, ball] of Object.entries(this.balls)) {
+      ball.position.copy(ends[name]);
+      ball.material.color.copy(name === hovered ? HOVERED : HEADING);
+    }
+    this.ring.visible = Boolean(brush);
+    if (!brush) return;
+    along(this.ring, brush.point, brush.normal, 1).scale.setScalar(brush.radius);
+    this.ring.material.color.set(brush.avoid ? AVOID : colour("--ink"));
+  }
+}
+
+// A motion, at one of its frames.
+export class Playing extends Pair {
+  constructor(motion, skin) {
+    super();
+    this.motion = motion;
+    this.setBody(new Body(motion.vertices, motion.faces, motion.colours));
+    this.body.paint(motion.avoid);
+    this.setSkin(skin);
+    this.table.at(motion.center);
+    this.mark(motion.markers, 0.85);
+    this.pushes = motion.forces[0].map(() => new Mesh(PUSH, lit(FORCE)));
+    this.add(...this.pushes);
+    this.behind = false;
+  }
+
+  // Makes it faint behind another motion.
+  set behind(on) {
+    this.faint = on;
+    this.traverse(({ material }) => {
+      if (!material) return;
+      material.userData.opacity ??= material.opacity;
+      fade(material, material.userData.opacity * (on ? BEHIND : 1)).depthFunc = on ? LessDepth : LessEqualDepth;
+    });
+  }
+
+  seek(time) {
+    const { links, object, forces, table } = this.motion.at(time);
+    this.table.visible = table && !this.faint;
+    this.place(object);
+    this.hand.follow(links);
+    if (forces === this.forces) return this.#push(links);
+    this.forces = forces;
+    const strengths = forces.map((force) => force.length());
+    this.hand.touch(strengths.map((strength) => (strength > LEAST ? 0.3 + 0.3 * Math.min(strength / FULL, 1) : 0)));
+    this.#push(links);
+  }
+
+  #push(links) {
+    this.forces.forEach((force, i) => {
+      const strength = force.length();
+      this.pushes[i].visible = strength > LEAST;
+      if (strength > LEAST) along(this.pushes[i], links[i].position, force.clone().divideScalar(strength), Math.min(FORCE_LENGTH * strength, LONGEST));
+    });
   }
 
   release() {
-    this.renderer.release(this.mesh);
+    release(this);
   }
 }
 
-export class Scene {
-  constructor(renderer) {
-    this.renderer = renderer;
-    this.hands = new Map(); // skins by hand
-    this.body = null;
-    this.table = renderer.mesh(shapes.table(TABLE));
-    this.shaft = renderer.mesh(shapes.arrow(ARROW, 0.0028));
-    this.force = renderer.mesh(shapes.arrow(1, 0.03));
-    this.ball = renderer.mesh(shapes.capsules([{ start: [0, 0, 0], end: [0, 0, 0], radius: 0.006 }]));
-    this.ring = renderer.mesh(shapes.ring(0.025));
-    this.paths = new Map(); // beads by use
+// All that can be drawn, and its light.
+export class Stage extends Scene {
+  constructor() {
+    super();
+    const key = new DirectionalLight(0xffffff, 0.4 * Math.PI);
+    key.position.copy(KEY);
+    const second = new DirectionalLight(0xffffff, 0.12 * Math.PI);
+    second.position.set(-0.7, 0.5, 0.25);
+    const sky = new HemisphereLight(new Color(0.66, 0.66, 0.66), new Color(0.34, 0.34, 0.34), Math.PI);
+    sky.position.copy(FORWARD);
+    this.background = new Color();
+    this.add(key, second, sky);
   }
 
-  setHand(name, message) {
-    this.hands.set(name, new Skin(this.renderer, message));
-  }
-
-  setObject(vertices, faces, own) {
-    this.body?.release();
-    this.body = new Body(this.renderer, vertices, faces, own);
-  }
-
-  // The hand, with shares of a colour on its links.
-  #hand(use, hand, poses, tint, shares) {
-    const skin = this.hands.get(hand);
-    return skin ? [skin.thing(use, poses, tint, shares ?? new Array(skin.links).fill(0))] : [];
-  }
-
-  #arrow(tip, direction, tint, alpha) {
-    return { mesh: this.shaft, model: along(sub(tip, scale(direction, ARROW)), direction), tint, alpha };
-  }
-
-  #path(use, points, place, alpha) {
-    const key = JSON.stringify(points);
-    let known = this.paths.get(use);
-    if (known?.key !== key) {
-      if (known) this.renderer.release(known.mesh);
-      known = { key, mesh: this.renderer.mesh(shapes.beads(points, 0.0035)) };
-      this.paths.set(use, known);
+  // Shows some of the groups alone.
+  show(groups, shadows) {
+    this.background.set(colour("--stage"));
+    for (const child of this.children) if (child instanceof Pair) child.visible = groups.includes(child);
+    for (const group of groups) {
+      group.table.recolour();
+      group.shadow.visible = shadows && group.table.visible;
     }
-    return { mesh: known.mesh, model: pose(place.position, place.quaternion), tint: PATH, alpha };
-  }
-
-  #table(center) {
-    return { mesh: this.table, model: [...IDENTITY.slice(0, 12), center[0], center[1], 0, 1], tint: rgb("--table"), lit: 0, ground: true };
-  }
-
-  // A reference pose, which is given in the object's frame.
-  #ghost(use, hand, links, place) {
-    const turned = {
-      position: links.position.map((point) => toWorld(place, point)),
-      quaternion: links.quaternion.map((turn) => product(place.quaternion, turn)),
-    };
-    const whole = new Array(links.position.length).fill(1);
-    return this.#hand(use, hand, turned, GHOST, whole).map((thing) => ({ ...thing, alpha: 0.28 }));
-  }
-
-  // Things while constraints are edited. `arrow`: {tip, direction} in the world; `brush`: {point, normal} in the object's
-  // frame and {radius, avoid} of the brush over it, or null.
-  editing(state, arrow, handles, brush) {
-    const place = state.rest;
-    const things = [this.#table(place.position)];
-    const model = pose(place.position, place.quaternion);
-    if (this.body) things.push({ mesh: this.body.mesh, model, casts: true });
-    things.push(...this.#hand("hand", state.hand, state.start, TOUCHING).map((thing) => ({ ...thing, casts: true })));
-    // An arrow that the rules overrule is faint, and beside it is the one that counts.
-    const counts = toWorld(place, state.active.position);
-    things.push(this.#arrow(arrow.tip, arrow.direction, HEADING, state.active.overruled ? 0.3 : 1));
-    if (state.active.overruled) things.push(this.#arrow(counts, rotate(place.quaternion, state.active.direction), COUNTS, 1));
-    for (const [name, point] of Object.entries(handles.points))
-      things.push({ mesh: this.ball, model: [...IDENTITY.slice(0, 12), ...point, 1], tint: name === handles.hover ? [1, 0.8, 0.2] : HEADING, lit: 0.5 });
-    if (state.path && state.asked.includes("trajectory")) things.push(this.#path("path", state.path, place, 1));
-    if (state.pose && state.asked.includes("pose")) things.push(...this.#ghost("ghost", state.hand, state.pose, place));
-    if (brush) things.push({ mesh: this.ring, model: multiply(model, along(brush.point, brush.normal).map((x, k) => (k < 12 ? brush.radius * x : x))), tint: brush.avoid ? AVOID : rgb("--ink"), lit: 0, above: true });
-    return things;
-  }
-
-  // Things of a frame of a motion (see `Motion.at`) in one of the player's slots; faint where it is `behind` another.
-  playing({ motion, body }, frame, slot, behind) {
-    const place = frame.object;
-    const things = [];
-    if (frame.table && !behind) things.push(this.#table(motion.center));
-    const solid = behind ? { alpha: BEHIND } : { casts: true };
-    const faint = (alpha) => (behind ? BEHIND * alpha : alpha);
-    things.push({ mesh: body.mesh, model: pose(place.position, place.quaternion), ...solid });
-    const strengths = frame.forces.map(norm);
-    const shares = strengths.map((strength) => (strength > LEAST ? 0.3 + 0.3 * Math.min(strength / FULL, 1) : 0));
-    things.push(...this.#hand(`hand ${slot}`, motion.hand, frame.links, TOUCHING, shares).map((thing) => ({ ...thing, ...solid })));
-    frame.forces.forEach((force, i) => {
-      const strength = norm(force);
-      if (strength > LEAST) things.push({ mesh: this.force, model: along(frame.links.position[i], scale(force, 1 / strength), Math.min(FORCE_LENGTH * strength, LONGEST)).map((x, k) => (k < 8 ? 0.09 * x : x)), tint: FORCE, alpha: faint(1) });
-    });
-    for (const { tip, direction } of motion.arrows)
-      things.push(this.#arrow(toWorld(place, tip), rotate(place.quaternion, direction), HEADING, faint(0.6)));
-    motion.paths.forEach((points, i) => things.push(this.#path(`path ${slot} ${i}`, points, place, faint(0.7))));
-    motion.ghosts.forEach((links, i) => things.push(...this.#ghost(`ghost ${slot} ${i}`, motion.hand, links, place)));
-    return things;
   }
 }
-
-function product(a, b) {
-  return [
-    a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-    a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-    a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-    a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-  ];
-}
-

@@ -4,7 +4,6 @@ import { outcomeOf } from "./player.js";
 import { ask, download, post, upload } from "./wire.js";
 
 const $ = (id) => document.getElementById(id);
-const MASK_NAMES = { pose_finger: "pose: fingers", pose_wrist: "pose: wrist" };
 const POLL = 200; // ms between two looks at a job
 const KEEPS_MOTION = new Set(["grasp", "draw_motion", "delete"]);
 const DRAWING = "drawing"; // what a job says it made when that is a file to save
@@ -33,9 +32,7 @@ export class StudioPanel {
       if ($("file").files.length) this.take($("file").files[0]);
       $("file").value = "";
     });
-    for (const box of document.querySelectorAll("[data-ask]")) box.addEventListener("change", () => this.act("ask", { constraint: box.dataset.ask, on: box.checked }));
-    for (const button of document.querySelectorAll("[data-suggest]"))
-      button.addEventListener("click", () => this.act("suggest", { constraint: button.dataset.suggest }));
+    this.extras = Object.fromEntries(Array.from(document.querySelectorAll("[data-extra]"), (part) => [part.dataset.extra, part]));
     $("clear-paint").addEventListener("click", () => this.act("fill", { avoid: false }));
     $("close-hand").addEventListener("click", () => this.act("close_hand", {}));
     this.gesture = Date.now(); // of the roll's slider: what one drag does is one edit, also beside other pages' drags
@@ -146,18 +143,16 @@ export class StudioPanel {
       $(name).title = what ? `${name === "undo" ? "Undo" : "Redo"}: ${what} (Ctrl-${name === "undo" ? "" : "Shift-"}Z)` : `Nothing to ${name}`;
     }
     $("policy").textContent = `${state.policy.source}, version ${state.policy.version}`;
-    this.#toggles(studio.others);
-    for (const box of document.querySelectorAll("[data-ask]")) {
-      box.checked = studio.asked.includes(box.dataset.ask);
-      box.closest(".constraint").hidden = !studio.known.includes(box.dataset.ask);
-    }
+    this.#constraints(studio.constraints);
+    for (const box of document.querySelectorAll("[data-ask]")) box.checked = box.disabled || studio.asked.includes(box.dataset.ask);
     $("share").textContent = studio.avoid_share ? `${Math.round(100 * studio.avoid_share)} % painted` : "nothing painted";
-    $("masks").replaceChildren(...Object.entries({ heading: true, ...studio.active.masks }).map(([name, on]) => {
+    const always = studio.constraints.filter(({ tool }) => tool === "arrow").map(({ name }) => [name, true]);
+    $("masks").replaceChildren(...[...always, ...Object.entries(studio.active.masks)].map(([name, on]) => {
       const mask = document.createElement("span");
       mask.className = "mask";
       mask.dataset.mask = name;
       mask.dataset.on = on;
-      mask.textContent = `${MASK_NAMES[name] ?? name} ${on ? "on" : "off"}`;
+      mask.textContent = `${name.replaceAll("_", " ")} ${on ? "on" : "off"}`;
       return mask;
     }));
     $("explanation").replaceChildren(...studio.explanation.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
@@ -200,12 +195,12 @@ export class StudioPanel {
     this.questioned = upload.unit ? null : upload.file;
   }
 
-  // Constraints without tools of their own: a box to ask for each, and one for each of its flags.
-  #toggles(others) {
-    const shown = JSON.stringify(others);
-    if (shown === this.others) return;
-    this.others = shown;
-    $("other-constraints").replaceChildren(...others.map(({ name, title, flags }) => {
+  // A row for each constraint: a box to ask for it, what its tool has on the panel, and a box for each of its flags.
+  #constraints(rows) {
+    const shown = JSON.stringify(rows);
+    if (shown === this.rows) return;
+    this.rows = shown;
+    $("constraints").replaceChildren(...rows.map(({ name, title, tool, flags }) => {
       const part = Object.assign(document.createElement("div"), { className: "constraint" });
       const box = (text, checked, change) => {
         const input = Object.assign(document.createElement("input"), { type: "checkbox", checked });
@@ -215,7 +210,16 @@ export class StudioPanel {
         part.append(label);
         return input;
       };
-      box(title[0].toUpperCase() + title.slice(1), false, (input) => this.act("ask", { constraint: name, on: input.checked })).dataset.ask = name;
+      const asked = box(title[0].toUpperCase() + title.slice(1), false, (input) => this.act("ask", { constraint: name, on: input.checked }));
+      asked.dataset.ask = name;
+      asked.disabled = tool === "arrow";
+      if (tool && tool !== "paint") {
+        const button = Object.assign(document.createElement("button"), { textContent: "Suggest" });
+        button.dataset.suggest = name;
+        button.addEventListener("click", () => this.act("suggest", { constraint: name }));
+        part.append(button);
+      }
+      if (this.extras[tool]) part.append(this.extras[tool]);
       for (const [field, labels] of Object.entries(flags)) {
         const boxes = Object.entries(labels).map(([text, on]) => box(text, on, () =>
           this.act("choose", { constraint: name, field, values: boxes.map((input) => input.checked) })));
@@ -294,7 +298,7 @@ export class StudioPanel {
     const { player, camera } = this.app;
     const { id } = player.motion;
     if (!this.state.drawn.includes(kind)) return this.#download("api/export", { id, kind });
-    return this.act("draw_motion", { id, kind, camera: camera.view, frame: player.motion.step(player.time) });
+    return this.act("draw_motion", { id, kind, camera: camera.viewpoint, frame: player.motion.step(player.time) });
   }
 
   async #download(path, query) {

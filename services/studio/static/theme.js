@@ -10,12 +10,6 @@ export function colour(name) {
   return known.get(name);
 }
 
-// The same of a colour #rrggbb as three numbers from 0 to 1.
-export function rgb(name) {
-  const text = colour(name);
-  return [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16) / 255);
-}
-
 export function onTheme(redraw) {
   dark.addEventListener("change", redraw);
 }

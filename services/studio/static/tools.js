@@ -1,8 +1,7 @@
 // What the mouse does in the scene: look around, place the arrow, paint, draw a path.
 
-import { onPlane } from "./camera.js";
-import { add, rotate, conjugate, scale, sub, toLocal, toWorld, unit } from "./math.js";
 import { ARROW } from "./scene.js";
+import { Plane, Ray, Vector3 } from "./vendor/three.module.min.js";
 
 const GRAB = 16; // pixels around a handle
 const INWARD = 0.02; // m from the surface to the heading's target
@@ -23,7 +22,7 @@ export class Tools {
     this.tool = "look";
     this.radius = 0.014;
     this.hover = "";
-    this.arrow = null; // {position, direction} in the object frame while it is dragged
+    this.arrow = null; // ray to its target in the object frame, while it is dragged
     this.stroke = null;
     this.over = null; // {point, normal} of the object's surface under a brush
     this.fingers = new Map(); // places of what touches the canvas, by pointer
@@ -36,7 +35,7 @@ export class Tools {
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
-      app.camera.zoom(Math.sign(event.deltaY) * Math.min(1, Math.abs(event.deltaY) / 60));
+      app.camera.dolly(Math.sign(event.deltaY) * Math.min(1, Math.abs(event.deltaY) / 60));
       app.redraw();
     }, { passive: false });
     for (const button of document.querySelectorAll("[data-tool]")) button.addEventListener("click", () => this.choose(button.dataset.tool));
@@ -75,19 +74,19 @@ export class Tools {
     this.app.redraw();
   }
 
-  // The arrow as it is drawn: it ends where its line enters the object.
+  // The arrow as it is drawn, a ray of the object frame: it ends where its line enters the object.
   shown() {
     const { state, body } = this.app;
     const arrow = this.arrow ?? state.arrow;
-    const start = sub(arrow.position, scale(arrow.direction, 0.4));
-    const entered = body?.hit(start, arrow.direction);
-    const inside = entered && Math.hypot(...sub(entered.point, start)) < 0.42;
-    const tip = inside ? entered.point : arrow.position;
-    return { tip: toWorld(state.rest, tip), direction: rotate(state.rest.quaternion, arrow.direction) };
+    if (this.entered?.arrow !== arrow || this.entered.body !== body) {
+      const hit = body.hit(new Ray(arrow.at(-0.4, new Vector3()), arrow.direction.clone()).applyMatrix4(body.matrixWorld));
+      this.entered = { arrow, body, shown: new Ray(hit?.distance < 0.42 ? hit.point : arrow.origin, arrow.direction) };
+    }
+    return this.entered.shown;
   }
 
-  handles(arrow) {
-    return { hover: this.hover, points: { tip: arrow.tip, tail: sub(arrow.tip, scale(arrow.direction, ARROW)) } };
+  ends(arrow) {
+    return { tip: arrow.origin, tail: arrow.at(-ARROW, new Vector3()) };
   }
 
   #place(event) {
@@ -103,17 +102,23 @@ export class Tools {
   // Where the mouse is on the object, in its frame.
   #hit(event) {
     const { state, body } = this.app;
-    if (!state || !body) return null;
-    const ray = this.#ray(event);
-    return body.hit(toLocal(state.rest, ray.origin), rotate(conjugate(state.rest.quaternion), ray.direction));
+    return state && body ? body.hit(this.#ray(event)) : null;
+  }
+
+  // Where the mouse is on the plane through a point of the object frame that faces the camera, in the world.
+  #facing(event, point) {
+    const { camera, body } = this.app;
+    const plane = new Plane().setFromNormalAndCoplanarPoint(camera.direction, body.localToWorld(point.clone()));
+    return this.#ray(event).intersectPlane(plane, new Vector3());
   }
 
   #handle(event) {
-    if (!this.app.state) return "";
+    const { state, body, camera } = this.app;
+    if (!state) return "";
     const { x, y, box } = this.#place(event);
-    const { points } = this.handles(this.shown());
+    const ends = this.ends(this.shown());
     for (const name of ["tail", "tip"]) {
-      const at = this.app.camera.project(points[name]);
+      const at = camera.locate(body.localToWorld(ends[name].clone()));
       if (at && Math.hypot((at[0] - x) * box.width, (at[1] - y) * box.height) < GRAB) return name;
     }
     return "";
@@ -140,11 +145,10 @@ export class Tools {
       this.#brush(hit);
     } else if (this.tool === "arrow" && hit) {
       this.doing = "";
-      const { state } = app;
-      const inward = rotate(state.rest.quaternion, scale(hit.normal, -1));
-      // From below the table no hand comes: such a direction is levelled.
-      const direction = unit([inward[0], inward[1], Math.min(inward[2], 0)]);
-      app.act("snap_heading", { surface: hit.point, direction: rotate(conjugate(state.rest.quaternion), direction) });
+      const inward = hit.normal.negate().transformDirection(app.body.matrixWorld);
+      inward.z = Math.min(inward.z, 0); // from below the table no hand comes: such a direction is levelled
+      const direction = inward.transformDirection(app.body.matrixWorld.clone().invert());
+      app.act("set_heading", { surface: hit.point.toArray(), direction: direction.toArray() });
     } else if (this.tool === "path" && app.state) {
       this.doing = "path";
       this.stroke = [];
@@ -188,7 +192,7 @@ export class Tools {
     if (after.length !== 2) return;
     const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
     const middle = ([a, b]) => [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
-    app.camera.zoom(Math.log(apart(before) / apart(after)) / 0.12);
+    app.camera.dolly(Math.log(apart(before) / apart(after)) / 0.12);
     app.camera.pan(middle(after)[0] - middle(before)[0], middle(after)[1] - middle(before)[1], app.canvas.clientHeight);
     app.redraw();
   }
@@ -202,11 +206,11 @@ export class Tools {
   #up(event) {
     const { app } = this;
     this.fingers.delete(event.pointerId);
-    if (this.doing === "paint") app.act("paint", { points: this.stroke, radius: this.radius, avoid: this.tool === "avoid" });
-    if (this.doing === "path" && this.stroke.length > 1) app.act("draw", { points: this.stroke });
+    if (this.doing === "paint") app.act("paint", { points: this.stroke.map((point) => point.toArray()), radius: this.radius, avoid: this.tool === "avoid" });
+    if (this.doing === "path" && this.stroke.length > 1) app.act("draw", { points: this.stroke.map((point) => point.toArray()) });
     if ((this.doing === "tip" || this.doing === "tail") && this.arrow) {
-      const surface = sub(this.arrow.position, scale(this.arrow.direction, INWARD));
-      app.act("snap_heading", { surface, direction: this.arrow.direction }).finally(() => {
+      const surface = this.arrow.at(-INWARD, new Vector3());
+      app.act("set_heading", { surface: surface.toArray(), direction: this.arrow.direction.toArray() }).finally(() => {
         this.arrow = null;
         app.redraw();
       });
@@ -223,29 +227,26 @@ export class Tools {
 
   // A path lies in the plane through the object that faces the camera, and never below the table.
   #trace(event) {
-    const { app } = this;
-    const point = onPlane(this.#ray(event), app.state.rest.position, app.camera.direction);
+    const point = this.#facing(event, new Vector3());
     if (!point) return;
-    const local = toLocal(app.state.rest, [point[0], point[1], Math.max(point[2], 0.03)]);
+    point.z = Math.max(point.z, 0.03);
+    this.app.body.worldToLocal(point);
     const before = this.stroke[this.stroke.length - 1];
-    if (!before || Math.hypot(...sub(local, before)) > STEP) this.stroke.push(local);
+    if (!before || before.distanceTo(point) > STEP) this.stroke.push(point);
   }
 
+  // Drags the arrow's tip over the object, or turns it by its tail.
   #drag(event) {
-    const { app } = this;
-    const { rest } = app.state;
-    const shown = this.shown();
-    const arrow = this.arrow ?? app.state.arrow;
+    const { body } = this.app;
+    const { origin, direction } = this.shown();
     if (this.doing === "tip") {
       const hit = this.#hit(event);
-      if (!hit) return;
-      this.arrow = { position: add(hit.point, scale(arrow.direction, INWARD)), direction: arrow.direction };
+      if (hit) this.arrow = new Ray(hit.point.addScaledVector(direction, INWARD), direction);
       return;
     }
-    const tail = sub(shown.tip, scale(shown.direction, ARROW));
-    const to = onPlane(this.#ray(event), tail, app.camera.direction);
-    if (!to || Math.hypot(...sub(shown.tip, to)) < 0.02) return;
-    const direction = rotate(conjugate(rest.quaternion), unit(sub(shown.tip, to)));
-    this.arrow = { position: add(toLocal(rest, shown.tip), scale(direction, INWARD)), direction };
+    const to = this.#facing(event, this.ends(this.shown()).tail);
+    if (!to || body.worldToLocal(to).distanceTo(origin) < 0.02) return;
+    const turned = origin.clone().sub(to).normalize();
+    this.arrow = new Ray(origin.clone().addScaledVector(turned, INWARD), turned);
   }
 }

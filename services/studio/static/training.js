@@ -24,7 +24,7 @@ function row(cells, kind = "td") {
 }
 
 export class TrainingPanel {
-  // `app` has: play(id), recordings (bool).
+  // `app` has: play(id).
   constructor(app) {
     this.app = app;
     this.chosen = [];

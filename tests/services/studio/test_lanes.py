@@ -5,7 +5,7 @@ import pytest
 
 from congrasp.common.task.constraints import get_constraint
 from congrasp.common.wire.codec import Message, decode, encode
-from congrasp.services.studio.lanes import for_page, lanes
+from congrasp.services.studio.page import for_page, lanes
 from tests.episodes import episode, older
 
 STEPS, REMOVAL = 30, 18

@@ -15,10 +15,9 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
-from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
-from congrasp.services.studio.training import TrainingWindow
+from congrasp.services.studio.training import Recordings, TrainingWindow
 from tests import studio as made_up
 from tests.studio import BEGIN, DIP
 from tests.waits import eventually
@@ -35,7 +34,8 @@ class Site:
         made_up.record(folder, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
         self.grasping = made_up.MadeUpGrasping()
         self.window: TrainingWindow = made_up.window(100)
-        self.session: Session = made_up.session(self.grasping, window=self.window, recordings=Recordings(folder))
+        self.window.recordings = Recordings(folder)
+        self.session: Session = made_up.session(self.grasping, window=self.window)
         self.server = PageServer(lambda browser: self.session.routes, "127.0.0.1", 0)
 
     @property
@@ -191,7 +191,7 @@ def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
     opened.click("[data-tool=path]")
     drag(opened, [(x + 220, y - 40), (x + 140, y - 70), (x + 60, y - 60), (x + 10, y)])
     opened.wait_for_selector("[data-mask=trajectory][data-on=true]")
-    path = np.array(site.studio["path"])
+    (path,) = (np.array(marker["points"]) for marker in site.studio["markers"] if marker["kind"] == "polyline")
     assert len(path) == made_up.MadeUpGrasping().task.trajectory_points
     assert np.linalg.norm(np.diff(path, axis=0), axis=-1).sum() > 0.05
     assert "wrist trajectory guides the wrist" in opened.inner_text("#explanation")
@@ -205,7 +205,8 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
 
     def fingers() -> list[str]:
-        return [name for name, on in session.state()["studio"]["others"][0]["flags"]["allowed"].items() if on]
+        row = session.state()["studio"]["constraints"][-1]
+        return [name for name, on in row["flags"]["allowed"].items() if on]
 
     page.goto(server.url)
     page.wait_for_selector("body[data-first-picture]")
@@ -213,11 +214,11 @@ def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: An
     page.check("[data-ask=fingers]")
     page.wait_for_selector("[data-mask=fingers][data-on=true]")
     assert "Only the named fingers" in page.inner_text("#explanation") and fingers() == ["thumb", "index"]
-    page.check("#other-constraints label:has-text('middle') input")
+    page.check("#constraints label:has-text('middle') input")
     eventually(lambda: fingers() == ["thumb", "index", "middle"])
     assert page.is_checked("[data-ask=fingers]")
     for name in ("index", "middle"):
-        page.uncheck(f"#other-constraints label:has-text('{name}') input")
+        page.uncheck(f"#constraints label:has-text('{name}') input")
         eventually(lambda name=name: name not in fingers())
     page.wait_for_selector("#trouble:has-text('needs the thumb and another finger. Allow both')")
     assert page.is_disabled("#grasp")

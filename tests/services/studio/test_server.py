@@ -23,12 +23,12 @@ from congrasp.common.wire.codec import decode
 from congrasp.services.cli.main import main
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
-from congrasp.services.studio import files
-from congrasp.services.studio import sessions as sessions_module
+from congrasp.services.studio import motions
+from congrasp.services.studio import server as server_module
 from congrasp.services.studio.catalogue import Uploads
-from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
 from congrasp.services.studio.session import Session
+from congrasp.services.studio.training import Recordings, TrainingWindow
 from tests import studio as made_up
 
 
@@ -87,7 +87,8 @@ def page(grasping: made_up.MadeUpGrasping) -> Iterator[Page]:
 
 def test_the_page_and_its_modules_are_served_and_nothing_else_of_the_disk(page: Page) -> None:
     assert b"<title>congrasp" in page.ask("GET", "/")[1]
-    assert page.ask("GET", "/static/gl.js")[0] == 200
+    assert page.ask("GET", "/static/picture.js")[0] == 200
+    assert page.ask("GET", "/prefix/static/vendor/three.module.min.js")[0] == 200
     hostile = ("HTTP://[", f"/static/{'a' * 300}.css", "/static/%00.css")
     for path in ("/static/../server.py", "/static/%2e%2e/server.py", "/etc/passwd", "/static/", "/api/none", *hostile):
         assert page.ask("GET", path)[0] == 404, path
@@ -102,14 +103,14 @@ def test_a_result_that_is_not_json_is_answered() -> None:
 
 def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which a cookie finds again; what one undoes is its own, and the least recent one of too many ends once idle."""
-    monkeypatch.setattr(sessions_module, "MOST", 2)
+    monkeypatch.setattr(server_module, "MOST", 2)
     made: list[Session] = []
 
     def new() -> Session:
         made.append(made_up.session(made_up.MadeUpGrasping()))
         return made[-1]
 
-    sessions = sessions_module.Sessions(new)
+    sessions = server_module.Sessions(new)
     server = PageServer(sessions.routes, "127.0.0.1", 0)
     page = Page(server.port)
 
@@ -133,7 +134,7 @@ def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch)
         for path, kind in (("/api/state", "GET"), ("/api/do", "POST")):
             refused = json.loads(page.ask(kind, path, body if kind == "POST" else b"", Cookie=cookies[2])[1])
             assert "2 browsers use this studio. Come back" in refused["error"] and len(made) == 2
-        monkeypatch.setattr(sessions_module, "IDLE", 0.0)
+        monkeypatch.setattr(server_module, "IDLE", 0.0)
         assert not undoable(cookies[2]) and len(made) == 3
         assert undoable(cookies[0]) and not undoable(cookies[1]) and len(made) == 4
     finally:
@@ -178,7 +179,7 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         refused = page.ask("GET", "/", Host="other.example.org")
         assert refused[0] == 403 and "--allow-host 'other.example.org'" in json.loads(refused[1])["error"]
         assert page.ask("GET", "/user/me/proxy/7480/api/state")[0] == page.ask("GET", "/user/me/")[0] == 200
-        for file in STATIC.iterdir():  # a proxy offers the page below a prefix
+        for file in filter(pathlib.Path.is_file, STATIC.rglob("*")):  # a proxy offers the page below a prefix
             assert not re.search(r"[\"'`]/(api|static)/", file.read_text())
     finally:
         server.close()
@@ -195,7 +196,7 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         (b'{"action": "draw", "points": [[0, 0, 0], [1]]}', "'draw' takes other values"),
         (b'{"action": "draw", "points": [[1e308, 0, 0], [-1e308, 0, 0]]}', "within"),
         (b'{"action": "paint", "points": [["x", 0, 0]], "radius": 0.01, "avoid": true}', "'paint' takes other values"),
-        (b'{"action": "set_heading", "position": [1e308, 0, 0], "direction": [0, 0, 1]}', "within"),
+        (b'{"action": "set_heading", "surface": [1e308, 0, 0], "direction": [0, 0, 1]}', "within"),
         (b'{"action": "explode"}', "cannot do 'explode'"),
         (b'{"action": "set_roll", "turns": 2}', "other values"),
         (b'{"action": "object", "name": "moon"}', "no object 'moon'"),
@@ -258,7 +259,7 @@ def test_paint_of_no_colour_leaves_the_studio_working(page: Page) -> None:
 
 def test_what_no_page_asks_is_a_bad_request(tmp_path: pathlib.Path) -> None:
     made_up.record(tmp_path, [(made_up.BEGIN, 1)])
-    session = made_up.session(recordings=Recordings(tmp_path))
+    session = made_up.session(window=TrainingWindow("made-up", Recordings(tmp_path)))
     server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
     page = Page(server.port)
     try:
@@ -392,7 +393,7 @@ def test_a_mesh_that_comes_during_a_job_is_refused(page, grasping, monkeypatch):
 
 
 def test_a_motion_may_be_named_by_a_number(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)])
+    monkeypatch.setattr(motions, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)])
     page.do("grasp")
     number = int(page.wait()["made"])
     camera = {"position": [0.5, 0.5, 0.5], "target": [0.0, 0.0, 0.0], "field_of_view": 40.0}

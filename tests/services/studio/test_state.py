@@ -10,9 +10,8 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.objects import procedural
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.task.sampling.headings import BACK_OFF, INWARD
-from congrasp.services.studio.description import describe
-from congrasp.services.studio.history import ACTIONS, History
-from congrasp.services.studio.state import Studio
+from congrasp.services.studio.page import describe
+from congrasp.services.studio.state import ACTIONS, History, Studio
 from tests.task import HAND, TASK
 
 MUG = procedural.generate(1, "mug")
@@ -35,6 +34,16 @@ def test_a_new_object_can_be_grasped_from_above_at_once(studio: Studio) -> None:
     np.testing.assert_allclose(down, [0, 0, -1], atol=1e-6)
     assert studio.explanation == ["The heading guides the wrist."]
     assert masks(studio) == set()
+
+
+def test_drawing_tools_follow_from_goal_arrays(studio: Studio) -> None:
+    tools = {row["name"]: row["tool"] for row in describe(studio)["constraints"]}
+    assert {name: tool for name, tool in tools.items() if tool} == {
+        "heading": "arrow", "affordance": "paint", "pose": "hand", "trajectory": "path",
+    }  # fmt: skip
+    lacking = Studio(HAND, dataclasses.replace(TASK, constraints=("heading",)), MUG)
+    with pytest.raises(CongraspError, match=r"no constraint of the tool 'path'\. It supports heading"):
+        lacking.draw([[0.0, 0.0, 0.3], [0.0, 0.0, 0.1]])
 
 
 def test_the_hand_begins_before_the_arrow_and_aligned_with_it(studio: Studio) -> None:
@@ -93,7 +102,7 @@ def test_the_affordance_redirects_an_arrow_that_comes_to_the_paint(studio: Studi
 
 
 def test_the_arrow_is_aimed_as_deep_as_in_training_and_rolls_around_itself(studio: Studio) -> None:
-    studio.snap_heading([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
+    studio.set_heading([0.01, 0.0, 0.02], [0.0, -3.0, 0.0])
     np.testing.assert_allclose(studio.arrow.position, [0.01, -INWARD, 0.02])
     before = studio.arrow.cross
     studio.set_roll(studio.arrow.roll(studio.up) + np.pi / 2)
@@ -122,10 +131,12 @@ def test_a_drawn_path_keeps_its_begin_and_ends_at_the_wrist_of_the_grasp(studio:
     drawn = [studio.arrow.position + up * h for h in (0.35, 0.25, 0.2)]
     studio.draw(drawn)
     studio.ask("trajectory", True)
-    assert studio.path is not None and studio.pose is not None
-    assert studio.path.position.shape == (TASK.trajectory_points, 3)
-    np.testing.assert_allclose(studio.path.position[0], drawn[0], atol=1e-6)
-    np.testing.assert_allclose(studio.path.position[-1], studio.pose.position, atol=1e-6)
+    path = studio.fields["trajectory"]["position"]
+    assert path.shape == (TASK.trajectory_points, 3)
+    np.testing.assert_allclose(path[0], drawn[0], atol=1e-6)
+    studio.close_hand()
+    np.testing.assert_allclose(path[-1], studio.fields["pose"]["position"], atol=1e-6)
+    studio.ask("pose", False)
     assert studio.trouble == "" and studio.explanation[0].startswith("The wrist trajectory")
 
 
@@ -169,7 +180,7 @@ def test_what_cannot_be_is_refused_in_one_line(studio: Studio, do, says) -> None
 
 def test_an_impossible_request_is_explained_before_it_is_sent(studio: Studio) -> None:
     up = matrix(MUG.rest_poses[0][3:]).T @ np.array([0.0, 0.0, 1.0])
-    studio.snap_heading(studio.arrow.position, up)
+    studio.set_heading(studio.arrow.position, up)
     assert "under the table" in studio.trouble
     with pytest.raises(CongraspError, match="under the table"):
         _ = studio.request
@@ -181,7 +192,7 @@ def test_an_impossible_request_is_explained_before_it_is_sent(studio: Studio) ->
 def test_another_object_forgets_what_was_asked_of_the_one_before(studio: Studio) -> None:
     studio.ask("pose", True)
     studio.take(dataclasses.replace(MUG, name="other"))
-    assert studio.asked == set() and studio.pose is None and describe(studio)["object"]["name"] == "other"
+    assert studio.asked == set() and "pose" not in studio.fields and describe(studio)["object"]["name"] == "other"
 
 
 def same(one: Studio, edit: object) -> bool:
@@ -202,8 +213,7 @@ def test_every_edit_is_undone_and_redone_and_a_new_one_ends_what_could_be_redone
     history, up = History(studio), matrix(MUG.rest_poses[0][3:])[2]
     edits = [
         ("set_rest_pose", {"rest": 0}),
-        ("snap_heading", {"surface": MUG.points[0], "direction": -MUG.normals[0]}),
-        ("set_heading", {"position": [0.0, 0.0, 0.0], "direction": -up}),
+        ("set_heading", {"surface": MUG.points[0], "direction": -MUG.normals[0]}),
         ("set_roll", {"angle": 0.5}),
         ("paint", {"points": [MUG.points[0]], "radius": 0.02, "avoid": True}),
         ("close_hand", {}),
@@ -218,7 +228,7 @@ def test_every_edit_is_undone_and_redone_and_a_new_one_ends_what_could_be_redone
         history.do(name, **values)
         states.append(studio.edit)
         assert history.view() == {"undo": ACTIONS[name], "redo": ""}
-    assert studio.asked == {"trajectory"} and studio.path is not None
+    assert studio.asked == {"trajectory"} and "trajectory" in studio.fields
     for state in states[-2::-1]:
         history.undo()
         assert same(studio, state)

@@ -15,9 +15,8 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.recorder import Recorder
-from congrasp.services.studio import recordings as recordings_module
-from congrasp.services.studio.recordings import Recordings
-from congrasp.services.studio.training import FIRST, Curve, Follower, TrainingWindow, labels_of
+from congrasp.services.studio import training as training_module
+from congrasp.services.studio.training import FIRST, Curve, Follower, Recordings, TrainingWindow, labels_of
 from tests import studio as made_up
 from tests.studio import BEGIN, DIP
 from tests.waits import eventually
@@ -156,7 +155,7 @@ def test_damage_to_a_finished_file_costs_no_more_than_what_is_damaged(tmp_path: 
 
 
 def test_of_many_episodes_the_nearest_are_taken(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recordings_module, "MOST", 3)
+    monkeypatch.setattr(training_module, "MOST", 3)
     made_up.record(tmp_path, [(BEGIN + n, n) for n in range(5)])
     _, rows = Recordings(tmp_path).around(BEGIN, 1000.0)
     assert [row["actor"] for row in rows] == ["a000", "a001", "a002"]
@@ -173,8 +172,8 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
         transport.publish(KEYS.log("event", "learner", "0"), Message({}, told))
         eventually(lambda: recorder.messages >= 42)
     made_up.record(tmp_path, [(BEGIN, 3), (BEGIN + 5, 3), (BEGIN + 6, 4)])
-    window = TrainingWindow("made-up")
-    window.load(tmp_path)
+    window = TrainingWindow("made-up", Recordings(tmp_path))
+    window.load()
     assert [row["id"] for row in window.view()["actors"]] == ["a003", "a004"]
     assert window.episode("a004").meta["object"] == "thing-4"
     assert window.curve("episode/success").values[DIP] == 0.1

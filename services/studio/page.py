@@ -1,0 +1,208 @@
+"""Content of the page: the request, a hand, and a motion with its lanes, markers and reward terms."""
+
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from congrasp.actors.initial import initial_hand
+from congrasp.common.hands import known_hand
+from congrasp.common.hands.skin import skin_of
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.painting import painted
+from congrasp.common.objects.resting import rest_tilts
+from congrasp.common.objects.spec import Colours
+from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.constraints import CONSTRAINTS, known
+from congrasp.common.task.constraints.base import ErrorSpec
+from congrasp.common.task.constraints.markers import Ghost, Marker
+from congrasp.common.task.reward import GRASP
+from congrasp.common.task.types import Goal, Surface
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.grasp.grasper import surface_of
+from congrasp.services.record.goals import active_blocks, active_constraints, markers
+from congrasp.services.studio.state import Studio, tool_of
+from congrasp.services.viz.render import grasp_steps
+from congrasp.services.viz.shapes import skin_colours
+
+TOUCH = 0.05
+"""Least force of a link in contact, N."""
+_UNITS = {"rad": (180 / np.pi, "°"), "m": (100.0, " cm"), "": (100.0, " %")}
+MEANINGS = {term.name: term.meaning for term in GRASP} | {
+    weight.name: weight.meaning for constraint in CONSTRAINTS for weight in constraint.weights
+}
+"""Descriptions of the reward terms by name."""
+_PLAYED = (
+    "link_position",
+    "link_quaternion",
+    "object_position",
+    "object_quaternion",
+    "contact_force",
+    "table",
+    "visual_vertices",
+    "visual_faces",
+    "surface_points",
+    "surface_avoid",
+)
+"""Arrays of an episode that the player needs unchanged."""
+
+
+def describe(studio: Studio) -> dict[str, Any]:
+    """Everything that a page shows of a request; in the object frame, except resting pose and start (world frame)."""
+    resolution = studio.resolution
+    goal = resolution.goal
+    obj, hand, rest = studio.obj, studio.hand, studio.obj.rest_poses[studio.rest]
+    asked = [constraint for constraint in known(studio.task) if constraint.name in studio.asked]
+    shown = (marker for c in asked for marker in c.markers(studio.goal[c.name], c.blocks))
+    return {
+        "hand": hand.name,
+        "object": {
+            "name": obj.name,
+            "size_cm": [round(100 * float(side), 1) for side in np.ptp(obj.visual_vertices, axis=0)],
+            "mass_g": round(1000 * obj.mass),
+            "faces": len(studio.canvas.faces),
+            "tilts_deg": np.degrees(rest_tilts(obj)).round().tolist(),
+        },
+        "rest": {"index": studio.rest, "position": rest[:3].tolist(), "quaternion": rest[3:].tolist()},
+        "asked": sorted(studio.asked),
+        "constraints": list(_rows(studio)),
+        "arrow": _lists(studio.arrow._asdict()),
+        "roll_deg": round(float(np.degrees(studio.arrow.roll(studio.up))), 1),
+        "active": {
+            "masks": {block: bool(on) for block, on in goal.active.items()},
+            **_lists(goal["heading"]._asdict()),
+            "overruled": bool(resolution.redirected) or any("heading" in constraint.overrides for constraint in asked),
+        },
+        "explanation": studio.explanation,
+        "trouble": studio.trouble,
+        "start": _lists(_frames(hand, *_start(hand, studio.task, *_batch_of_one(studio, goal)))),
+        "markers": [{"kind": kind, **_lists(fields)} for kind, fields in _shapes(hand, shown)],
+        "painted": studio.canvas.paint.version,
+        "avoid_share": round(float(studio.canvas.avoid.mean()), 3),
+    }
+
+
+def _rows(studio: Studio) -> Iterator[dict[str, Any]]:
+    """Name, title, drawing tool and labelled flags of each constraint of the policy."""
+    for constraint in known(studio.task):
+        fields = studio.fields.get(constraint.name, {})
+        flags = {
+            field: dict(zip(labels, fields[field].tolist(), strict=True))
+            for field, labels in constraint.labels(studio.hand).items()
+        }
+        yield {"name": constraint.name, "title": constraint.title, "tool": tool_of(constraint), "flags": flags}
+
+
+def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Arrays as JSON."""
+    return {name: np.asarray(value).tolist() for name, value in fields.items()}
+
+
+def _batch_of_one(studio: Studio, goal: Goal) -> tuple[Goal, Surface, np.ndarray]:
+    """The goal, the object's surface and its resting pose (7,), with a batch axis."""
+    rest = np.asarray(studio.obj.rest_poses[studio.rest], np.float32)
+    return jax.tree.map(lambda array: np.asarray(array)[None], (goal, surface_of(studio.task, studio.obj), rest))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _start(hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: jax.Array) -> tuple[jax.Array, ...]:
+    """Finger angles (F,) and wrist pose (3,), (4,) at the start of a grasp, world frame."""
+    q, position, quaternion = initial_hand(hand, task, goal, surface, rest)
+    return q[0], position[0], quaternion[0]
+
+
+def _frames(hand: Hand, q: Any, position: Any, quaternion: Any) -> dict[str, np.ndarray]:
+    """Link frames, positions (L, 3) and quaternions (L, 4), of finger angles and a wrist pose, in that pose's frame."""
+    wrist = Rotation.from_quat(quaternion, scalar_first=True)
+    places, turns = mujoco_link_poses(hand, np.asarray(q, float))
+    turned = wrist * Rotation.from_quat(turns, scalar_first=True)
+    return {"position": wrist.apply(places) + position, "quaternion": turned.as_quat(scalar_first=True)}
+
+
+def _shapes(hand: Hand, shown: Iterator[Marker]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Kind and fields of each marker, object frame; a ghost of a whole hand has its link frames as fields."""
+    for marker in shown:
+        if not isinstance(marker, Ghost):
+            yield type(marker).__name__.lower(), marker._asdict()
+        elif marker.q is not None:
+            yield "ghost", _frames(hand, marker.q, marker.position, marker.quaternion)
+
+
+def hand_message(hand: Hand) -> Message:
+    """A hand's skin (see `common.hands.skin`), and its links' names."""
+    skin = skin_of(hand)
+    links, weights = skin.influences()
+    arrays = {
+        "skin_points": skin.points,
+        "skin_normals": skin.normals,
+        "skin_faces": skin.faces,
+        "skin_joints": links.astype(np.int32),
+        "skin_weights": weights,
+        "skin_origins": skin.origins.astype(np.float32),
+        "skin_colours": skin_colours(skin),
+    }
+    return Message(arrays, {"hand": hand.name, "links": [link.name for link in hand.links]})
+
+
+class Lane(NamedTuple):
+    """One constraint over T steps."""
+
+    met: np.ndarray
+    """(T,) bool."""
+    counts: np.ndarray
+    """(T,) bool: the constraint applies to this step (a heading to the grasp, a path to the approach)."""
+    legend: str
+    """Measured quantity, and its tolerance."""
+    errors: Mapping[str, np.ndarray]
+    """(T,) errors by their units, `share` without unit; the number of links by `links`."""
+
+
+def lanes(episode: Message) -> dict[str, Lane]:
+    """The lanes of an episode by name: contact, then the active constraints whose errors are recorded."""
+    arrays = {name: np.asarray(value) for name, value in episode.arrays.items()}
+    table = np.arange(len(arrays["table"])) < grasp_steps(episode)[1]
+    links = (np.linalg.norm(arrays["contact_force"], axis=-1) > TOUCH).sum(-1)
+    found = {"contact": Lane(links >= 2, ~table, "two links or more touch the object", {"links": links.astype(float)})}
+    active, blocks = active_constraints(arrays), active_blocks(arrays)
+    for constraint in CONSTRAINTS:
+        errors = [spec for spec in constraint.errors if not spec.block or blocks.get(spec.block)]
+        if constraint.name in active and all(f"error/{spec.name}" in arrays for spec in errors):
+            found[constraint.name] = _lane(errors, arrays, table)
+    return found
+
+
+def _lane(errors: Sequence[ErrorSpec], arrays: Mapping[str, np.ndarray], table: np.ndarray) -> Lane:
+    """The lane of one constraint from its recorded errors (T,)."""
+    values = {spec: arrays[f"error/{spec.name}"] for spec in errors}
+    met = np.all([value <= spec.tolerance for spec, value in values.items()], 0)
+    counts = table if errors[0].window == "approach" else ~table
+    parts = []
+    for spec in errors:
+        factor, unit = _UNITS[spec.unit]
+        parts.append(f"{spec.meaning}: {factor * spec.tolerance:.0f}{unit} at most")
+    return Lane(met, counts, "; ".join(parts), {spec.unit or "share": value for spec, value in values.items()})
+
+
+def for_page(episode: Message) -> Message:
+    """The episode for the page's player: poses, forces, rewards, object, lanes, and markers `KIND/CONSTRAINT/FIELD`."""
+    found = lanes(episode)
+    arrays: dict[str, Any] = {name: episode.arrays[name] for name in _PLAYED}
+    if "colour_values" in episode.arrays:
+        own = Colours(episode.arrays["colour_points"], episode.arrays["colour_values"])
+        mesh = painted(arrays["visual_vertices"], arrays["visual_faces"], own)
+        arrays |= dict(zip(("visual_vertices", "visual_faces", "visual_colours"), mesh, strict=True))
+    rewards = {name: value for name, value in episode.arrays.items() if name.startswith("reward/")}
+    arrays |= rewards
+    for name, lane in found.items():
+        arrays |= {f"lane/{name}/met": lane.met, f"lane/{name}/counts": lane.counts}
+        arrays |= {f"lane/{name}/{unit}": np.asarray(value, np.float32) for unit, value in lane.errors.items()}
+    for name, marker in markers(episode.arrays):
+        for kind, fields in _shapes(known_hand(episode.meta["hand"]), iter([marker])):
+            fields = {"avoid": episode.arrays["surface_avoid"]} if kind == "paint" else fields
+            arrays |= {f"{kind}/{name}/{field}": np.asarray(value, np.float32) for field, value in fields.items()}
+    terms = {name: MEANINGS.get(name, "") for name in (key.removeprefix("reward/") for key in rewards)}
+    return Message(arrays, {**episode.meta, "lanes": {n: lane.legend for n, lane in found.items()}, "terms": terms})
