@@ -50,7 +50,7 @@ def report(
     from congrasp.common.policy.bundle import content_hash
     from congrasp.common.policy.pretrained import policy_file
     from congrasp.services.cli.console import at_least, tracked
-    from congrasp.services.evaluate.reporting import report_on
+    from congrasp.services.evaluate.report import report_on
     from congrasp.services.evaluate.scores import write_json
 
     at_least(1, episodes=episodes, pool=pool)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.constraints import get_constraint
 from congrasp.common.wire.codec import Message
-from congrasp.services.evaluate.failures import cause
+from congrasp.services.evaluate.pictures import cause
 
 Held = Callable[[GraspRequest, str], int]
 """(weaker request, name of the omitted constraint) -> number of attempts that hold."""
