@@ -16,7 +16,7 @@ from congrasp.common.runtime.engines import engine_title
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from congrasp.services.evaluate.experiment import Experiment
+    from congrasp.common.objects.spec import GraspObject
     from congrasp.services.evaluate.lineup import Lineup
     from congrasp.services.evaluate.tables import Found
 
@@ -120,20 +120,19 @@ def evaluate(
         pools = folder_pools(objects, engine) if objects else procedural_pools(many, engine, exam)
     without: list[str] = []
     with tracked() as track:
-        experiment = Experiment(lineup.entrants[0][0].policy, [], episodes=episodes, track=track, **settings)
+        given: list[GraspObject] = []
         if constraints is not None or set(table) != {"objects"}:
             given = objects_of(objects, track=track) if objects else exam_pool(exam, pool)
-            experiment = dataclasses.replace(experiment, objects=given)
+        experiment = Experiment(lineup.entrants[0][0].policy, given, episodes=episodes, track=track, **settings)
         if constraints is not None:
-            sets = captured(constraints, split, experiment.objects)
+            sets = captured(constraints, split, given)
             _check_hand(sets.hand, [one.hand for one, _ in lineup.entrants])
-            without = sorted({obj.name for obj in experiment.objects} - {obj.name for obj in sets.objects})
+            without = sorted({obj.name for obj in given} - {obj.name for obj in sets.objects})
             experiment = dataclasses.replace(experiment, objects=sets.objects, constraints=sets.bank, paper=sets.paper)
-        experiments, results = [], []
+        results = []
         for one, tables in lineup.entrants:
             own = dataclasses.replace(experiment, policy=one.policy, hold=two_seconds(one.policy.task))
             folder = kept and kept / f"{one.hand}-{one.method}"
-            experiments.append(own)
             results.append(evaluate_tables(own, tables, pools, folder, keep=pictures is not None))
     source = _source(lineup, objects, exam)
     _show(results, lineup, f"{_who(lineup)}, on {source}, {engine_title(engine)}, friction {friction:g}", by)
@@ -151,8 +150,8 @@ def evaluate(
         write_json([row for found in results for row in found.rows], json, about)
         shutil.rmtree(kept, ignore_errors=True)
     if pictures is not None:
-        for (one, _), own, found in zip(lineup.entrants, experiments, results, strict=True):
-            _draw(own, found, pictures if len(results) == 1 else pictures / f"{one.hand}-{one.method}")
+        for (one, _), found in zip(lineup.entrants, results, strict=True):
+            _draw(found, pictures if len(results) == 1 else pictures / f"{one.hand}-{one.method}")
     return 0
 
 
@@ -239,7 +238,7 @@ def _about(lineup: "Lineup", results: "Sequence[Found]") -> dict[str, Any]:
     }
 
 
-def _draw(experiment: "Experiment", found: "Found", pictures: pathlib.Path) -> None:
+def _draw(found: "Found", pictures: pathlib.Path) -> None:
     """Draws curves and examples of noisy references, and episodes of the rows without a change."""
     from congrasp.services.evaluate.experiment import Variation
     from congrasp.services.evaluate.pictures import failure_sheets, save_noise_examples
@@ -247,14 +246,14 @@ def _draw(experiment: "Experiment", found: "Found", pictures: pathlib.Path) -> N
     from congrasp.services.evaluate.tables import Noise
     from congrasp.services.viz.sheets import save_png
 
-    console, policy = _console(), experiment.policy
+    console, policy = _console(), found.experiment.policy
     if noisy := found.of(Noise):
         who = f"{policy.spec.hand_name} hand, version {policy.version}"
-        title = f"{who}: {experiment.episodes} episodes a level"
+        title = f"{who}: {found.experiment.episodes} episodes a level"
         draw_noise([result.row for result in noisy], pictures / "noise.png", title)
         save_noise_examples(noisy, pictures / "noise_examples.png")
         console.print(f"Curves and examples of noisy references are drawn in {pictures}.", soft_wrap=True)
-    for name, sheet, _ in failure_sheets(experiment, found.of(Variation), _PICTURED, _PICTURED):
+    for name, sheet, _ in failure_sheets(found.experiment, found.of(Variation), _PICTURED, _PICTURED):
         save_png(pictures / f"{name}.png", sheet)
         console.print(f"Episodes of '{name}' are drawn in {pictures}.", soft_wrap=True)
 

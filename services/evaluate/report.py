@@ -184,7 +184,7 @@ def write_report(
       curves: curves of the training, if it was recorded.
       commands: commands that reproduce its parts.
       check: self-check of the hand, if it was run.
-      motion: an interactive grasp (`services.evaluate.turntable`).
+      motion: an interactive grasp (`services.evaluate.pictures.turntable`).
 
     Raises:
       CongraspError: jinja2 is not installed, or the file cannot be written.

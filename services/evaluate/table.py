@@ -142,7 +142,7 @@ def measured(row: Row, name: str, factor: float = 1.0) -> str:
     """Formats the mean and the 95th percentile of a force or depth, such as "7.1, 19.3"."""
     found = {**row.forces, **row.plausibility}
     pair = found.get(f"{name}_mean", found.get(name)), found.get(f"{name}_p95")
-    return ", ".join(NONE if x is None else f"{factor * x:.1f}" for x in pair) if None not in pair else NONE
+    return NONE if None in pair else ", ".join(f"{factor * x:.1f}" for x in pair if x is not None)
 
 
 def errors_text(errors: Mapping[str, float | None]) -> str:

@@ -220,6 +220,7 @@ def payload(scale: float, *, constant_mass: bool) -> tuple[Load, ...]:
 class Found(NamedTuple):
     """Results of one policy."""
 
+    experiment: Experiment
     results: list[Result]
     """Results of all rows but those of many objects."""
     rows: list[Row]
@@ -263,7 +264,7 @@ def evaluate_tables(
         wanted -= _OTHERS - {"noise"}
     if not names and not wanted & _OTHERS:
         raise CongraspError(f"The method '{task.method}' has no row in these tables.", "Pass another --table.")
-    found = Found([], [], [], "")
+    found = Found(experiment, [], [], [], "")
     if names or wanted & _OTHERS - {"objects"}:
         found = _rows(experiment, names, wanted, keep)
     if "objects" in wanted and pools:
@@ -292,7 +293,7 @@ def _rows(experiment: Experiment, names: Sequence[str], wanted: Set[str], keep: 
     }
     variations += [variation for table in levels if table in wanted for variation in levels[table]]
     results = experiment.run(variations, keep=keep)
-    return Found(results, [result.row for result in results], left_out, source, rules)
+    return Found(experiment, results, [result.row for result in results], left_out, source, rules)
 
 
 def _source(experiment: Experiment) -> str:

@@ -175,7 +175,7 @@ def evaluate_part(part: Part, entrant: Entrant, request: Request, track: Track) 
         "policy": facts(entrant),
         "settings": settings,
         "source": data.paper if data else _SOURCES.get(part.table, "hands"),
-        "pictures": _draw(part, experiment, found, request.out / "pictures" / part.name),
+        "pictures": _draw(part, found, request.out / "pictures" / part.name),
         "references": found.references,
         "heading_rules": found.heading_rules.sentence(entrant.hand) if found.heading_rules else "",
         "left_out": [str(error) for error in found.left_out],
@@ -231,11 +231,11 @@ def _read(file: pathlib.Path, part: Part, settings: Mapping[str, Any]) -> Result
         return None
 
 
-def _draw(part: Part, experiment: Experiment, found: Found, folder: pathlib.Path) -> list[dict[str, str]]:
+def _draw(part: Part, found: Found, folder: pathlib.Path) -> list[dict[str, str]]:
     """Draws failures and successes of every row; returns title, caption and file of each picture."""
     pictures = list[dict[str, str]]()
     results = found.of(Variation) if part.pictured else []
-    for name, sheet, causes in failure_sheets(experiment, results, _PICTURED, _PICTURED):
+    for name, sheet, causes in failure_sheets(found.experiment, results, _PICTURED, _PICTURED):
         file = folder / f"{name.replace(':', '-')}.png"
         save_png(file, sheet)
         title = f"{part.policy.hand}, {name.replace(':', ', ')}"

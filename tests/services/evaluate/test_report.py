@@ -90,7 +90,7 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
     def report_on(file, out, *, check, track, subject, **options):
         assert subject == f"--policy {file}" and options["episodes"] == 8 and options["run_dir"] == tmp_path
         write_report(out, policy, file.name, rows, "8 episodes", [], [], Commands("c", ""), check)
-        return Found([], rows, [CongraspError("Row x.", "Y.")], "")
+        return Found(None, [], rows, [CongraspError("Row x.", "Y.")], "")
 
     monkeypatch.setattr("congrasp.services.evaluate.report.report_on", report_on)
     command = ["report", str(tmp_path), "--out", str(out), "--episodes", "8", "--json", str(tmp_path / "rows.json")]
