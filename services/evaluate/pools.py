@@ -10,20 +10,18 @@ import contextlib
 import dataclasses
 import functools
 import itertools
-import json
 import logging
 import pathlib
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
 from congrasp.common.config import ObjectsConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.outline import Outline, outline
-from congrasp.common.io.files import write_atomically
-from congrasp.common.io.inputs import read_file
+from congrasp.common.io.caches import keep, read_kept
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool, object_scale
 from congrasp.common.objects.spec import GraspObject
@@ -32,7 +30,7 @@ from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.build import headings_of
-from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
+from congrasp.common.wire.codec import Message, encode
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.evaluate.episodes import Episodes, Sample, joined
@@ -57,6 +55,7 @@ _MOST = {True: 4096, False: 128}
 """Objects of a pool, for engines on a device and for others; each has a compiled scene in the latter."""
 _MESHES = 512
 """Objects of a pool of a folder, whose surfaces may be large."""
+_FORCE, _TORQUE = "sample/link_force", "sample/torque"
 _UNCHANGED = ImportOptions()
 _log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
@@ -230,6 +229,11 @@ class _Result(NamedTuple):
         """Number of episodes."""
         return len(self.sample.values.get("success", ()))
 
+    def message(self) -> Message:
+        """Returns the result for a file."""
+        arrays = {**self.sample.values, _FORCE: self.sample.link_force, _TORQUE: self.sample.torque}
+        return Message(arrays, {"objects": self.objects, "left_out": self.left_out})
+
 
 def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | None = None) -> list[Row]:
     """Evaluates rows of the heading constraint on unseen geometry: all objects, then by size, mass and family.
@@ -252,10 +256,11 @@ def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | No
         hold=two_seconds(policy.task),
         measured=pools.size * number <= MEASURED,
     )
-    about: dict[str, Any] = {"policy": content_hash(encode(policy.to_message())), "task": repr(experiment.task)}
-    about |= {"source": pools.source, "physics": experiment.physics, "seed": experiment.seed}
-    about |= {"size": pools.size, "each": each}
-    found = {n: old for n in range(number) if kept and (old := _read(_file(kept, n), about))}
+    made_by = content_hash(encode(policy.to_message()))
+    about = (made_by, experiment.task, pools.source, pools.size, each, experiment.physics, experiment.seed)
+    name = content_hash(repr(about).encode())
+    files = [kept / f"{name}-{n:05d}.safetensors" for n in range(number)] if kept else []
+    found = {n: _stored(message) for n, file in enumerate(files) if (message := read_kept(file))}
     todo = sorted(set(range(number)) - set(found))
     with contextlib.ExitStack() as stack, prepared(experiment, pools, todo) as ready:
         running: Episodes | None = None
@@ -267,8 +272,8 @@ def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | No
             result = _simulated(running, pool, progress, max(0, STRESSED - done))
             if done:  # forces are read from the first pool
                 result = result._replace(sample=result.sample.without_forces())
-            if kept:
-                _write(_file(kept, pool.experiment.pool), result, about)
+            for file in files[pool.experiment.pool :][:1]:
+                keep(file, result.message(), number)
             found[pool.experiment.pool] = result
     return _rows([found[n] for n in sorted(found)], experiment)
 
@@ -315,28 +320,8 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
     return rows
 
 
-def _file(folder: pathlib.Path, number: int) -> pathlib.Path:
-    """Path of a pool's result."""
-    return folder / f"pool-{number:05d}.safetensors"
-
-
-def _write(path: pathlib.Path, result: _Result, about: Mapping[str, Any]) -> None:
-    """Writes a result and its identity."""
-    arrays = {f"values/{name}": column for name, column in result.sample.values.items()}
-    arrays |= {"link_force": result.sample.link_force, "torque": result.sample.torque}
-    meta: dict[str, Any] = {"objects": result.objects, "left_out": result.left_out, "about": json.dumps(about)}
-    write_atomically(path, encode(Message(arrays, meta)))
-
-
-def _read(path: pathlib.Path, about: Mapping[str, Any]) -> _Result | None:
-    """Reads a result with the same arguments; returns None if it is missing or damaged."""
-    try:
-        message = decode(read_file(path, MAX_MESSAGE))
-        if message.meta["about"] != json.dumps(about):
-            return None
-        arrays, meta = message.arrays, message.meta
-        values = {name.removeprefix("values/"): x for name, x in arrays.items() if name.startswith("values/")}
-        sample = Sample(values, arrays["link_force"], arrays["torque"])
-        return _Result(sample, [tuple(facts) for facts in meta["objects"]], meta["left_out"])
-    except (LookupError, CongraspError):
-        return None
+def _stored(message: Message) -> _Result:
+    """Returns the result of its `message`."""
+    values = dict(message.arrays)
+    sample = Sample(link_force=values.pop(_FORCE), torque=values.pop(_TORQUE), values=values)
+    return _Result(sample, [tuple(facts) for facts in message.meta["objects"]], message.meta["left_out"])

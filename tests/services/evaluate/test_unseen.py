@@ -105,7 +105,7 @@ def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
     assert [names for names, _ in simulated] == [[o.name for o in OBJECTS[:2]], [o.name for o in OBJECTS[2:4]]]
     evaluated(first, 8, tmp_path, seed=1)
     assert len(simulated) == 4  # other settings: both anew
-    (tmp_path / "pool-00001.safetensors").write_bytes(b"cut off")
+    max(tmp_path.glob("*-00001.safetensors"), key=lambda file: file.stat().st_mtime_ns).write_bytes(b"cut off")
     evaluated(first, 8, tmp_path, seed=1)
     assert len(simulated) == 5
 

@@ -132,8 +132,7 @@ def test_bad_input_is_refused_before_anything_begins(policy, tmp_path, monkeypat
 
 def test_captured_sets_are_looked_for_where_the_import_puts_them(policy, tmp_path, capsys, monkeypatch):
     (tmp_path / "grab" / "objects").mkdir(parents=True)
-    nothing = Found(None, [], [], [], "")
-    monkeypatch.setattr(run, "evaluate_tables", lambda *arguments, **options: nothing)
+    monkeypatch.setattr(run, "evaluate_tables", lambda own, *arguments, **options: Found(own, [], [], [], ""))
     monkeypatch.setattr(run, "exam_pool", lambda exam, count: [])
     command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy)]
     assert load("reproduce")([*command, "--captured", str(tmp_path / "grab"), "--out", str(tmp_path / "out")])() == 1
