@@ -98,7 +98,6 @@ def evaluate(
     from congrasp.services.cli.console import at_least, tracked
     from congrasp.services.evaluate.experiment import Experiment
     from congrasp.services.evaluate.lineup import line_up, read_entrants
-    from congrasp.services.evaluate.plan import two_seconds
     from congrasp.services.evaluate.pools import MANY, exam_pool, folder_pools, procedural_pools
     from congrasp.services.evaluate.scores import write_json
     from congrasp.services.evaluate.tables import captured, evaluate_tables
@@ -131,7 +130,7 @@ def evaluate(
             experiment = dataclasses.replace(experiment, objects=sets.objects, constraints=sets.bank, paper=sets.paper)
         results = []
         for one, tables in lineup.entrants:
-            own = dataclasses.replace(experiment, policy=one.policy, hold=two_seconds(one.policy.task))
+            own = dataclasses.replace(experiment, policy=one.policy)
             folder = kept and kept / f"{one.hand}-{one.method}"
             results.append(evaluate_tables(own, tables, pools, folder, keep=pictures is not None))
     source = _source(lineup, objects, exam)

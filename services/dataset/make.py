@@ -24,7 +24,7 @@ from congrasp.services.dataset.columns import VERDICTS, grasp_columns, grasp_row
 from congrasp.services.dataset.shards import Shards
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.experiment import Experiment, Variation
-from congrasp.services.evaluate.plan import plan_row, two_seconds
+from congrasp.services.evaluate.plan import plan_row
 from congrasp.services.evaluate.pools import Pool, Pools, listed_pools, prepared
 
 FORMAT = 1
@@ -63,8 +63,7 @@ class Recipe:
     def template(self) -> Experiment:
         """The experiment of each shard, without its objects."""
         episodes = max(self.shares.values()) * min(self.shard, len(self.objects))
-        hold = two_seconds(self.experiment.policy.task)
-        return dataclasses.replace(self.experiment, episodes=episodes, hold=hold)
+        return dataclasses.replace(self.experiment, episodes=episodes)
 
     @functools.cached_property
     def about(self) -> dict[str, Any]:

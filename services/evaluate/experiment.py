@@ -110,8 +110,8 @@ class Experiment:
     """Seed of constraints and episodes."""
     friction: float = NOMINAL_FRICTION
     """Sliding friction between hand and object."""
-    hold: int = 0
-    """Control steps without the table; 0 uses the task's, which count for success."""
+    hold: int | None = None
+    """Control steps without the table; two seconds if None."""
     paper: str = "hands"
     """Table of the paper for comparison (`services.evaluate.paper`); empty for none."""
     pool: int = 0
@@ -129,7 +129,7 @@ class Experiment:
     @functools.cached_property
     def steps(self) -> int:
         """Control steps without the table."""
-        return self.hold or self.policy.task.hold_steps
+        return two_seconds(self.policy.task) if self.hold is None else self.hold
 
     @functools.cached_property
     def task(self) -> TaskConfig:

@@ -41,7 +41,6 @@ from congrasp.services.evaluate.experiment import (
     Variation,
     silent,
 )
-from congrasp.services.evaluate.plan import two_seconds
 from congrasp.services.evaluate.scores import Row, object_groups, summarise
 
 Exam = Literal["figures", "development"]
@@ -149,7 +148,7 @@ class Pool(NamedTuple):
     """A pool that is ready for simulation."""
 
     experiment: Experiment
-    """Its objects are the pool's; those from `real` on are repetitions that pad it. None if no object remains."""
+    """Its objects are the pool's; those from `real` on are repetitions that pad it. It has none if none remains."""
     real: int
     left_out: list[str]
 
@@ -253,7 +252,6 @@ def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | No
         experiment,
         constraints=None,
         episodes=each * pools.size,
-        hold=two_seconds(policy.task),
         measured=pools.size * number <= MEASURED,
     )
     made_by = content_hash(encode(policy.to_message()))

@@ -21,7 +21,7 @@ from congrasp.common.wire.codec import encode
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.evaluate.experiment import Experiment, Result, Track, Variation
 from congrasp.services.evaluate.pictures import failure_sheets, turntable
-from congrasp.services.evaluate.plan import objects_label, two_seconds
+from congrasp.services.evaluate.plan import objects_label
 from congrasp.services.evaluate.pools import exam_pool
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.evaluate.table import (
@@ -130,8 +130,7 @@ def report_on(
     policy, engine = bundles.load(file), resolve_physics(physics)
     curves = list(curves_of(run_dir)) if run_dir else []
     given = objects_of(objects, track=track) if objects else exam_pool("figures", pool)
-    hold = two_seconds(policy.task)
-    experiment = Experiment(policy, given, episodes=episodes, physics=engine, seed=seed, hold=hold, track=track)
+    experiment = Experiment(policy, given, episodes=episodes, physics=engine, seed=seed, track=track)
     found = evaluate_tables(experiment, ("single", "composed"), keep=True)
     results = found.of(Variation)
     advance = track("Pictures", len(results))

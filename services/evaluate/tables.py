@@ -283,7 +283,7 @@ def _rows(experiment: Experiment, names: Sequence[str], wanted: Set[str], keep: 
     sampled = experiment.constraints is None and task.headings == "all"
     if "single" in wanted and sampled and Variation() in variations:
         variations.insert(variations.index(Variation()) + 1, Center())
-        rules = heading_rules(experiment.bank, experiment.scaled, experiment.by_center)
+        rules = heading_rules(experiment)
     scale = object_scale(experiment.hand, task)
     levels = {
         "noise": NOISE,

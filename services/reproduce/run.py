@@ -23,7 +23,7 @@ from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.evaluate.experiment import Experiment, Track, Variation
 from congrasp.services.evaluate.lineup import Entrant, facts, read_entrant
 from congrasp.services.evaluate.pictures import failure_sheets
-from congrasp.services.evaluate.plan import NOMINAL_FRICTION, two_seconds
+from congrasp.services.evaluate.plan import NOMINAL_FRICTION
 from congrasp.services.evaluate.pools import MANY, exam_pool, procedural_pools
 from congrasp.services.evaluate.report import count_causes, curves_of
 from congrasp.services.evaluate.scores import Row, write_json
@@ -197,7 +197,6 @@ def _experiment(part: Part, entrant: Entrant, request: Request, track: Track) ->
         episodes=request.many if many else request.episodes,
         physics=request.physics,
         seed=request.seed,
-        hold=two_seconds(entrant.policy.task),
         track=track,
     )
     if not part.data:

@@ -272,7 +272,8 @@ def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, run_dir: p
     pool = load_pool(objects)
     console.print(f"Evaluating {episodes} episodes on {len(pool)} objects that no training sees …")
     policy = dataclasses.replace(policy, task=config.task)
-    (result,) = Experiment(policy, pool, episodes=episodes, batch=episodes).run([Variation()], keep=True)
+    heading = Experiment(policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps)
+    (result,) = heading.run([Variation()], keep=True)
     save_png(run_dir / EPISODE, episode_sheet(result.examples(1, 1)[-1]))
     return result.row
 

@@ -41,7 +41,7 @@ def test_rollouts_are_made_on_it():
 
 @pytest.mark.slow
 def test_an_evaluation_takes_its_batch_from_its_row():
-    own = Experiment(suite.policy(), OBJECTS, physics="counting", episodes=2 * BATCH)
+    own = Experiment(suite.policy(), OBJECTS, physics="counting", episodes=2 * BATCH, hold=TASK.hold_steps)
     (result,) = own.run([Variation()])
     assert result.row.episodes == 2 * BATCH
     assert CountingPhysics.steps == 2 * BATCH * (TASK.approach_steps + TASK.hold_steps)

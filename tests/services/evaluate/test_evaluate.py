@@ -49,7 +49,7 @@ def policy(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def experiment():
-    return Experiment(task.policy(), OBJECTS, episodes=EPISODES, batch=task.BATCH)
+    return Experiment(task.policy(), OBJECTS, episodes=EPISODES, batch=task.BATCH, hold=task.TASK.hold_steps)
 
 
 def test_references_are_grasps_and_made_once(experiment, cache, monkeypatch):
@@ -109,12 +109,23 @@ def test_rows_by_the_hand_centre_and_under_loads(experiment):
         result.row
         for result in experiment.run([Load(label="light", mass=(0.1, 0.1)), Load(label="heavy", mass=(2, 2)), Center()])
     )
-    rules = heading_rules(experiment.bank, experiment.scaled, experiment.by_center)
     assert center.group == CENTER_GROUP and center.episodes == EPISODES and center.paper.success == 0.96
-    assert 0 < rules.kept < rules.kept_by_center <= 1 - rules.from_below + 1e-9 and 0 < rules.opposed <= 1
     assert (light.group, light.mass_kg, heavy.mass_kg) == ("light", pytest.approx(0.1), pytest.approx(2.0))
     assert light.constraint == "heading" and light.paper is None and heavy.diverged == 0
     assert center.mass_kg == pytest.approx(np.mean([obj.mass for obj in experiment.scaled])), "its own objects again"
+
+
+def test_shares_of_the_rules_for_headings(experiment):
+    """They add up, and agree with the bank."""
+    found, bank = heading_rules(experiment), experiment.bank
+    assert found.kept + found.from_below + found.no_room == pytest.approx(1.0) and 0 <= found.moved <= 1
+    assert 0 < found.kept < found.kept_by_center <= 1 - found.from_below + 1e-9 and 0 < found.opposed <= 1
+    kept = sum(
+        len(set(np.asarray(bank.heading_index)[n, 0, r]))
+        for n in range(len(OBJECTS))
+        for r in range(len({tuple(rest) for rest in np.asarray(bank.rest)[n].tolist()}))
+    )
+    assert found.kept * 256 * sum(len(obj.rest_poses) for obj in experiment.scaled) == pytest.approx(kept)
 
 
 def test_rows_are_independent_and_kept_episodes_are_drawn(experiment):
@@ -168,7 +179,7 @@ def test_numbers_out_of_range(policy, arguments):
 
 
 def test_nominal_mass_and_friction_and_two_seconds():
-    assert plan.two_seconds(task.TASK) == 200
+    assert Experiment(task.policy(), []).steps == plan.two_seconds(task.TASK) == 200
     ranged = dataclasses.replace(
         task.TASK, mass_range=(0.8, 1.5), friction_range=(0.6, 1.0), gain_range=(0.8, 1.2), sensing=TRACKERS
     )

@@ -1,4 +1,4 @@
-"""What the exam is made of: objects, rules for headings, and which episodes are the same."""
+"""What the exam is made of: objects, and which episodes are the same."""
 
 import jax
 import numpy as np
@@ -9,15 +9,7 @@ from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED
 from congrasp.services.evaluate import pools
 from congrasp.services.evaluate.episodes import identity, reference
-from congrasp.services.evaluate.heading_rules import heading_rules
 from tests import task
-
-OBJECTS = task.OBJECTS
-
-
-@pytest.fixture(scope="module")
-def bank():
-    return task.bank()
 
 
 @pytest.fixture(scope="module")
@@ -40,18 +32,6 @@ def test_the_development_exam_never_reaches_objects_for_figures():
     assert pools.first_seed("development", 1_000_000) == HELD_OUT_SEED
     with pytest.raises(CongraspError, match="smaller --pool"):
         pools.first_seed("development", 1_000_001)
-
-
-def test_shares_of_the_rules_for_headings(bank):
-    """They add up, and agree with the bank."""
-    found = heading_rules(bank, OBJECTS)
-    assert found.kept + found.from_below + found.no_room == pytest.approx(1.0) and 0 <= found.moved <= 1
-    kept = sum(
-        len(set(np.asarray(bank.heading_index)[n, 0, r]))
-        for n in range(len(OBJECTS))
-        for r in range(len({tuple(rest) for rest in np.asarray(bank.rest)[n].tolist()}))
-    )
-    assert found.kept * 256 * sum(len(obj.rest_poses) for obj in OBJECTS) == pytest.approx(kept)
 
 
 def test_episodes_that_begin_alike_are_one(conditions):

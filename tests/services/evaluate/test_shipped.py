@@ -41,7 +41,7 @@ def check(hand, names, episodes):
     """A broken bundle, or physics that it does not know, falls below these floors."""
     recorded_rows = {row.constraint: row for row in RESULTS[hand].rows if not row.group}
     policy = bundles.load(policy_file(None, hand))
-    own = Experiment(policy, exam_pool("development", episodes), episodes=episodes)
+    own = Experiment(policy, exam_pool("development", episodes), episodes=episodes, hold=policy.task.hold_steps)
     for row in (result.row for result in own.run([Variation(name) for name in names])):
         record = recorded_rows[row.constraint]
         assert row.success >= farthest(record.success, row.covered, record.independent), row.constraint
