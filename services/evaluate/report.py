@@ -8,21 +8,17 @@ import pathlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from congrasp.actors.physics import PhysicsName, resolve_physics
 from congrasp.common.errors import need_package
 from congrasp.common.io.files import write_atomically
-from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.runtime.engines import engine_title
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import optional
 from congrasp.common.task.plausibility import CLEAN_MM
 from congrasp.common.wire.codec import encode
-from congrasp.services.assets.objects.named import objects_of
-from congrasp.services.evaluate.experiment import Experiment, Result, Track, Variation
+from congrasp.services.evaluate.experiment import Experiment, Result, Variation
 from congrasp.services.evaluate.pictures import failure_sheets, turntable
 from congrasp.services.evaluate.plan import objects_label
-from congrasp.services.evaluate.pools import exam_pool
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.evaluate.table import (
     FORCES,
@@ -95,58 +91,47 @@ class HandCheck:
 
 
 def report_on(
-    file: pathlib.Path,
+    experiment: Experiment,
+    name: str,
     out: pathlib.Path,
     *,
     subject: str,
-    episodes: int,
-    pool: int,
-    physics: PhysicsName = "auto",
-    seed: int = 0,
     objects: pathlib.Path | None = None,
     run_dir: pathlib.Path | None = None,
     check: HandCheck | None = None,
-    track: Track,
 ) -> Found:
     """Evaluates a policy by the paper's protocol and writes one HTML file about it.
 
     Args:
-      file: file of the policy.
+      experiment: policy, objects, engine and numbers.
+      name: name of the policy's file.
       out: the HTML file.
       subject: options of `congrasp evaluate` that select the policy.
-      episodes: episodes of each row.
-      pool: number of procedural objects.
-      physics: engine.
-      seed: seed of constraints and episodes.
-      objects: objects to grasp, as for `congrasp evaluate`; held-out procedural ones by default.
+      objects: path of the objects; None if they are procedural.
       run_dir: run whose curves are shown.
       check: self-check of its hand.
-      track: shows progress.
 
     Raises:
       CongraspError: a package is missing, or a file cannot be read or written.
     """
     template()  # fails before the evaluation if a package is missing
-    policy, engine = bundles.load(file), resolve_physics(physics)
+    policy, track = experiment.policy, experiment.track
     curves = list(curves_of(run_dir)) if run_dir else []
-    given = objects_of(objects, track=track) if objects else exam_pool("figures", pool)
-    experiment = Experiment(policy, given, episodes=episodes, physics=engine, seed=seed, track=track)
     found = evaluate_tables(experiment, ("single", "composed"), keep=True)
     results = found.of(Variation)
     advance = track("Pictures", len(results))
     sheets = []
-    for name, sheet, causes in failure_sheets(experiment, results, _PICTURED, _PICTURED):
-        sheets.append(Picture(name, png_of(sheet), count_causes(causes)))
+    for row, sheet, causes in failure_sheets(experiment, results, _PICTURED, _PICTURED):
+        sheets.append(Picture(row, png_of(sheet), count_causes(causes)))
         advance(len(sheets))
-    subject += f" --objects {objects}" if objects else f" --pool {pool}"
-    command = (
-        f"congrasp evaluate --table single composed {subject} --episodes {episodes} --physics {engine} --seed {seed}"
-    )
+    subject += f" --objects {objects}" if objects else f" --pool {len(experiment.objects)}"
+    numbers = f"--episodes {experiment.episodes} --physics {experiment.physics} --seed {experiment.seed}"
+    command = f"congrasp evaluate --table single composed {subject} {numbers}"
     commands = Commands(command, f"{command} --pictures pictures", f"congrasp plot {run_dir}" if curves else "")
     rules = f". {found.heading_rules.sentence(policy.spec.hand_name)}" if found.heading_rules else ""
-    which = f"{len(given)} objects ({objects_label(policy, objects)})"
-    how = f"{episodes} episodes a row on {which}, {engine_title(engine)}, seed {seed}{rules}"
-    write_report(out, policy, file.name, found.rows, how, sheets, curves, commands, check, _motion(results))
+    which = f"{len(experiment.objects)} objects ({objects_label(policy, objects)})"
+    how = f"{experiment.episodes} episodes a row on {which}, {engine_title(experiment.physics)}, seed {experiment.seed}"
+    write_report(out, policy, name, found.rows, how + rules, sheets, curves, commands, check, _motion(results))
     return found
 
 

@@ -87,12 +87,13 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
     bundles.save(policy, tmp_path / "policy.safetensors")
     rows, out = [row("heading", 0.99, 0.975, 0.995)], tmp_path / "report.html"
 
-    def report_on(file, out, *, check, track, subject, **options):
-        assert subject == f"--policy {file}" and options["episodes"] == 8 and options["run_dir"] == tmp_path
-        write_report(out, policy, file.name, rows, "8 episodes", [], [], Commands("c", ""), check)
+    def report_on(own, name, out, *, check, subject, objects, run_dir):
+        assert subject == f"--policy {tmp_path / name}" and own.episodes == 8 and run_dir == tmp_path
+        write_report(out, own.policy, name, rows, "8 episodes", [], [], Commands("c", ""), check)
         return Found(None, [], rows, [CongraspError("Row x.", "Y.")], "")
 
     monkeypatch.setattr("congrasp.services.evaluate.report.report_on", report_on)
+    monkeypatch.setattr("congrasp.services.evaluate.pools.exam_pool", lambda exam, count: [])
     command = ["report", str(tmp_path), "--out", str(out), "--episodes", "8", "--json", str(tmp_path / "rows.json")]
     assert main.run([*command, "--check", str(tmp_path / "check.json")]) == 0
     found = Reader(text := out.read_text())
