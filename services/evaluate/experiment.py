@@ -280,11 +280,12 @@ class Experiment:
           visit: called with each batch, and the number of its episodes that count.
           stressed: least number of episodes that continue after the hold.
         """
-        found: list[Sample] = []
+        found, done = list[Sample](), 0
         for batch, count in self.batches(running, variation, plan, stressed):
             visit(batch, count)
             found.append(batch.sample.first(count))
-            progress(sum(len(sample.values["success"]) for sample in found))
+            done += count
+            progress(done)
         return joined(found)
 
     def batches(
