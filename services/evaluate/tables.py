@@ -260,7 +260,7 @@ def evaluate_tables(
     """
     task, wanted = experiment.policy.task, {*TABLES, *_OTHERS} if "all" in tables else set(tables)
     names = [name for name in known_rows((k for k in TABLES if k in wanted), task) if takes(task.method, name)]
-    if not takes(task.method, "heading"):
+    if not takes(task.method, Variation().constraint):
         wanted -= _OTHERS - {"noise"}
     if not names and not wanted & _OTHERS:
         raise CongraspError(f"The method '{task.method}' has no row in these tables.", "Pass another --table.")
