@@ -95,8 +95,7 @@ def _references(
     """Returns constraints with references from a policy's grasps; prints their number."""
     from congrasp.common.policy import bundle as bundles
     from congrasp.common.policy.pretrained import policy_file, reference_file
-    from congrasp.common.runtime.parallel import cores
-    from congrasp.services.evaluate.evaluator import Evaluator
+    from congrasp.services.evaluate.experiment import Experiment
 
     bundle = bundles.load(policy or reference_file(hand.name) or policy_file(None, hand.name))
     if bundle.spec.hand_name != hand.name:
@@ -104,9 +103,7 @@ def _references(
             f"The policy has the hand '{bundle.spec.hand_name}', not '{hand.name}'.",
             f"Pass --hand {bundle.spec.hand_name}.",
         )
-    evaluator = Evaluator(bundle, objects, threads=cores(), seed=seed)
-    advance = track("Grasping: reference poses", None)
-    made = evaluator.references_of(bundle, lambda done, of: advance(done))
+    made = Experiment(bundle, objects, seed=seed, track=track).references_of(bundle)
     whole = made.grasps[:, 0]
     print(
         f"Grasps per object: {whole.min()} to {whole.max()}; where there is none, the hand is closed around the object."

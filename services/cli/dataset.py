@@ -66,9 +66,9 @@ def dataset(
     from congrasp.common.policy.pretrained import policy_file
     from congrasp.common.task.constraints import require_known
     from congrasp.services.cli.console import at_least, at_most, tracked
-    from congrasp.services.dataset.card import write_card
     from congrasp.services.dataset.make import Recipe, make, pools_of, shard_objects
-    from congrasp.services.dataset.shards import Shards
+    from congrasp.services.dataset.shards import Shards, write_card
+    from congrasp.services.evaluate.experiment import Experiment
     from congrasp.services.evaluate.plan import ALIGNED
     from congrasp.services.evaluate.pools import most_objects
     from congrasp.services.evaluate.results import provenance
@@ -89,7 +89,7 @@ def dataset(
     asked = tuple(dict.fromkeys(constraints)) or tuple(known_rows(("single", "composed"), bundle.task))
     require_known([name for one in asked for name in one.removesuffix(ALIGNED).split("+")], bundle.task)
     recipe = Recipe(
-        policy=bundle,
+        experiment=Experiment(bundle, [], physics=engine, seed=seed, batch=batch),
         policy_sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
         objects=found,
         options=mesh,
@@ -97,9 +97,6 @@ def dataset(
         constraints=asked,
         keep=tuple(name for name in dict.fromkeys(keep) if name != "all"),
         shard=shard or shard_objects(per_object),
-        physics=engine,
-        seed=seed,
-        batch=batch,
     )
     pools = pools_of(recipe)
     shards = Shards(out, len(pools.make))

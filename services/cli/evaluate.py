@@ -16,7 +16,8 @@ from congrasp.common.runtime.engines import engine_title
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from congrasp.services.evaluate.lineup import Entrant, Lineup
+    from congrasp.common.objects.spec import GraspObject
+    from congrasp.services.evaluate.lineup import Lineup
     from congrasp.services.evaluate.tables import Found
 
 Table = Literal[
@@ -95,9 +96,11 @@ def evaluate(
     from congrasp.actors.physics import resolve_physics
     from congrasp.services.assets.objects.named import objects_of
     from congrasp.services.cli.console import at_least, tracked
+    from congrasp.services.evaluate.experiment import Experiment
     from congrasp.services.evaluate.lineup import line_up, read_entrants
+    from congrasp.services.evaluate.pools import MANY, exam_pool, folder_pools, procedural_pools
     from congrasp.services.evaluate.scores import write_json
-    from congrasp.services.evaluate.tables import Setup, captured, evaluate_tables
+    from congrasp.services.evaluate.tables import captured, evaluate_tables
 
     at_least(1, episodes=episodes)
     at_least(0, pool=pool, batch=batch)
@@ -105,30 +108,36 @@ def evaluate(
     lineup = line_up(table, read_entrants(policy, method), hand, method)
     if pictures is not None and {"noise", "all"} & set(table):
         need_package("--pictures", "matplotlib")
+    if constraints is not None and not objects:
+        raise CongraspError("--constraints needs the sets' objects.", "Pass their folder with --objects.")
     engine = resolve_physics(physics)
     settings: dict[str, Any] = {"physics": engine, "batch": batch, "seed": seed, "friction": friction}
-    setup = Setup(episodes, exam=exam, pool=pool, folder=objects, **settings)
-    pools = json and json.with_name(f"{json.name}.pools")
+    kept = json and json.with_name(f"{json.name}.pools")
+    pools = None
+    if {"objects", "all"} & set(table):
+        many = pool or min(episodes, MANY)
+        pools = folder_pools(objects, engine) if objects else procedural_pools(many, engine, exam)
     without: list[str] = []
     with tracked() as track:
-        if objects and (constraints or set(table) != {"objects"}):
-            setup = dataclasses.replace(setup, given=objects_of(objects, track=track))
+        given: list[GraspObject] = []
+        if constraints is not None or set(table) != {"objects"}:
+            given = objects_of(objects, track=track) if objects else exam_pool(exam, pool)
+        experiment = Experiment(lineup.entrants[0][0].policy, given, episodes=episodes, track=track, **settings)
         if constraints is not None:
-            if not objects:
-                raise CongraspError("--constraints needs the sets' objects.", "Pass their folder with --objects.")
-            sets = captured(constraints, split, setup.given)
+            sets = captured(constraints, split, given)
             _check_hand(sets.hand, [one.hand for one, _ in lineup.entrants])
-            without = sorted({obj.name for obj in setup.given} - {obj.name for obj in sets.objects})
-            setup = dataclasses.replace(setup, given=sets.objects, bank=sets.bank, paper=sets.paper)
+            without = sorted({obj.name for obj in given} - {obj.name for obj in sets.objects})
+            experiment = dataclasses.replace(experiment, objects=sets.objects, constraints=sets.bank, paper=sets.paper)
         results = []
         for one, tables in lineup.entrants:
-            own = dataclasses.replace(setup, keep=pools and pools / f"{one.hand}-{one.method}")
-            results.append(evaluate_tables(one.policy, tables, own, track, keep=pictures is not None))
+            own = dataclasses.replace(experiment, policy=one.policy)
+            folder = kept and kept / f"{one.hand}-{one.method}"
+            results.append(evaluate_tables(own, tables, pools, folder, keep=pictures is not None))
     source = _source(lineup, objects, exam)
     _show(results, lineup, f"{_who(lineup)}, on {source}, {engine_title(engine)}, friction {friction:g}", by)
     if without:
         print(f"Left out: objects without a constraint set, or a heading in it ({split}): {', '.join(without)}.")
-    if json and pools:
+    if json and kept:
         about = {
             **_about(lineup, results),
             "objects": source,
@@ -138,11 +147,10 @@ def evaluate(
             **settings,
         }
         write_json([row for found in results for row in found.rows], json, about)
-        shutil.rmtree(pools, ignore_errors=True)
+        shutil.rmtree(kept, ignore_errors=True)
     if pictures is not None:
         for (one, _), found in zip(lineup.entrants, results, strict=True):
-            folder = pictures if len(results) == 1 else pictures / f"{one.hand}-{one.method}"
-            _draw(found, one, episodes, folder)
+            _draw(found, pictures if len(results) == 1 else pictures / f"{one.hand}-{one.method}")
     return 0
 
 
@@ -177,7 +185,7 @@ def _who(lineup: "Lineup") -> str:
 
 def _source(lineup: "Lineup", objects: pathlib.Path | None, exam: Exam) -> str:
     """Label of the objects, with their scale for the hand if there is one."""
-    from congrasp.services.evaluate.protocol import objects_label
+    from congrasp.services.evaluate.plan import objects_label
 
     labels = list(dict.fromkeys(objects_label(one.policy, objects, exam) for one, _ in lineup.entrants))
     return labels[0] if len(labels) == 1 else f"{labels[0].partition(',')[0]} in each hand's size"
@@ -194,11 +202,11 @@ def _console() -> "Console":
 
 def _show(results: "Sequence[Found]", lineup: "Lineup", title: str, by: str | None) -> None:
     """Prints the tables, the effect of the rules for headings, the references' source, and reasons for skipped rows."""
-    from congrasp.services.evaluate.cells import object_table, tables_of
+    from congrasp.services.evaluate.table import object_table, tables_of
 
     console, rows = _console(), [row for found in results for row in found.rows]
     for shown in tables_of(rows, title, lineup.missing) + ([object_table(rows)] if by == "object" else []):
-        console.print(shown)
+        console.print(shown.terminal())
     for (one, _), found in zip(lineup.entrants, results, strict=True):
         if found.heading_rules:
             console.print(found.heading_rules.sentence(one.hand), markup=False, soft_wrap=True)
@@ -229,20 +237,22 @@ def _about(lineup: "Lineup", results: "Sequence[Found]") -> dict[str, Any]:
     }
 
 
-def _draw(found: "Found", one: "Entrant", episodes: int, pictures: pathlib.Path) -> None:
-    """Draws curves and examples of noisy references, and episodes of the other rows."""
-    from congrasp.services.evaluate.failures import failure_sheets
-    from congrasp.services.evaluate.noise_sheet import draw_noise
+def _draw(found: "Found", pictures: pathlib.Path) -> None:
+    """Draws curves and examples of noisy references, and episodes of the rows without a change."""
+    from congrasp.services.evaluate.experiment import Variation
+    from congrasp.services.evaluate.pictures import failure_sheets, save_noise_examples
+    from congrasp.services.evaluate.plots import draw_noise
+    from congrasp.services.evaluate.tables import Noise
     from congrasp.services.viz.sheets import save_png
 
-    if found.evaluator is None:
-        return
-    console = _console()
-    if found.noisy:
-        title = f"{one.hand} hand, version {one.policy.version}: {episodes} episodes a level"
-        draw_noise(found.evaluator, found.noisy, pictures, title)
+    console, policy = _console(), found.experiment.policy
+    if noisy := found.of(Noise):
+        who = f"{policy.spec.hand_name} hand, version {policy.version}"
+        title = f"{who}: {found.experiment.episodes} episodes a level"
+        draw_noise([result.row for result in noisy], pictures / "noise.png", title)
+        save_noise_examples(noisy, pictures / "noise_examples.png")
         console.print(f"Curves and examples of noisy references are drawn in {pictures}.", soft_wrap=True)
-    for name, sheet, _ in failure_sheets(found.evaluator, one.policy, found.names, _PICTURED, _PICTURED):
+    for name, sheet, _ in failure_sheets(found.experiment, found.of(Variation), _PICTURED, _PICTURED):
         save_png(pictures / f"{name}.png", sheet)
         console.print(f"Episodes of '{name}' are drawn in {pictures}.", soft_wrap=True)
 

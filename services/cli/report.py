@@ -47,10 +47,14 @@ def report(
       congrasp report runs/mine --episodes 16
       congrasp report --hand allegro --objects my-objects --out allegro.html
     """
-    from congrasp.common.policy.bundle import content_hash
+    from congrasp.actors.physics import resolve_physics
+    from congrasp.common.policy import bundle as bundles
     from congrasp.common.policy.pretrained import policy_file
+    from congrasp.services.assets.objects.named import objects_of
     from congrasp.services.cli.console import at_least, tracked
-    from congrasp.services.evaluate.reporting import report_on
+    from congrasp.services.evaluate.experiment import Experiment
+    from congrasp.services.evaluate.pools import exam_pool
+    from congrasp.services.evaluate.report import report_on
     from congrasp.services.evaluate.scores import write_json
 
     at_least(1, episodes=episodes, pool=pool)
@@ -58,22 +62,31 @@ def report(
         raise CongraspError(f"--out is the folder {out}.", f"Pass a file in it: --out {out / 'report.html'}")
     run_dir = source if source is not None and source.is_dir() else None
     file = _policy_of_run(run_dir) if run_dir else policy_file(source, hand)
+    checked = None if check is None else _checked(check)
     with tracked() as track:
         made = report_on(
-            file,
+            Experiment(
+                bundles.load(file),
+                objects_of(objects, track=track) if objects else exam_pool("figures", pool),
+                episodes=episodes,
+                physics=resolve_physics(physics),
+                seed=seed,
+                track=track,
+            ),
+            file.name,
             out,
             subject=f"--policy {file}" if source else f"--hand {hand}",
-            episodes=episodes,
-            pool=pool,
-            physics=physics,
-            seed=seed,
             objects=objects,
             run_dir=run_dir,
-            check=None if check is None else _checked(check),
-            track=track,
+            check=checked,
         )
     if json is not None:
-        about = {"policy": str(file), "content": content_hash(file.read_bytes()), "episodes": episodes, "pool": pool}
+        about = {
+            "policy": str(file),
+            "content": bundles.content_hash(file.read_bytes()),
+            "episodes": episodes,
+            "pool": pool,
+        }
         write_json(made.rows, json, {**about, "seed": seed})
     for error in made.left_out:
         print(f"Left out: {error}")

@@ -64,9 +64,8 @@ def reproduce(
     """
     from congrasp.common.policy.pretrained import pretrained_hands
     from congrasp.services.cli.console import at_least, tracked
-    from congrasp.services.evaluate.protocol import NOMINAL_FRICTION
-    from congrasp.services.reproduce.evaluation import Numbers
-    from congrasp.services.reproduce.page import JSON, LATEX, PAGE, summary
+    from congrasp.services.reproduce.comparison import summary
+    from congrasp.services.reproduce.page import JSON, LATEX, PAGE
     from congrasp.services.reproduce.plan import BASELINES, policies
     from congrasp.services.reproduce.run import Request, reproduce, to_train
 
@@ -79,6 +78,7 @@ def reproduce(
     options |= {"physics": "" if physics == "auto" else physics, "out": "" if str(out) == _OUT else out}
     chosen, compared = tuple(dict.fromkeys(hands)) or tuple(pretrained_hands()), methods or BASELINES
     _check_names(chosen, compared)
+    usual_episodes, usual_pool = _QUICK if quick else _FULL
     request = Request(
         out=out,
         hands=chosen,
@@ -89,14 +89,15 @@ def reproduce(
         options=tuple(shlex.split(training)),
         patience=60.0 * patience,
         command=_command(options),
+        episodes=episodes or usual_episodes,
+        pool=pool or usual_pool,
+        many=_MANY[quick] * (episodes or usual_episodes),
+        physics=physics,
+        seed=seed,
     )
     _check_device([one.name for one in to_train(request)])
-    usual_episodes, usual_pool = _QUICK if quick else _FULL
-    episodes, pool = episodes or usual_episodes, pool or usual_pool
-
     with tracked() as track:
-        numbers = Numbers(episodes, pool, _MANY[quick] * episodes, physics, seed, NOMINAL_FRICTION)
-        account = reproduce(request, numbers, track, lambda text: print(text, flush=True))
+        account = reproduce(request, track, lambda text: print(text, flush=True))
     print(summary(account.cells))
     print(f"The page is {out / PAGE}, next to {JSON} and {LATEX}.")
     return 1 if account.failures else 0

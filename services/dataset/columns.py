@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from congrasp.actors.initial import InitialConditions
 from congrasp.actors.stress import ASSESSED, SURVIVAL
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
@@ -98,11 +97,9 @@ def object_columns() -> list[Column]:
     ]
 
 
-def grasp_rows(
-    hand: Hand, task: TaskConfig, asked: str, conditions: InitialConditions, batch: Batch
-) -> dict[str, np.ndarray]:
+def grasp_rows(task: TaskConfig, asked: str, batch: Batch) -> dict[str, np.ndarray]:
     """Columns (B, ...) of a batch of episodes under the constraints `asked`, without those of object and episode."""
-    start, state, features = conditions.reset_state, *batch.final
+    start, state, features = batch.conditions.reset_state, *batch.final
     values, names = batch.sample.values, asked.removesuffix(ALIGNED).split("+")
     rows: dict[str, Any] = {
         "constraints": np.full(len(start.q), asked),
@@ -126,7 +123,7 @@ def grasp_rows(
         requested = 1.0 if constraint.name in names else np.nan
         rows |= {
             f"goal_{constraint.name}_{name}": requested * np.asarray(array, np.float32)
-            for name, array in conditions.goal[constraint.name]._asdict().items()
+            for name, array in batch.conditions.goal[constraint.name]._asdict().items()
         }
         rows |= {spec.name: requested * values[spec.name] for spec in constraint.errors}
     return {name: np.asarray(column) for name, column in rows.items()}

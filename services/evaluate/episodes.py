@@ -1,5 +1,6 @@
 """Parallel episodes under a policy's mean action, for evaluations and reference grasps."""
 
+import dataclasses
 import math
 import zlib
 from collections.abc import Callable, Sequence
@@ -22,18 +23,64 @@ from congrasp.common.objects.distance import DistanceField
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, acting
 from congrasp.common.runtime.engines import PhysicsName
+from congrasp.common.runtime.parallel import cores
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint
 from congrasp.common.task.types import Array, Goal
 from congrasp.common.wire.codec import Message
-from congrasp.services.evaluate.protocol import two_seconds
-from congrasp.services.evaluate.scores import Sample
+from congrasp.services.evaluate.plan import two_seconds
+
+PROBED_EPISODES = 2000
+"""Most episodes of a row from which forces are read."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """Episodes of one row."""
+
+    values: dict[str, np.ndarray]
+    """Metrics (E,), by the names in `actors.env.metric_names`; `mass_kg`; `identity`, equal for equal episodes; and
+    `reference`, equal for the same object and reference (`identity`, `reference`)."""
+    link_force: np.ndarray
+    """(E', W, L) net contact force of each link in the paper's window, N, for the first E' episodes."""
+    torque: np.ndarray
+    """(E', W, F) finger torques in that window, as shares of their limits."""
+
+    def where(self, chosen: np.ndarray) -> "Sample":
+        """Selects episodes by `chosen` (E,)."""
+        kept = chosen[: len(self.link_force)]
+        values = {name: column[chosen] for name, column in self.values.items()}
+        return Sample(values, self.link_force[kept], self.torque[kept])
+
+    def without_forces(self) -> "Sample":
+        """Drops the forces of all episodes."""
+        return Sample(self.values, self.link_force[:0], self.torque[:0])
+
+    def first(self, count: int) -> "Sample":
+        """Returns the first `count` episodes."""
+        values = {name: column[:count] for name, column in self.values.items()}
+        return Sample(values, self.link_force[:count], self.torque[:count])
+
+
+def joined(samples: Sequence[Sample]) -> Sample:
+    """Joins the episodes of several samples, with forces of at most the first `PROBED_EPISODES`."""
+    probed: list[Sample] = []
+    for sample in samples:
+        probed.append(sample)
+        if len(sample.link_force) < len(sample.values["success"]):
+            break
+    return Sample(
+        {name: np.concatenate([sample.values[name] for sample in samples]) for name in samples[0].values},
+        np.concatenate([sample.link_force for sample in probed])[:PROBED_EPISODES],
+        np.concatenate([sample.torque for sample in probed])[:PROBED_EPISODES],
+    )
 
 
 class Batch(NamedTuple):
     """B episodes simulated together."""
 
+    conditions: InitialConditions
     sample: Sample
     final: View
     """Hand and object at the end of the hold."""
@@ -53,7 +100,6 @@ class Episodes:
         hold: int,
         batch: int,
         physics: PhysicsName,
-        threads: int,
         field: DistanceField | None = None,
         traced: bool = False,
     ):
@@ -61,12 +107,11 @@ class Episodes:
 
         Args:
           bundle: the policy.
-          task: the task, under `services.evaluate.protocol.protocol`.
+          task: the task, under `services.evaluate.plan.protocol`.
           objects: objects, scaled for the hand.
           hold: control steps without the table.
           batch: number B of episodes.
           physics: engine, except `auto`.
-          threads: threads of the `native` engine.
           field: grids of the objects' surfaces, used to measure plausibility at every step
             (`common.task.plausibility`); None skips it.
           traced: records every step of every episode.
@@ -76,7 +121,7 @@ class Episodes:
         self._worker = RolloutWorker(
             self._hand,
             task,
-            make_physics(physics, self._hand, task, objects, threads=threads),
+            make_physics(physics, self._hand, task, objects, threads=cores()),
             None,
             acting(bundle.spec.layout, mean=True),
             batch=batch,
@@ -138,7 +183,7 @@ class Episodes:
             )
             return self._message(begun, trace, {name: float(x[episode]) for name, x in values.items()}, episode)
 
-        return Batch(Sample({**values, **self._facts(conditions)}, force, torque), final, message)
+        return Batch(conditions, Sample({**values, **self._facts(conditions)}, force, torque), final, message)
 
     def take_grasps(self) -> Grasps:
         """Returns the grasps of the last batch that may become references."""
@@ -147,7 +192,7 @@ class Episodes:
     def _facts(self, conditions: InitialConditions) -> dict[str, np.ndarray]:
         """Columns (B,) of the initial conditions of episodes: masses in kg, and their identities."""
         start = jax.tree.map(np.asarray, conditions.reset_state)
-        masses = np.array([obj.mass for obj in self._objects])[start.object_index]
+        masses = np.array([obj.mass for obj in self.objects])[start.object_index]
         mass = (masses * start.mass_scale).astype(np.float32)
         return {"mass_kg": mass, "identity": identity(conditions), "reference": reference(conditions)}
 
@@ -160,7 +205,7 @@ class Episodes:
 
     def _measure(self, objects: Sequence[GraspObject], field: DistanceField | None) -> None:
         """Prepares measurements for these objects; later phases are under `protocols.stress`."""
-        self._objects = objects
+        self.objects = objects
         if self._measured:
             stress = protocols.stress(self._task, objects, self._hold) if self.stressable else None
             self._worker.adjust(protocol=stress, probe_data=field)
@@ -173,7 +218,7 @@ class Episodes:
             trace,
             begun.goal.row(episode),
             jax.tree.map(lambda array: np.asarray(array)[episode], begun.surface),
-            self._objects[int(np.asarray(begun.reset_state.object_index)[episode])],
+            self.objects[int(np.asarray(begun.reset_state.object_index)[episode])],
             {
                 "version": self._bundle.version,
                 "actor": "evaluation",

@@ -1,4 +1,4 @@
-"""Plans the episodes of a row, before any is simulated.
+"""Protocol of an evaluation, and plans of the episodes of a row before any is simulated.
 
 A row has the same number of episodes for every object that allows its constraints, and nearly the same number for each
 resting pose of an object. The draws of an episode depend on the seed, the row's constraints, the object and the
@@ -6,6 +6,7 @@ episode's number, never on other rows, objects or policies of the evaluation.
 """
 
 import dataclasses
+import pathlib
 import zlib
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -16,14 +17,52 @@ import numpy as np
 from congrasp.actors import initial
 from congrasp.actors.initial import InitialConditions, PlannedEpisodes
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.mjcf import CONTACT
+from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.config import TaskConfig
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import get_constraint, optional, require_known
 from congrasp.common.task.sampling.bank import ConstraintBank
 
+HOLD_SECONDS = 2.0
+"""Required hold of a grasp without the table, beyond the paper's quarter of a second."""
+NOMINAL_FRICTION = CONTACT.friction[0]
+"""Default sliding friction between hand and object in evaluations."""
 ALIGNED = ":aligned"
 """Suffix of rows with matching pose and trajectory; elsewhere they are drawn independently."""
+
+
+def two_seconds(task: TaskConfig) -> int:
+    """Control steps in `HOLD_SECONDS`."""
+    return round(HOLD_SECONDS / task.control_dt)
+
+
+def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) -> TaskConfig:
+    """Returns the task with `hold` steps without the table, unscaled masses, one friction and no disturbances.
+
+    Servo gains are nominal, and the tracker is perfect. Rates are therefore comparable between policies trained with
+    different ranges.
+    """
+    return dataclasses.replace(
+        task,
+        hold_steps=min(task.hold_steps, hold),
+        hold_steps_max=hold,
+        end_when_fallen=False,
+        mass_range=(1.0, 1.0),
+        friction_range=(friction, friction),
+        gain_range=(1.0, 1.0),
+        sensing=SensingConfig(),
+    )
+
+
+def objects_label(bundle: PolicyBundle, folder: pathlib.Path | None, exam: str = "figures") -> str:
+    """Name of the objects' source, with the factor on their lengths for the policy's hand."""
+    scale = object_scale(get_hand(bundle.spec.hand), bundle.task)
+    source = str(folder) if folder else f"procedural objects ({exam})"
+    return source if scale == 1.0 else f"{source}, lengths x {scale:g} for the {bundle.spec.hand_name} hand"
 
 
 class RowPlan(NamedTuple):

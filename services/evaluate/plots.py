@@ -1,7 +1,8 @@
-"""Figures of an evaluation from its JSON: comparison with the paper, rates with intervals, distributions of errors."""
+"""Figures of an evaluation's rows: comparison with the paper, rates with intervals, errors, and the effect of noise."""
 
+import functools
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,9 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_json
 from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.services.evaluate.scores import ERRORS, Row
+from congrasp.services.evaluate.table import RATE, Table, paper_rate, percent, row_title
+from congrasp.services.evaluate.tables import NOISE
 from congrasp.services.record.palette import INK
 from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, save, style
 
@@ -18,6 +22,11 @@ _TITLES = {
     for spec in constraint.errors
 }
 """Title and unit of each error, by its name in the rows."""
+_NOISES = {
+    "joints": "Pose: normal error of every finger joint",
+    "depth": "Pose: depth that it sinks into the object",
+    "jitter": "Trajectory: normal error of every waypoint",
+}
 _COLUMNS = 4
 _LARGEST = 64 << 20  # limit of a JSON file in bytes
 
@@ -37,9 +46,9 @@ def plot_evaluation(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str
       CongraspError: it is not such a file.
     """
     try:
-        rows = read_json(path, _LARGEST)["rows"]
-        figures = {"table": _table(rows), "success": _success(rows)}
-        if any(row.get("quantiles") for row in rows):
+        rows = [Row.from_json(row) for row in read_json(path, _LARGEST)["rows"]]
+        figures = {"table": _table(compared(rows)), "success": _success(rows)}
+        if any(row.quantiles for row in rows):
             figures["errors"] = _errors(rows)
     except (CongraspError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise CongraspError(
@@ -49,76 +58,113 @@ def plot_evaluation(path: pathlib.Path, out: pathlib.Path, formats: Sequence[str
     return [file for name, figure in figures.items() for file in save(figure, out / name, formats)]
 
 
-def cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Text of the table, its header first; a pair is ours and the paper's."""
-    shown = [name for name in _TITLES if any(row.get(name) is not None for row in rows)]
-    head = ["constraint", "episodes", "success, %", "paper", "held 2 s, %"]
-    table = [[*head, *(word for name in shown for word in (f"{_TITLES[name][0]}, {_TITLES[name][1]}", "paper"))]]
-    for row, label in zip(rows, _labels(rows), strict=True):
-        paper = row["paper"] or {"success": None, "errors": {}}
-        interval = f"{_percent(row['success'])} ({_percent(row['success_low'])}-{_percent(row['success_high'])})"
-        line = [label, str(row["episodes"]), interval, _percent(paper["success"]), _percent(row["held_2s"])]
-        line += [word for name in shown for word in (_figure(row.get(name)), _figure(paper["errors"].get(name)))]
-        table.append(line)
-    return table
-
-
-def _labels(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Labels of the rows: constraint and group, with hand and method if there are several."""
-    several = len({(row["hand"], row["method"]) for row in rows}) > 1
-    keys = ("constraint", "group", "hand", "method") if several else ("constraint", "group")
-    return [", ".join(row[key] for key in keys if row[key]) for row in rows]
-
-
-def _percent(rate: float | None) -> str:
-    """Formats a rate in per cent; empty if there is none."""
-    return "" if rate is None else f"{100 * rate:.1f}"
-
-
-def _figure(value: float | None) -> str:
-    """Formats a value with three digits; empty if there is none."""
-    return "" if value is None else f"{value:.3f}"
-
-
-def _table(rows: Sequence[Mapping[str, Any]]) -> Any:
-    """Draws the figure of `cells`."""
-    text = cells(rows)
-    widths = [
-        max(max(len(word) for word in cell.split("\n")) for cell in column)
-        for column in zip(*_wrapped(text), strict=True)
+def compared(rows: Sequence[Row]) -> Table:
+    """Rates and all errors of rows, each with the paper's."""
+    labels = _labels(rows)
+    columns: list[tuple[str, Callable[[Row], str]]] = [
+        ("constraint", lambda row: labels[rows.index(row)]),
+        ("episodes", lambda row: str(row.episodes)),
+        ("success", RATE["success"]),
+        ("paper", paper_rate),
+        ("held 2 s", lambda row: percent(row.held_2s)),
     ]
-    total = sum(widths) + 2 * len(widths)
-    figure = new_figure(0.085 * total + 0.3, 0.32 * len(text) + 1.0, "Evaluation and paper")
+    for name, (title, unit) in _TITLES.items():
+        if any(row.errors.get(name) is not None for row in rows):
+            columns += [
+                (f"{title}, {unit}", functools.partial(_error, name)),
+                ("paper", functools.partial(_paper_error, name)),
+            ]
+    return Table.of("Evaluation and paper", rows, columns)
+
+
+def draw_noise(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
+    """Draws success and errors against the noise, a panel for each kind, as PNG.
+
+    Args:
+      rows: rows of `services.evaluate.tables.NOISE`, in that order.
+      path: the file to write.
+      title: title of the figure.
+
+    Raises:
+      CongraspError: the file cannot be written.
+    """
+    figure = new_figure(4.0 * len(_NOISES), 5.6, title)
+    grid = figure.subplots(2, len(_NOISES), sharex="col")
+    pairs = list(zip(NOISE, rows, strict=True))
+    for (above, below), (kind, heading) in zip(grid.T, _NOISES.items(), strict=True):
+        constraint = next(noise.constraint for noise in NOISE if noise.kind == kind)
+        shown = [(n, row) for n, row in pairs if n.constraint == constraint and n.kind in ("", kind)]
+        unit, factor = ("rad", 1.0) if kind == "joints" else ("cm", 100.0)
+        x = [factor * noise.level for noise, _ in shown]
+        style(above, heading, "", "%")
+        style(below, "", f"{kind}, {unit}", "mean error")
+        for name, label, colour in (("success", "success", COLOURS[0]), ("held_2s", "held for 2 s", COLOURS[2])):
+            ends = ("_low", "", "_high")
+            low, middle, high = ([100 * (getattr(row, f"{name}{end}") or 0.0) for _, row in shown] for end in ends)
+            above.plot(x, middle, "o-", color=colour, label=label)
+            above.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
+        for (name, scale, unit), colour in zip(_scaled(constraint), (COLOURS[3], COLOURS[1]), strict=True):
+            found = [np.nan if (value := row.errors[name]) is None else scale * value for _, row in shown]
+            below.plot(x, found, "s-", color=colour, label=f"error, {unit}")
+        above.set_ylim(0, 102)
+        below.set_ylim(0, 1.1 * below.get_ylim()[1])
+        for axes in (above, below):
+            axes.legend(frameon=False, fontsize=8)
+    save(figure, path.with_suffix(""), ["png"])
+
+
+def _scaled(constraint: str) -> list[tuple[str, float, str]]:
+    """Errors of a constraint, with a factor and a unit: angles in rad, lengths in dm."""
+    shown = {"rad": (1.0, "rad"), "m": (10.0, "dm")}
+    return [(name, *shown[_TITLES[name][1]]) for name in ERRORS[constraint].values()]
+
+
+def _labels(rows: Sequence[Row]) -> list[str]:
+    """Labels of the rows: constraint and group, with hand and method if there are several."""
+    several = len({(row.hand, row.method) for row in rows}) > 1
+    return [row_title(row) + (f", {row.hand}, {row.method}" if several else "") for row in rows]
+
+
+def _error(name: str, row: Row) -> str:
+    """An error of a row with three digits; empty if there is none."""
+    return "" if (error := row.errors.get(name)) is None else f"{error:.3f}"
+
+
+def _paper_error(name: str, row: Row) -> str:
+    """The paper's; empty if there is none."""
+    return f"{row.paper.errors[name]:.3f}" if row.paper and name in row.paper.errors else ""
+
+
+def _table(table: Table) -> Any:
+    """Draws a table."""
+    heads = [name.replace(", ", ",\n", 1) for name in table.columns]
+    cells = zip(heads, *table.rows, strict=True)
+    widths = [2 + max(len(word) for cell in column for word in cell.split("\n")) for column in cells]
+    figure = new_figure(0.085 * sum(widths) + 0.3, 0.32 * (1 + len(table.rows)) + 1.0, table.title)
     axes = figure.subplots()
     axes.set_axis_off()
-    edges = np.cumsum([0, *(width + 2 for width in widths)]) / total
-    for r, line in enumerate(_wrapped(text)):
-        y = 1 - (r + 0.5) / len(text)
-        for c, word in enumerate(line):
-            heavy = "bold" if r == 0 or c == 0 else "normal"
-            quiet = QUIET if text[0][c] == "paper" else INK
-            x, side = (edges[c], "left") if c == 0 else (edges[c + 1], "right")
-            axes.text(x, y, word, ha=side, va="center", fontsize=8.5, color=quiet, fontweight=heavy)
-        axes.axhline(1 - (r + 1) / len(text), color=INK if r == 0 else "#e3e6ea", linewidth=1.0 if r == 0 else 0.6)
-    axes.set_xlim(0, 1)
-    axes.set_ylim(0, 1)
+    shown = axes.table(
+        table.rows, colLabels=heads, colWidths=np.divide(widths, sum(widths)), bbox=(0, 0, 1, 1), edges="horizontal"
+    )
+    shown.auto_set_font_size(False)
+    shown.set_fontsize(8.5)
+    for (line, column), cell in shown.get_celld().items():
+        cell.set_edgecolor(INK if line == 0 else "#e3e6ea")
+        weight = "bold" if line == 0 or column == 0 else "normal"
+        cell.set_text_props(color=QUIET if table.columns[column] == "paper" else INK, weight=weight)
+        cell.set_text_props(ha="left" if column == 0 else "right")
     return figure
 
 
-def _wrapped(text: Sequence[Sequence[str]]) -> list[list[str]]:
-    """Breaks the header's words after their comma."""
-    return [[word.replace(", ", ",\n", 1) for word in text[0]], *map(list, text[1:])]
-
-
-def _success(rows: Sequence[Mapping[str, Any]]) -> Any:
+def _success(rows: Sequence[Row]) -> Any:
     """Draws the success of each row with its interval, and that of the paper."""
     figure = new_figure(7.2, 0.9 + 0.36 * len(rows), "Success, with 95 % intervals")
     axes = figure.subplots()
     y = np.arange(len(rows))[::-1]
-    rates = np.array([row["success"] for row in rows])
-    spread = np.abs(np.array([[row["success_low"], row["success_high"]] for row in rows]).T - rates)
+    rates = np.array([row.success for row in rows])
+    spread = np.abs(np.array([[row.success_low, row.success_high] for row in rows]).T - rates)
     axes.errorbar(rates, y, xerr=spread, fmt="o", color=COLOURS[0], capsize=3, markersize=5, label="ours")
-    paper = [(row["paper"]["success"], height) for row, height in zip(rows, y, strict=True) if row["paper"]]
+    paper = [(row.paper.success, height) for row, height in zip(rows, y, strict=True) if row.paper]
     if paper:
         axes.plot(*zip(*paper, strict=True), "D", color=COLOURS[1], markersize=5, label="paper")
     axes.set_yticks(y, _labels(rows))
@@ -128,9 +174,9 @@ def _success(rows: Sequence[Mapping[str, Any]]) -> Any:
     return figure
 
 
-def _errors(rows: Sequence[Mapping[str, Any]]) -> Any:
+def _errors(rows: Sequence[Row]) -> Any:
     """Draws cumulative distributions of the errors, one panel each."""
-    shown = [name for name in _TITLES if any(name in row.get("quantiles", {}) for row in rows)]
+    shown = [name for name in _TITLES if any(name in row.quantiles for row in rows)]
     columns = min(_COLUMNS, len(shown))
     lines = -(-len(shown) // columns)
     figure = new_figure(3.6 * columns, 0.6 + 2.8 * lines, "Errors of successful episodes: share of episodes below")
@@ -141,14 +187,12 @@ def _errors(rows: Sequence[Mapping[str, Any]]) -> Any:
     for axes, name in zip(grid.flat, shown, strict=False):
         title, unit = _TITLES[name]
         for i, row in enumerate(rows):
-            found = row.get("quantiles", {}).get(name)
-            if not found:
+            if not (found := row.quantiles.get(name)):
                 continue
             colour = COLOURS[i % len(COLOURS)]
             axes.plot(found, np.linspace(0, 1, len(found)), color=colour, linewidth=1.6, label=labels[i])
-            paper = (row["paper"] or {"errors": {}})["errors"].get(name)
-            if paper is not None:
-                axes.axvline(paper, color=colour, linewidth=1.0, linestyle=":")
+            if row.paper and name in row.paper.errors:
+                axes.axvline(row.paper.errors[name], color=colour, linewidth=1.0, linestyle=":")
         style(axes, title, f"{unit}   (dotted: mean of the paper)", "share")
         axes.set_ylim(0, 1)
         axes.legend(fontsize=7, frameon=False, labelcolor=QUIET)

@@ -1,7 +1,8 @@
-"""Pools of objects of equal size, made one after another with their constraints: as many objects as there is time for.
+"""Objects of evaluations: the procedural ones of the two exams, and pools of as many as there is time for.
 
-While the episodes of one pool are simulated the next is made or imported; no program is compiled for it, and only these
-two are in memory.
+Pools have one size, so that no program is compiled again, and only two are in memory: while the episodes of one are
+simulated, the next is made or imported with its constraints. The result of a pool is a few numbers per episode, which
+can be stored on disk, so that a stopped evaluation resumes at its current pool.
 """
 
 import concurrent.futures
@@ -11,34 +12,69 @@ import functools
 import itertools
 import logging
 import pathlib
+import zlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from congrasp.common.config import ObjectsConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.outline import Outline, outline
-from congrasp.common.hands.spec import Hand
+from congrasp.common.io.caches import keep, read_kept
 from congrasp.common.objects import procedural
-from congrasp.common.objects.distance import DistanceField, distance_field
-from congrasp.common.objects.pool import object_scale, scale_objects
+from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool, object_scale
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.policy.bundle import content_hash
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling.bank import ConstraintBank
-from congrasp.common.task.sampling.build import build_bank, headings_of
+from congrasp.common.task.sampling.build import headings_of
+from congrasp.common.wire.codec import Message, encode
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.evaluate.exam import FAMILIES, Exam, first_seed
+from congrasp.services.evaluate.episodes import Episodes, Sample, joined
+from congrasp.services.evaluate.experiment import (
+    MEASURED,
+    STRESSED,
+    Experiment,
+    Variation,
+    silent,
+)
+from congrasp.services.evaluate.scores import Row, object_groups, summarise
 
+Exam = Literal["figures", "development"]
+"""Sets of procedural objects: one for published figures, one for development."""
+FAMILIES = tuple(sorted(procedural.FAMILIES, key=lambda family: zlib.crc32(family.encode())))
+"""All families, cycled among the objects in an order that mixes basic and household ones."""
+MANY = 50_000
+"""Most procedural objects of the table `objects` by default."""
+_SEEDS: dict[Exam, int] = {"figures": FIGURES_SEED, "development": HELD_OUT_SEED}
 _MOST = {True: 4096, False: 128}
 """Objects of a pool, for engines on a device and for others; each has a compiled scene in the latter."""
 _MESHES = 512
 """Objects of a pool of a folder, whose surfaces may be large."""
+_FORCE, _TORQUE = "sample/link_force", "sample/torque"
 _UNCHANGED = ImportOptions()
 _log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
+
+
+def first_seed(exam: Exam, count: int) -> int:
+    """Seed of the first of `count` objects of an exam.
+
+    Raises:
+      CongraspError: that many objects of the development exam would overlap those for figures.
+    """
+    if exam == "development" and count > FIGURES_SEED - HELD_OUT_SEED:
+        raise CongraspError(f"The development set does not have {count} objects.", "Pass a smaller --pool.")
+    return _SEEDS[exam]
+
+
+def exam_pool(exam: Exam, count: int = 0) -> list[GraspObject]:
+    """Returns the objects of an exam; 0 takes one of each family."""
+    count = count or len(FAMILIES)
+    return load_pool(ObjectsConfig(families=FAMILIES, count=count, seed=first_seed(exam, count)))
 
 
 class Loaded(NamedTuple):
@@ -59,7 +95,7 @@ class Pools(NamedTuple):
 
 
 def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
-    """Returns at least `count` procedural objects of an evaluation set, in pools of one size."""
+    """Returns at least `count` procedural objects of an exam, in pools of one size."""
     number, size = _divided(count, _MOST[ENGINES[physics].on_device])
     seed = first_seed(exam, number * size)
     families = procedural.family_turns(number * size, seed, FAMILIES)
@@ -102,27 +138,41 @@ def listed_pools(found: Sequence[ObjectAt], most: int, options: ImportOptions = 
     return Pools(",".join(one.name for one in found), size, [functools.partial(make, part) for part in parts])
 
 
-class Pool(NamedTuple):
-    """A pool that is ready for simulation."""
-
-    number: int
-    objects: list[GraspObject]
-    """Objects scaled for the hand; those from `real` on are repetitions that pad the pool."""
-    bank: ConstraintBank | None
-    """None if no object remains."""
-    field: DistanceField | None
-    real: int
-    left_out: list[str]
-
-
 def _divided(count: int, most: int) -> tuple[int, int]:
     """Number and size of pools for `count` objects, at most `most` in each."""
     number = -(-count // most)
     return number, -(-count // number)
 
 
+class Pool(NamedTuple):
+    """A pool that is ready for simulation."""
+
+    experiment: Experiment
+    """Its objects are the pool's; those from `real` on are repetitions that pad it. It has none if none remains."""
+    real: int
+    left_out: list[str]
+
+
 @contextlib.contextmanager
-def one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
+def prepared(experiment: Experiment, pools: Pools, wanted: Sequence[int]) -> Iterator[Iterator[Pool]]:
+    """Yields an experiment on each of some pools, made in a thread while the previous one is in use."""
+    with _one_ahead(_prepared(experiment, pools, wanted)) as found:
+        yield found
+
+
+def _prepared(experiment: Experiment, pools: Pools, wanted: Sequence[int]) -> Iterator[Pool]:
+    """Yields experiments on pools, with their constraints."""
+    for number in wanted:
+        loaded, left_out = pools.make[number]()
+        own, kept = _approachable(dataclasses.replace(experiment, pool=number, track=silent), loaded, pools.size)
+        lost = [obj.name for obj in loaded if all(obj is not other for other in kept)]
+        if kept:
+            _ = own.field  # computed here
+        yield Pool(own, len(kept), [*left_out, *lost])
+
+
+@contextlib.contextmanager
+def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
     """Yields the same items, each computed in a thread while the previous one is in use."""
     with concurrent.futures.ThreadPoolExecutor(1) as background:
 
@@ -135,48 +185,141 @@ def one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
         yield taken()
 
 
-def prepared(
-    hand: Hand, task: TaskConfig, pools: Pools, seed: int, wanted: Sequence[int], measured: bool
-) -> Iterator[Pool]:
-    """Yields pools with their constraints."""
-    for number in wanted:
-        loaded, left_out = pools.make[number]()
-        objects = scale_objects(hand, task, loaded)
-        kept, bank = _with_bank(hand, task, objects, pools.size, seed + number)
-        left_out = [*left_out, *(obj.name for obj in objects if all(obj is not other for other in kept))]
-        filled = _filled(kept, pools.size)
-        field = distance_field(filled) if measured and kept else None
-        yield Pool(number, filled, bank, field, len(kept), left_out)
-
-
-def _filled(objects: Sequence[GraspObject], size: int) -> list[GraspObject]:
-    """Pads objects to `size` by repeating the first ones."""
-    return list(itertools.islice(itertools.cycle(objects), size))
-
-
-def _with_bank(
-    hand: Hand, task: TaskConfig, objects: list[GraspObject], size: int, seed: int
-) -> tuple[list[GraspObject], ConstraintBank | None]:
-    """Returns the objects that the hand can approach in some resting pose, and a bank of `size` of them (`_filled`)."""
+def _approachable(
+    experiment: Experiment, objects: list[GraspObject], size: int
+) -> tuple[Experiment, list[GraspObject]]:
+    """Returns an experiment on `size` of the objects that the hand can approach in some resting pose, and all these."""
     while objects:
-        filled = _filled(objects, size)
+        filled = list(itertools.islice(itertools.cycle(objects), size))
+        own = dataclasses.replace(experiment, objects=filled)
         try:
-            return objects, build_bank(hand, task, filled, seed)
+            _ = own.bank
+            return own, objects
         except CongraspError as error:
-            scale, seeds = object_scale(hand, task), [(seed, n) for n in range(size)]
-            own = itertools.repeat(outline(hand), size)
-            fine = parallel_map(_approachable, [task] * size, filled, seeds, [scale] * size, own)
+            task, scale = own.task, object_scale(own.hand, own.task)
+            seeds = [(own.seed + own.pool, n) for n in range(size)]
+            hand = itertools.repeat(outline(own.hand), size)
+            fine = parallel_map(_has_heading, [task] * size, own.scaled, seeds, [scale] * size, hand)
             if all(fine):
                 raise
             _log.warning("%s", error)
             lost = {id(obj) for obj, good in zip(filled, fine, strict=True) if not good}
             objects = [obj for obj in objects if id(obj) not in lost]
-    return [], None
+    return dataclasses.replace(experiment, objects=()), []
 
 
-def _approachable(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, own: Outline) -> bool:
+def _has_heading(task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, own: Outline) -> bool:
     """True if an object has a heading for the hand with this outline, and does not lie too flat for all of them."""
     try:
         return bool(headings_of(task, obj, seed, None, scale, own)["weight"])
     except CongraspError:
         return False
+
+
+class _Result(NamedTuple):
+    """Result of a pool: its episodes, and name, largest side (m), mass (kg) and family of each object."""
+
+    sample: Sample
+    objects: list[tuple[str, float, float, str]]
+    left_out: list[str]
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.sample.values.get("success", ()))
+
+    def message(self) -> Message:
+        """Returns the result for a file."""
+        arrays = {**self.sample.values, _FORCE: self.sample.link_force, _TORQUE: self.sample.torque}
+        return Message(arrays, {"objects": self.objects, "left_out": self.left_out})
+
+
+def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | None = None) -> list[Row]:
+    """Evaluates rows of the heading constraint on unseen geometry: all objects, then by size, mass and family.
+
+    Args:
+      experiment: policy and settings; `episodes` is the least total number, and every object has the same number.
+      pools: pools of objects.
+      kept: folder for results of pools, from which an evaluation with the same arguments resumes; None stores none.
+
+    Raises:
+      CongraspError: the hand can approach none of the objects.
+    """
+    policy, number = experiment.policy, len(pools.make)
+    each = -(-experiment.episodes // (pools.size * number))
+    advance = experiment.track("Episodes on many objects", experiment.episodes)
+    experiment = dataclasses.replace(
+        experiment,
+        constraints=None,
+        episodes=each * pools.size,
+        measured=pools.size * number <= MEASURED,
+    )
+    made_by = content_hash(encode(policy.to_message()))
+    about = (made_by, experiment.task, pools.source, pools.size, each, experiment.physics, experiment.seed)
+    name = content_hash(repr(about).encode())
+    files = [kept / f"{name}-{n:05d}.safetensors" for n in range(number)] if kept else []
+    found = {n: _stored(message) for n, file in enumerate(files) if (message := read_kept(file))}
+    todo = sorted(set(range(number)) - set(found))
+    with contextlib.ExitStack() as stack, prepared(experiment, pools, todo) as ready:
+        running: Episodes | None = None
+        for pool in ready:
+            if pool.real and not running:
+                running = stack.enter_context(pool.experiment.simulator())
+            done = sum(result.episodes for result in found.values())
+            progress = functools.partial(lambda before, n: advance(before + n), done)
+            result = _simulated(running, pool, progress, max(0, STRESSED - done))
+            if done:  # forces are read from the first pool
+                result = result._replace(sample=result.sample.without_forces())
+            for file in files[pool.experiment.pool :][:1]:
+                keep(file, result.message(), number)
+            found[pool.experiment.pool] = result
+    return _rows([found[n] for n in sorted(found)], experiment)
+
+
+def _simulated(running: Episodes | None, pool: Pool, progress: Callable[[int], None], stressed: int) -> _Result:
+    """Simulates the episodes of a pool, if it has objects."""
+    if not running or not pool.real:
+        return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], pool.left_out)
+    own, row = pool.experiment, Variation()
+    sample = own.sample(running, row, own.plan(row), progress, stressed=stressed)
+    facts = [
+        (obj.name, float(np.ptp(obj.visual_vertices, axis=0).max()), float(obj.mass), obj.family)
+        for obj in own.scaled[: pool.real]
+    ]
+    return _Result(sample.where(sample.values["object_index"] < pool.real), facts, pool.left_out)
+
+
+def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
+    """Returns the rows of all objects, then of groups."""
+    left_out = [name for result in results for name in result.left_out]
+    results = [result for result in results if result.episodes]
+    if not results:
+        raise CongraspError("None of the objects can be approached.", "Scale them for the hand, or pass others.")
+    firsts = np.cumsum([0, *(len(result.objects) for result in results)])
+    for result, first in zip(results, firsts, strict=False):
+        result.sample.values["object_index"] = result.sample.values["object_index"] + first
+    whole = joined([result.sample for result in results])
+    index = whole.values["object_index"].astype(int)
+    names, sizes, masses, families = zip(*(facts for result in results for facts in result.objects), strict=True)
+    row = functools.partial(
+        summarise,
+        Variation().constraint,
+        experiment.hand.name,
+        held_2s=True,
+        objects=[*names, *left_out],
+        method=experiment.task.method,
+        paper="objects",
+    )
+    rows = [row(sample=whole)]
+    for label, members in object_groups(np.array(sizes), np.array(masses), np.array(families)):
+        chosen = members[index]
+        if chosen.any():
+            rows.append(row(sample=whole.where(chosen), pool=int(members.sum()), group=label))
+    return rows
+
+
+def _stored(message: Message) -> _Result:
+    """Returns the result of its `message`."""
+    values = dict(message.arrays)
+    sample = Sample(link_force=values.pop(_FORCE), torque=values.pop(_TORQUE), values=values)
+    return _Result(sample, [tuple(facts) for facts in message.meta["objects"]], message.meta["left_out"])

@@ -27,13 +27,13 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import reference_file
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import POSES, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.evaluate.episodes import Episodes
-from congrasp.services.evaluate.plan import RowPlan, batches
-from congrasp.services.evaluate.protocol import protocol
+from congrasp.services.evaluate.plan import RowPlan, batches, protocol
 
 HELD_OUT = POSES // 5
 """References of an object and region that its constraint set holds out (`write_sets`), the last ones."""
@@ -74,7 +74,6 @@ def make(
     bank: ConstraintBank,
     *,
     physics: PhysicsName,
-    threads: int,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> References:
     """Returns the bank with references of a reference policy, cached on disk.
@@ -85,20 +84,23 @@ def make(
       objects: N objects, scaled for the hand.
       bank: bank of these objects (`build_bank`), with references for where the policy finds none.
       physics: engine, except `auto`.
-      threads: threads of the `native` engine.
       progress: called with the number of references found, and their greatest number.
     """
     kept = cache_folder("references") / f"{_key(policy, task, objects, physics)}.safetensors"
     if found := _read(kept, bank):
         return found
-    grasps = _grasp(policy, task, objects, bank, physics, threads, progress)
+    grasps = _grasp(policy, task, objects, bank, physics, progress)
     made = _filled(policy, task, bank, grasps)
     arrays = {name: np.asarray(getattr(made.bank, name)) for name in _ARRAYS}
     keep(kept, Message({**arrays, "grasps": made.grasps}, {"kind": "references"}), _MOST_FILES)
     return made
 
 
-_ARRAYS = ("pose_q", "pose_position", "pose_quaternion", "trajectory_position", "trajectory_quaternion", "pose_valid")
+_REGIONS = tuple(next(c.name for c in CONSTRAINTS if c.region == v and not c.from_reference) for v in range(2))
+"""Constraints of the grasps on the whole surface, and on the graspable region."""
+_FROM_REFERENCES = {constraint.name for constraint in CONSTRAINTS if constraint.from_reference}
+_ARRAYS = tuple(name for name in ConstraintBank._fields if name.partition("_")[0] in _FROM_REFERENCES)
+"""Columns of references: fields of `Poses`, then results of `make_references`."""
 
 
 def _grasp(
@@ -107,7 +109,6 @@ def _grasp(
     objects: Sequence[GraspObject],
     bank: ConstraintBank,
     physics: PhysicsName,
-    threads: int,
     progress: Callable[[int, int], None],
 ) -> list[list[list[Poses]]]:
     """Returns at most `POSES` grasps of each object (N) and region (V)."""
@@ -115,11 +116,11 @@ def _grasp(
     hand = get_hand(policy.spec.hand)
     found: list[list[list[Poses]]] = [[[] for _ in range(2)] for _ in objects]
     names = np.array([int(store.digest(obj)[:8], 16) for obj in objects], np.uint32)
-    regions = [initial.allowing(own, bank, asked) for asked in ((), ("affordance",))]
+    regions = [initial.allowing(own, bank, (asked,)) for asked in _REGIONS]
     most = POSES * sum(int(allowed.any(1).sum()) for allowed in regions)
     size = min(ENGINES[physics].batch, 1 << (most - 1).bit_length())
-    with Episodes(policy, own, objects, hold=own.hold_steps, batch=size, physics=physics, threads=threads) as episodes:
-        for region, constraint in enumerate(("heading", "affordance")):
+    with Episodes(policy, own, objects, hold=own.hold_steps, batch=size, physics=physics) as episodes:
+        for region, constraint in enumerate(_REGIONS):
             rests = [np.flatnonzero(row) for row in regions[region]]
             tried = np.zeros(len(objects), int)
             while True:

@@ -22,15 +22,14 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
 from congrasp.common.runtime.engines import engine_title
 from congrasp.common.runtime.parallel import cores
-from congrasp.services.evaluate.cells import paper_cells, plausibility_cells, rate_cells, row_title
 from congrasp.services.evaluate.heading_rules import HeadingRules
 from congrasp.services.evaluate.scores import Row
+from congrasp.services.evaluate.table import PLAUSIBILITY, RATE, Columns, Table, paper_rate, percent, row_title
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 FOLDER = pathlib.Path("docs", "results")
 _BLOCK = re.compile(r"(<!-- results (\S+) (\S+) -->\n).*?(<!-- end of results -->)", re.S)
 _LARGEST = 1 << 26
-_NONE = "\N{EN DASH}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,37 +81,35 @@ def recorded(root: pathlib.Path = ROOT) -> dict[str, Results]:
 
 def summary(results: Results) -> list[str]:
     """Success, held and clean, with the paper's success."""
-    head = ("constraint", "success", "held for 2 s", "held, and clean", "success, held of all objects", "paper")
-    return _table(
-        head,
-        (
-            (
-                row_title(row),
-                f"{100 * row.success:.1f} %",
-                _percent(row.held_2s),
-                _percent(row.plausibility.get("clean")),
-                f"{_percent(row.success_all)}, {_percent(row.held_all)}",
-                paper_cells(row)[0],
-            )
-            for row in results.rows
-        ),
+    columns: Columns[Row] = (
+        ("constraint", row_title),
+        ("success", lambda row: percent(row.success)),
+        ("held for 2 s", lambda row: percent(row.held_2s)),
+        ("held, and clean", lambda row: percent(row.plausibility.get("clean"))),
+        ("success, held of all objects", lambda row: f"{percent(row.success_all)}, {percent(row.held_all)}"),
+        ("paper", paper_rate),
     )
+    return Table.of("", results.rows, columns).markdown()
 
 
 def rates(results: Results) -> list[str]:
     """Rates with intervals and errors, and those of the paper."""
-    head = ("constraint", "episodes (independent)", "objects", "success (95 %)", "held 2 s (95 %)", "of all objects")
-    rows = []
-    for row in results.rows:
-        name, _, *cells = rate_cells(row)
-        rows.append((name, f"{row.episodes} ({row.independent:.0f})", *cells))
-    return _table((*head, "error", "paper"), rows)
+    columns: Columns[Row] = (
+        ("constraint", row_title),
+        ("episodes (independent)", lambda row: f"{row.episodes} ({row.independent:.0f})"),
+        ("objects", RATE["objects"]),
+        ("success (95 %)", RATE["success"]),
+        ("held 2 s (95 %)", RATE["held 2 s"]),
+        *((name, RATE[name]) for name in ("of all objects", "error", "paper")),
+    )
+    return Table.of("", results.rows, columns).markdown()
 
 
 def plausibility(results: Results) -> list[str]:
     """Penetrations (mean, 95th percentile), peaks of the wrist, and survival of grasps."""
-    head = ("constraint", "in itself, mm", "in the table", "in the object", "wrist, m/s", "m/s²", "clean", "lifted")
-    return _table((*head, "pushed by half the weight", "and by 1 N"), map(plausibility_cells, results.rows))
+    heads = ("constraint", "in itself, mm", "in the table", "in the object", "wrist, m/s", *dict(PLAUSIBILITY[5:]))
+    columns = [(head, cell) for head, (_, cell) in zip(heads, PLAUSIBILITY, strict=True)]
+    return Table.of("", results.rows, columns).markdown()
 
 
 def conditions(results: Results) -> list[str]:
@@ -171,16 +168,6 @@ def pages(root: pathlib.Path = ROOT) -> Iterator[tuple[pathlib.Path, str]]:
         text = path.read_text()
         if (new := filled(text, results, path.name)) != text:
             yield path, new
-
-
-def _table(head: Sequence[str], rows: Iterator[tuple[str, ...]] | Sequence[tuple[str, ...]]) -> list[str]:
-    """Returns a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines]
-
-
-def _percent(rate: float | None) -> str:
-    return _NONE if rate is None else f"{100 * rate:.1f} %"
 
 
 if __name__ == "__main__":

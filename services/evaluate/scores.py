@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import pathlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -13,7 +14,7 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.plausibility import CLEAN_MM
-from congrasp.services.evaluate.intervals import NORMAL_95, clustered, independent_episodes, standard_error
+from congrasp.services.evaluate.episodes import Sample
 from congrasp.services.evaluate.paper import PaperRow, paper_row
 from congrasp.services.evaluate.plan import ALIGNED
 
@@ -27,8 +28,8 @@ ERRORS = {c.name: {spec.name: spec.column or spec.name for spec in c.errors} for
 """Names of the errors of each constraint, in the metrics of episodes and in rows."""
 UNITS = {spec.column or spec.name: spec.unit for constraint in CONSTRAINTS for spec in constraint.errors}
 """Units of the errors, by their names in rows."""
-PROBED_EPISODES = 2000
-"""Most episodes of a row from which forces are read."""
+NORMAL_95 = 1.959964
+"""Quantile of the normal distribution for two-sided 95 % intervals."""
 _FORCES = ("link_force", "force_sum", "torque_share")
 _PRESSED = ("force_peak_n", "force_mean_n")
 _HUNDREDTHS = np.linspace(0, 1, 101)
@@ -36,48 +37,10 @@ _SIZES = ("small", "medium", "large")
 
 
 @dataclasses.dataclass(frozen=True)
-class Sample:
-    """Episodes of one row."""
-
-    values: dict[str, np.ndarray]
-    """Metrics (E,), by the names in `actors.env.metric_names`; `mass_kg`; `identity`, equal for equal episodes; and
-    `reference`, equal for the same object and reference (`services.evaluate.episodes`)."""
-    link_force: np.ndarray
-    """(E', W, L) net contact force of each link in the paper's window, N, for the first E' episodes."""
-    torque: np.ndarray
-    """(E', W, F) finger torques in that window, as shares of their limits."""
-
-    def where(self, chosen: np.ndarray) -> "Sample":
-        """Selects episodes by `chosen` (E,)."""
-        kept = chosen[: len(self.link_force)]
-        values = {name: column[chosen] for name, column in self.values.items()}
-        return Sample(values, self.link_force[kept], self.torque[kept])
-
-    def first(self, count: int) -> "Sample":
-        """Returns the first `count` episodes."""
-        values = {name: column[:count] for name, column in self.values.items()}
-        return Sample(values, self.link_force[:count], self.torque[:count])
-
-
-def joined(samples: Sequence[Sample]) -> Sample:
-    """Joins the episodes of several samples, with forces of at most the first `PROBED_EPISODES`."""
-    probed: list[Sample] = []
-    for sample in samples:
-        probed.append(sample)
-        if len(sample.link_force) < len(sample.values["success"]):
-            break
-    return Sample(
-        {name: np.concatenate([sample.values[name] for sample in samples]) for name in samples[0].values},
-        np.concatenate([sample.link_force for sample in probed])[:PROBED_EPISODES],
-        np.concatenate([sample.torque for sample in probed])[:PROBED_EPISODES],
-    )
-
-
-@dataclasses.dataclass(frozen=True)
 class Row:
     """One row of a table.
 
-    Rates have 95 % intervals (`services.evaluate.intervals.clustered`; clusters are objects or captured sequences).
+    Rates have 95 % intervals (`clustered`; clusters are objects or captured sequences).
     Errors and forces are averaged over successful episodes.
     """
 
@@ -224,7 +187,7 @@ def _rates(
     Args:
       names: names of the two means.
       outcomes: (E,) bool.
-      clusters: (E,) labels of clusters, see `services.evaluate.intervals`.
+      clusters: (E,) labels of clusters, see `independent_episodes`.
       objects: (E,) index of each episode's object.
       pool: number of objects; those without episodes have a rate of 0.
     """
@@ -281,6 +244,56 @@ def _forces(sample: Sample) -> dict[str, float | None]:
     row["force_peak_n"] = float(strongest.max(-1).mean()) if strongest.size else None
     row["force_mean_n"] = float(strongest.mean()) if strongest.size else None
     return row
+
+
+def wilson(rate: float, count: float) -> tuple[float, float]:
+    """95 % Wilson score interval of a rate.
+
+    Args:
+      rate: share of successes.
+      count: number of independent episodes, not necessarily an integer.
+    """
+    if count <= 0:
+        return 0.0, 1.0
+    z2 = NORMAL_95**2
+    center = (rate + z2 / (2 * count)) / (1 + z2 / count)
+    half = NORMAL_95 / (1 + z2 / count) * math.sqrt(rate * (1 - rate) / count + z2 / (4 * count**2))
+    return max(center - half, 0.0), min(center + half, 1.0)
+
+
+def independent_episodes(outcomes: np.ndarray, clusters: np.ndarray) -> float:
+    """Number of independent episodes with the same variance of the rate as these clustered ones.
+
+    It is the number of episodes over the design effect (Kish, Survey Sampling, 1965): the cluster-robust variance of
+    the rate, G / (G - 1) sum_g (sum_{i in g} (y_i - p))^2 / n^2, over p (1 - p) / n. The design effect is at least 1.
+    If all episodes have the same outcome it cannot be estimated, and each cluster counts once. Episodes of a single
+    cluster count as independent, and the rate is that of the cluster.
+
+    Args:
+      outcomes: (E,) bool.
+      clusters: (E,) label of the cluster of each episode.
+    """
+    count, rate = len(outcomes), float(np.mean(outcomes)) if len(outcomes) else 0.0
+    _, members = np.unique(clusters, return_inverse=True)
+    number = int(members.max(initial=-1)) + 1
+    if number <= 1:
+        return float(count)
+    if rate in (0.0, 1.0):
+        return float(number)
+    off = np.bincount(members, np.asarray(outcomes, float) - rate)
+    robust = number / (number - 1) * float(off @ off) / count**2
+    return count / max(robust * count / (rate * (1 - rate)), 1.0)
+
+
+def clustered(outcomes: np.ndarray, clusters: np.ndarray) -> tuple[float, float]:
+    """95 % interval of the rate of outcomes (E,) in clusters (E,): Wilson's, with `independent_episodes`."""
+    rate = float(np.mean(outcomes)) if len(outcomes) else 0.0
+    return wilson(rate, independent_episodes(outcomes, clusters))
+
+
+def standard_error(values: np.ndarray) -> float:
+    """Standard error of the mean of independent values (E,), at least two."""
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def terciles(values: np.ndarray, names: Sequence[str], unit: str, factor: float) -> tuple[np.ndarray, list[str]]:

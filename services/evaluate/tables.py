@@ -1,202 +1,311 @@
-"""Rows of an evaluation's tables, for one policy."""
+"""Tables of an evaluation: their rows, as variations of one experiment."""
 
 import dataclasses
+import math
 import pathlib
-from collections.abc import Callable, Sequence, Set
-from typing import NamedTuple
+import zlib
+from collections.abc import Sequence, Set
+from typing import Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from congrasp.actors.initial import InitialConditions
 from congrasp.common.config import Split
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.motors import coupled
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.policy.bundle import PolicyBundle
-from congrasp.common.runtime.engines import PhysicsName
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.methods import takes
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.sets import bank_of, load_for
-from congrasp.services.evaluate import loads, sensing
-from congrasp.services.evaluate.evaluator import Evaluator
-from congrasp.services.evaluate.exam import Exam, exam_pool
-from congrasp.services.evaluate.heading_rules import HeadingRules
-from congrasp.services.evaluate.noise import LEVELS
-from congrasp.services.evaluate.paper import CAPTURED_SETS
+from congrasp.services.evaluate.episodes import identity
+from congrasp.services.evaluate.experiment import Experiment, Result, Variation
+from congrasp.services.evaluate.heading_rules import HeadingRules, heading_rules
+from congrasp.services.evaluate.paper import CAPTURED_SETS, CENTER_GROUP
 from congrasp.services.evaluate.plan import from_references
-from congrasp.services.evaluate.pools import folder_pools, procedural_pools
-from congrasp.services.evaluate.protocol import NOMINAL_FRICTION, two_seconds
+from congrasp.services.evaluate.pools import Pools, evaluate_pools
 from congrasp.services.evaluate.references import reference_policy
 from congrasp.services.evaluate.scores import TABLES, Row, known_rows
-from congrasp.services.evaluate.unseen import evaluate_objects
 
-MANY = 50_000
-"""Most procedural objects of the table `objects` by default."""
-_OTHERS = {"noise", "sensing", "objects", "payload", "peers"}  # tables whose rows are not constraints
-Track = Callable[[str, int | None], Callable[[int], None]]
-"""(label, total if known) -> function to call with the number done."""
+Table = Literal[
+    "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
+]
 
 
 @dataclasses.dataclass(frozen=True)
-class Setup:
-    """Settings of an evaluation."""
+class Center(Variation):
+    """Headings that only keep the hand's centre above the table."""
 
-    episodes: int
-    """Episodes of each row; of the table `objects` in total."""
-    physics: PhysicsName
-    """Engine, except `auto`."""
-    exam: Exam = "figures"
-    """Set of procedural objects."""
-    pool: int = 0
-    """Number of procedural objects; 0 uses `exam.POOL`, and for the table `objects` one per episode, at most `MANY`."""
-    batch: int = 0
-    """Number of parallel worlds; 0 uses the engine's default."""
-    seed: int = 0
-    friction: float = NOMINAL_FRICTION
-    given: Sequence[GraspObject] = ()
-    """Objects of rows by constraint; procedural ones if empty."""
-    bank: ConstraintBank | None = None
-    """Constraints of the objects, if given."""
-    paper: str = "hands"
-    """Table of the paper for comparison (`services.evaluate.paper`)."""
-    folder: pathlib.Path | None = None
-    """Objects of the table `objects`; procedural ones if None."""
-    keep: pathlib.Path | None = None
-    """Folder for results of its pools, to resume from."""
+    label: str = CENTER_GROUP
+
+    def bank(self, experiment: Experiment) -> ConstraintBank:
+        """See `Variation.bank`."""
+        return experiment.by_center
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise(Variation):
+    """References with errors like captured ones; errors of the row are relative to the request, including noise.
+
+    * joints: an independent normal error of standard deviation `level` on every finger joint, clipped to its limits.
+    * depth: a displacement of the wrist along the hand's heading axis, into the object, uniform up to `level`.
+    * jitter: an independent normal error of standard deviation `level` on every coordinate of every waypoint.
+    """
+
+    kind: str = ""
+    """joints, depth or jitter; empty for no noise."""
+    level: float = 0.0
+    """rad for joints, m otherwise."""
+
+    def bank(self, experiment: Experiment) -> ConstraintBank:
+        """See `Variation.bank`."""
+        bank, rng = experiment.bank_for(self.constraint), np.random.default_rng(experiment.seed)
+        if self.kind == "joints":
+            q, hand = np.asarray(bank.pose_q), experiment.hand
+            noisy = np.clip(q + rng.normal(0.0, self.level, q.shape), hand.lower, hand.upper)
+            return bank._replace(pose_q=coupled(hand, noisy).astype(np.float32))
+        if self.kind == "depth":
+            position, quaternion = np.asarray(bank.pose_position), np.asarray(bank.pose_quaternion)
+            turn = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
+            inward = turn.apply(grasp_frame(experiment.hand).heading).reshape(position.shape)
+            depth = rng.uniform(0.0, self.level, (*position.shape[:-1], 1))
+            return bank._replace(pose_position=(position + depth * inward).astype(np.float32))
+        if self.kind == "jitter":
+            path = np.asarray(bank.trajectory_position)
+            noisy = path + rng.normal(0.0, self.level, path.shape)
+            return bank._replace(trajectory_position=noisy.astype(np.float32))
+        return bank
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensors(Variation):
+    """A tracker, a friction and an error of the gains; by default a tracker with 30 Hz, 5 mm, 3 degrees and 60 ms.
+
+    A policy of the full state gets the tracker's pose instead of the true one, and keeps its contact forces and
+    velocities. Errors and losses use the same random numbers at all levels.
+    """
+
+    position_noise: float = 0.005
+    """Standard deviation of each coordinate, m."""
+    rotation_noise: float = math.radians(3.0)
+    """Standard deviation about each axis, rad."""
+    delay: float = 0.06
+    """s."""
+    rate: float = 30.0
+    """Hz."""
+    dropout: float = 0.0
+    """Share of lost samples."""
+    friction: float | None = None
+    """Sliding friction between hand and object; None: that of the evaluation."""
+    gains: float = 1.0
+    """Factor on the finger servos' gains."""
+    latency: float = 0.0
+    """Seconds until the servos follow a target."""
+
+    def task(self, task: TaskConfig) -> TaskConfig:
+        """Returns the task in which a policy observes trackers, with room for the longest delay of `SENSING`."""
+        delay, latency = ((0.0, max(getattr(level, name) for level in SENSING)) for name in ("delay", "latency"))
+        sensing = SensingConfig(delay=delay, latency=latency, settle=task.sensing.settle)
+        return dataclasses.replace(task, sensing=sensing)
+
+    def episodes(self, conditions: InitialConditions, control_dt: float) -> InitialConditions:
+        """See `Variation.episodes`."""
+        values = {
+            "period": max(1.0 / (self.rate * control_dt), 1.0),
+            "delay": round(self.delay / control_dt),
+            "position_noise": self.position_noise,
+            "rotation_noise": self.rotation_noise,
+            "dropout": self.dropout,
+            "latency": round(self.latency / control_dt),
+        }
+        sensors, start = conditions.sensors, conditions.reset_state
+        friction = start.friction if self.friction is None else jnp.full_like(start.friction, self.friction)
+        return conditions._replace(
+            sensors=sensors._replace(**{k: jnp.full_like(getattr(sensors, k), value) for k, value in values.items()}),
+            reset_state=start._replace(friction=friction, gain_scale=jnp.full_like(start.gain_scale, self.gains)),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Load(Variation):
+    """Mass of an object and friction of an episode, each uniform in a range; by default those of the evaluation.
+
+    The inertia is scaled with the mass. Objects are replaced instead of scaling the mass of an episode: engines derive
+    the softness of contacts from the mass at compilation, and diverge far from it.
+    """
+
+    mass: tuple[float, float] | None = None
+    """kg; the object's name determines the position in the range."""
+    friction: tuple[float, float] | None = None
+    """Sliding friction between hand and object; the episode determines the position in the range."""
+    factor: float = 1.0
+    """Factor on the object's mass, if no mass is given."""
+
+    def objects(self, objects: Sequence[GraspObject]) -> list[GraspObject]:
+        """See `Variation.objects`."""
+        found = []
+        for obj in objects:
+            mass = self.factor * obj.mass
+            if self.mass:
+                mass = self.mass[0] + (self.mass[1] - self.mass[0]) * zlib.crc32(obj.name.encode()) / 2**32
+            found.append(dataclasses.replace(obj, mass=mass, inertia=obj.inertia * mass / obj.mass))
+        return found
+
+    def episodes(self, conditions: InitialConditions, control_dt: float) -> InitialConditions:
+        """See `Variation.episodes`."""
+        if not self.friction:
+            return conditions
+        low, high = self.friction
+        share = np.array([zlib.crc32(episode.tobytes()) for episode in identity(conditions)]) / 2**32
+        friction = (low + (high - low) * share).astype(np.float32)
+        return conditions._replace(reset_state=conditions.reset_state._replace(friction=friction))
+
+
+NOISE = (
+    Noise("pose"),
+    Noise("pose", "joints 0.1 rad", "joints", 0.1),
+    Noise("pose", "joints 0.2 rad", "joints", 0.2),
+    Noise("pose", "depth 0.5 cm", "depth", 0.005),
+    Noise("pose", "depth 1 cm", "depth", 0.01),
+    Noise("trajectory"),
+    Noise("trajectory", "jitter 0.5 cm", "jitter", 0.005),
+    Noise("trajectory", "jitter 1 cm", "jitter", 0.01),
+)
+"""Rows of the table `noise` (paper, noisy constraints)."""
+SENSING = (
+    Sensors(label="the true pose", position_noise=0.0, rotation_noise=0.0, delay=0.0, rate=math.inf),
+    Sensors(label="5 mm 3°, 30 Hz, 60 ms"),
+    Sensors(label="no noise", position_noise=0.0, rotation_noise=0.0),
+    Sensors(label="10 mm 6°", position_noise=0.01, rotation_noise=math.radians(6.0)),
+    Sensors(label="no delay", delay=0.0),
+    Sensors(label="100 ms", delay=0.1),
+    Sensors(label="10 Hz", rate=10.0),
+    Sensors(label="10 % dropped", dropout=0.1),
+    Sensors(label="30 % dropped", dropout=0.3),
+    Sensors(label="friction 0.5", friction=0.5),
+    Sensors(label="gains -20 %", gains=0.8),
+    Sensors(label="gains +20 %", gains=1.2),
+    Sensors(label="targets 20 ms late", latency=0.02),
+    Sensors(label="targets 40 ms late", latency=0.04),
+)
+"""Rows of the table `sensing`; each but the first differs from the second, a typical tracker, in one setting."""
+PEERS = (
+    Load(label="RobustDexGrasp: 0.25 kg, friction 0.8", mass=(0.25, 0.25), friction=(0.8, 0.8)),
+    Load(label="dexsuite: 0.04-0.5 kg, friction 0.5-1", mass=(0.04, 0.5), friction=(0.5, 1.0)),
+)
+"""Rows of the table `peers`: conditions of RobustDexGrasp (arXiv:2504.05287) and of Isaac Lab's dexsuite."""
+MASSES = (0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0)
+"""Masses of the table `payload`, kg."""
+_OTHERS = {"noise", "sensing", "objects", "payload", "peers"}  # tables whose rows are not constraints
+
+
+def payload(scale: float, *, constant_mass: bool) -> tuple[Load, ...]:
+    """Rows of the table `payload`: fixed masses, the objects' masses, and masses scaled with lengths if different.
+
+    Args:
+      scale: factor on the lengths of the hand's objects.
+      constant_mass: setting of the task; True if the evaluated objects keep their mass when scaled.
+    """
+    masses = tuple(Load(label=f"{mass:g} kg", mass=(mass, mass)) for mass in MASSES)
+    own = 1.0 if constant_mass else scale**-3
+    found = (*masses, Load(label="masses of the objects", factor=own))
+    literal = Load(label=f"masses scaled with the lengths x {scale:g}", factor=own * scale**3)
+    return found if scale == 1.0 else (*found, literal)
 
 
 class Found(NamedTuple):
     """Results of one policy."""
 
-    evaluator: Evaluator | None
-    """Evaluator of the rows by constraint; None if there are none."""
-    names: list[str]
-    """Names of the evaluated rows by constraint."""
-    left_out: list[CongraspError]
-    """Reasons for skipped rows."""
-    noisy: list[Row]
-    """Rows under noise of references."""
+    experiment: Experiment
+    results: list[Result]
+    """Results of all rows but those of many objects."""
     rows: list[Row]
     """All rows."""
+    left_out: list[CongraspError]
+    """Reasons for skipped rows."""
     references: str
     """Source of reference poses and trajectories; empty if no row has any."""
     heading_rules: HeadingRules | None = None
     """Effect of the rules for headings; None without the table `single` of sampled headings."""
 
+    def of(self, kind: type[Variation]) -> list[Result]:
+        """Results of one kind of variation: `Variation` itself for constraints without a change."""
+        return [result for result in self.results if type(result.variation) is kind]
+
 
 def evaluate_tables(
-    policy: PolicyBundle, tables: Sequence[str], setup: Setup, track: Track, *, keep: bool = False
+    experiment: Experiment,
+    tables: Sequence[str],
+    pools: Pools | None = None,
+    kept: pathlib.Path | None = None,
+    *,
+    keep: bool = False,
 ) -> Found:
     """Evaluates the rows of some tables.
 
     Args:
-      policy: policy, evaluated as the method of its task.
+      experiment: policy, evaluated as the method of its task, objects, engine and numbers. The table `objects` has
+        as many episodes in total, on objects of its own.
       tables: keys of `TABLES`, `objects`, `noise`, `sensing`, `payload`, `peers`, or `all` for all of these.
-      setup: objects, engine and numbers.
-      track: shows progress.
-      keep: keeps episodes for `Evaluator.examples`.
+      pools: pools of the table `objects`, if it is wanted.
+      kept: folder for the results of these pools, to resume from.
+      keep: keeps episodes for pictures.
 
     Raises:
       CongraspError: the policy's method has no row in these tables, or no object allows one.
     """
-    method, wanted = policy.task.method, {*TABLES, *_OTHERS} if "all" in tables else set(tables)
-    names = [name for name in known_rows((key for key in TABLES if key in wanted), policy.task) if takes(method, name)]
-    if not takes(method, "heading"):
+    task, wanted = experiment.policy.task, {*TABLES, *_OTHERS} if "all" in tables else set(tables)
+    names = [name for name in known_rows((k for k in TABLES if k in wanted), task) if takes(task.method, name)]
+    if not takes(task.method, Variation().constraint):
         wanted -= _OTHERS - {"noise"}
     if not names and not wanted & _OTHERS:
-        raise CongraspError(f"The method '{method}' has no row in these tables.", "Pass another --table.")
-    rows: list[Row] = []
-    noisy: list[Row] = []
-    left_out: list[CongraspError] = []
-    evaluator: Evaluator | None = None
-    rules, source = None, ""
+        raise CongraspError(f"The method '{task.method}' has no row in these tables.", "Pass another --table.")
+    found = Found(experiment, [], [], [], "")
     if names or wanted & _OTHERS - {"objects"}:
-        evaluator = _evaluator(policy, setup, track)
-        if "noise" in wanted or any(from_references(name) for name in names):
-            source = _references(evaluator, track)
-        if names:
-            names, left_out = evaluator.allowed(names)
-            advance = track("Episodes", len(names) * setup.episodes)
-            rows = evaluator.rows(names, setup.episodes, advance, keep=keep)
-        if "single" in wanted and "heading" in names and setup.bank is None and policy.task.headings == "all":
-            advance = track("Episodes with other rules for headings", setup.episodes)
-            by_center, rules = evaluator.row_by_center(setup.episodes, advance)
-            rows.insert(names.index("heading") + 1, by_center)
-        if "noise" in wanted:
-            advance = track("Episodes under noise", len(LEVELS) * setup.episodes)
-            noisy = evaluator.rows_under_noise(advance, setup.episodes)
-        rows += noisy + _rows_at_levels(evaluator, policy, wanted, setup.episodes, track)
-    if "objects" in wanted:
-        rows += _object_rows(policy, setup, track)
-    return Found(evaluator, names, left_out, noisy, rows, source, rules)
+        found = _rows(experiment, names, wanted, keep)
+    if "objects" in wanted and pools:
+        found.rows.extend(evaluate_pools(experiment, pools, kept))
+    return found
 
 
-def _rows_at_levels(
-    evaluator: Evaluator, policy: PolicyBundle, wanted: Set[str], episodes: int, track: Track
-) -> list[Row]:
-    """Evaluates rows of the tables `sensing`, `payload` and `peers`, if requested."""
-    rows: list[Row] = []
-    if "sensing" in wanted:
-        advance = track("Episodes with a robot's sensors", len(sensing.LEVELS) * episodes)
-        rows += evaluator.rows_under_sensing(advance, episodes)
-    scale = object_scale(get_hand(policy.spec.hand), policy.task)
-    levels = {"payload": loads.payload(scale, constant_mass=policy.task.constant_mass), "peers": loads.PEERS}
-    for table in sorted(wanted & levels.keys()):
-        advance = track("Episodes under loads", len(levels[table]) * episodes)
-        rows += evaluator.rows_under_loads(levels[table], advance, episodes)
-    return rows
+def _rows(experiment: Experiment, names: Sequence[str], wanted: Set[str], keep: bool) -> Found:
+    """Evaluates constraints of these names, and the rows at levels of some tables."""
+    experiment.track("Generating constraints", None)
+    source, task = "", experiment.policy.task
+    if "noise" in wanted or any(map(from_references, names)):
+        source = _source(experiment)
+    variations, left_out = experiment.allowed(map(Variation, names))
+    rules = None
+    sampled = experiment.constraints is None and task.headings == "all"
+    if "single" in wanted and sampled and Variation() in variations:
+        variations.insert(variations.index(Variation()) + 1, Center())
+        rules = heading_rules(experiment)
+    scale = object_scale(experiment.hand, task)
+    levels = {
+        "noise": NOISE,
+        "sensing": SENSING,
+        "payload": payload(scale, constant_mass=task.constant_mass),
+        "peers": PEERS,
+    }
+    variations += [variation for table in levels if table in wanted for variation in levels[table]]
+    results = experiment.run(variations, keep=keep)
+    return Found(experiment, results, [result.row for result in results], left_out, source, rules)
 
 
-def _evaluator(policy: PolicyBundle, setup: Setup, track: Track) -> Evaluator:
-    """Returns an evaluator of given objects, or of procedural ones of an evaluation set."""
-    track("Generating constraints", None)
-    return Evaluator(
-        policy,
-        setup.given or exam_pool(setup.exam, setup.pool),
-        physics=setup.physics,
-        batch=setup.batch,
-        threads=cores(),
-        seed=setup.seed,
-        friction=setup.friction,
-        hold_steps=two_seconds(policy.task),
-        bank=setup.bank,
-        paper=setup.paper,
-    )
-
-
-def _references(evaluator: Evaluator, track: Track) -> str:
+def _source(experiment: Experiment) -> str:
     """Generates references if none were given, and describes their source."""
-    advance = track("Reference grasps", None)
-    made = evaluator.references(lambda done, of: advance(done))
-    if made is None:
+    if (made := experiment.references) is None:
         return "References come from the constraint sets."
-    _, who = reference_policy(evaluator.bundle)
+    _, who = reference_policy(experiment.policy)
     whole = made.grasps[:, 0]
-    closed = [obj.name for obj, count in zip(evaluator.objects, whole, strict=True) if not count]
+    closed = [obj.name for obj, count in zip(experiment.objects, whole, strict=True) if not count]
     text = f"References: grasps of {who}, {np.median(whole):.0f} per object (median)."
     return text + (
         f" Without a grasp, the hand closed around the object is used: {', '.join(closed)}." if closed else ""
-    )
-
-
-def _object_rows(policy: PolicyBundle, setup: Setup, track: Track) -> list[Row]:
-    """Evaluates rows of the heading on many objects."""
-    if setup.folder:
-        pools = folder_pools(setup.folder, setup.physics)
-    else:
-        pools = procedural_pools(setup.pool or min(setup.episodes, MANY), setup.physics, setup.exam)
-    return evaluate_objects(
-        policy,
-        pools,
-        setup.episodes,
-        physics=setup.physics,
-        batch=setup.batch,
-        threads=cores(),
-        seed=setup.seed,
-        friction=setup.friction,
-        keep=setup.keep,
-        progress=track("Episodes on many objects", setup.episodes),
     )
 
 

@@ -1,26 +1,16 @@
-"""Every figure of the paper with our measurement, or the reason why there is no comparable one."""
+"""Every figure of the paper with our measurement, or the reason why there is no comparable one; and these as tables."""
 
+import collections
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from congrasp.services.evaluate.paper import PaperLine, paper_lines
-from congrasp.services.evaluate.scores import Row
-from congrasp.services.reproduce.evaluation import Result
-from congrasp.services.reproduce.plan import RequiredPolicy
+from congrasp.services.evaluate.paper import TABLES, PaperLine, paper_lines
+from congrasp.services.evaluate.scores import UNITS, Row
+from congrasp.services.evaluate.table import NONE, Columns, Styled, Table, percent, verdict
+from congrasp.services.reproduce.plan import RequiredPolicy, Result
 
 SUCCESS = "success"
 CAPTURED_DATA = {"captured": "GRAB and OakInk", "cross": "DexYCB"}
-CONDITIONS = (
-    "MuJoCo replaces the paper's simulator; contacts, friction, servos and the hands' models differ.",
-    "The human hand replaces MANO. It has 20 anatomical joints; the paper's has MANO's.",
-    "Procedural objects that are never used in training replace the objects of the paper's table of hands, and "
-    "Objaverse in its table of large-scale objects. Sizes there are terciles of our objects; the paper gives no "
-    "bounds.",
-    "References of the table of hands are grasps of this project's reference policies, generated as in the paper.",
-    "Success is the paper's: the object has not fallen a quarter of a second after the table is removed. The "
-    "paper does not report whether it is held for two seconds, nor whether fingers penetrate anything.",
-)
-"""Differences that apply to every table."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +44,11 @@ class Cell:
     @property
     def verdict(self) -> str:
         """ "better" or "worse" if the whole interval is, else empty."""
-        if self.low is None or self.high is None or self.low <= self.paper <= self.high:
+        if self.low is None or self.high is None:
             return ""
-        return "better" if (self.low > self.paper) == (self.quantity == SUCCESS) else "worse"
+        if self.quantity == SUCCESS:
+            return verdict(self.low, self.high, self.paper)
+        return verdict(-self.high, -self.low, -self.paper)  # a smaller error is better
 
 
 def compare(results: Sequence[Result], absent: Mapping[RequiredPolicy, str], hands: Sequence[str]) -> list[Cell]:
@@ -135,3 +127,111 @@ def _reason(
             "--captured uses your copy"
         )
     return "not evaluated"
+
+
+def summary(cells: Sequence[Cell]) -> str:
+    """Summarises how many of the paper's figures have a counterpart, and how they compare."""
+    rates = [cell for cell in cells if cell.quantity == SUCCESS]
+    compared = [cell for cell in rates if cell.ours is not None]
+    above = sum(cell.ours >= cell.paper for cell in compared if cell.ours is not None)
+    verdicts = collections.Counter(cell.verdict for cell in compared)
+    return (
+        f"{len(compared)} of the paper's {len(rates)} success rates have a comparable one. It is at or above the "
+        f"paper's in {above}; the whole 95 % interval is above it in {verdicts['better']}, and below it in "
+        f"{verdicts['worse']}."
+    )
+
+
+def not_comparable(cells: Sequence[Cell]) -> Table:
+    """Lines without a comparable figure: description, reason, and the nearest measured success."""
+    columns: Columns[Cell] = (
+        (
+            "the paper's line",
+            lambda cell: (
+                f"{TABLES[cell.table]}: {cell.constraint}, {cell.hand}, {cell.method}"
+                + (f", {cell.group} objects" if cell.group else "")
+            ),
+        ),
+        ("why", lambda cell: Styled(cell.reason, "text")),
+        (
+            "nearest success here, procedural references",
+            lambda cell: (
+                NONE if cell.nearest is None else f"{percent(cell.nearest)} ({percent(cell.paper)} in the paper)"
+            ),
+        ),
+    )
+    return Table.of("", [cell for cell in cells if cell.ours is None and cell.quantity == SUCCESS], columns)
+
+
+def tables(cells: Sequence[Cell]) -> list[Table]:
+    """Returns all of the paper's tables, with a row for each constraint, hand, method, size and data set."""
+    found: list[Table] = []
+    for name, title in TABLES.items():
+        lines = dict[tuple[str, ...], list[Cell]]()
+        for cell in cells:
+            if cell.table == name:
+                lines.setdefault((cell.constraint, cell.hand, cell.method, cell.group, cell.data), []).append(cell)
+        table = Table.of(title, lines.values(), _COLUMNS)
+        hidden = {i for key, group in _OPTIONAL.items() if {row[key] for row in table.rows} <= {NONE} for i in group}
+        shown = [i for i in range(len(_COLUMNS)) if i not in hidden]
+        found.append(Table(title, [table.columns[i] for i in shown], [[row[i] for i in shown] for row in table.rows]))
+    return found
+
+
+def _joined(show: Callable[[Cell], str]) -> Callable[[list[Cell]], str]:
+    """Joins all errors of a line with their units; `NONE` if no error is shown."""
+
+    def cell(line: list[Cell]) -> str:
+        """Cell of the errors."""
+        texts = [show(error) for error in line[1:]]
+        if set(texts) <= {NONE}:
+            return NONE
+        return " / ".join(
+            f"{text} {UNITS[error.quantity]}".strip() for text, error in zip(texts, line[1:], strict=True)
+        )
+
+    return cell
+
+
+def _objects(line: list[Cell]) -> str:
+    """Size of the objects, and our captured data set."""
+    success = line[0]
+    group = success.group or ("all" if success.table == "objects" else "")
+    return ", ".join(filter(None, (group, success.data))) or NONE
+
+
+def _error(cell: Cell) -> str:
+    """Formats an error, such as "0.137 ± 0.004"."""
+    if cell.ours is None:
+        return NONE
+    return f"{cell.ours:.3f}" + ("" if cell.high is None else f" ± {cell.high - cell.ours:.3f}")
+
+
+def _difference(cell: Cell) -> str:
+    """Formats a signed difference in percentage points, or in the error's unit."""
+    if cell.difference is None:
+        return NONE
+    return f"{100 * cell.difference:+.1f}" if cell.quantity == SUCCESS else f"{cell.difference:+.3f}"
+
+
+def _styled(style: str, cell: Callable[[list[Cell]], str]) -> Callable[[list[Cell]], str]:
+    """The same cells with a CSS class."""
+    return lambda line: Styled(cell(line), style)
+
+
+_COLUMNS: Columns[list[Cell]] = (
+    ("constraint", lambda line: line[0].constraint),
+    ("hand", lambda line: line[0].hand),
+    ("method", lambda line: line[0].method),
+    ("objects", _objects),
+    ("episodes", lambda line: str(line[0].episodes or NONE)),
+    ("success, %", lambda line: Styled(percent(line[0].ours, line[0].low, line[0].high, ""), line[0].verdict)),
+    ("paper", _styled("paper", lambda line: percent(line[0].paper, unit=""))),
+    ("difference", lambda line: _difference(line[0])),
+    ("error", _styled("errors", _joined(_error))),
+    ("paper", _styled("errors paper", _joined(lambda cell: f"{cell.paper:.3f}"))),
+    ("difference", _styled("errors", _joined(_difference))),
+)
+"""Columns of a line's figures, success first."""
+_OPTIONAL = {3: (3,), 9: (8, 9, 10)}
+"""Columns that are left out if the first of them is empty: objects, and errors if the paper has none."""

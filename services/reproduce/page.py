@@ -1,25 +1,32 @@
 """Page, JSON file and LaTeX tables of a reproduction."""
 
-import collections
 import dataclasses
 import json
 import pathlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
-from congrasp.services.evaluate.cells import PLAUSIBILITY, RATES, plausibility_cells, rate_cells
 from congrasp.services.evaluate.report import Picture, embedded, template
 from congrasp.services.evaluate.scores import Row
-from congrasp.services.reproduce.comparison import CONDITIONS, SUCCESS, Cell, unmatched
-from congrasp.services.reproduce.evaluation import Result
-from congrasp.services.reproduce.latex import latex
-from congrasp.services.reproduce.layout import not_comparable, tables
-from congrasp.services.reproduce.plan import RequiredPolicy
+from congrasp.services.evaluate.table import PLAUSIBILITY, RATE, RATES, Columns, Styled, Table
+from congrasp.services.reproduce.comparison import Cell, not_comparable, summary, tables, unmatched
+from congrasp.services.reproduce.plan import RequiredPolicy, Result
 
 PAGE, JSON, LATEX = "reproduction.html", "reproduction.json", "tables.tex"
 _LARGEST_PICTURE = 32 << 20
+_CONDITIONS = (
+    "MuJoCo replaces the paper's simulator; contacts, friction, servos and the hands' models differ.",
+    "The human hand replaces MANO. It has 20 anatomical joints; the paper's has MANO's.",
+    "Procedural objects that are never used in training replace the objects of the paper's table of hands, and "
+    "Objaverse in its table of large-scale objects. Sizes there are terciles of our objects; the paper gives no "
+    "bounds.",
+    "References of the table of hands are grasps of this project's reference policies, generated as in the paper.",
+    "Success is the paper's: the object has not fallen a quarter of a second after the table is removed. The "
+    "paper does not report whether it is held for two seconds, nor whether fingers penetrate anything.",
+)
+"""Differences that apply to every table."""
 
 
 class Account(NamedTuple):
@@ -51,24 +58,29 @@ def write(account: Account, out: pathlib.Path) -> None:
     Raises:
       CongraspError: a file cannot be written, or jinja2 is not installed.
     """
-    shown = tables(account.cells)
-    absent = not_comparable(account.cells)
+    shown, absent = tables(account.cells), not_comparable(account.cells)
+    policies = [(policy.hand, policy.method, Styled(what, "text")) for policy, what in account.policies]
     text = page().render(
         title="The paper's tables",
         summary=summary(account.cells),
         conditions=f"{account.conditions} {_times(account.seconds)}",
         command=account.command,
-        tables=shown,
+        tables=_shown(shown),
         everywhere=_different(account.results),
-        absent=absent,
-        details=_details(account.results),
+        absent=absent.html() if absent.rows else "",
+        details=_shown(_details(account.results)),
         pictures=[embedded(picture) for picture in [*_pictures(account.results), *account.curves]],
-        policies=[(policy.hand, policy.method, what) for policy, what in account.policies],
+        policies=Table("", ("hand", "method", "policy"), policies).html(),
         failures=account.failures,
     )
     write_atomically(out / PAGE, text.encode())
-    write_atomically(out / LATEX, latex(shown, account.conditions).encode())
+    write_atomically(out / LATEX, "\n".join(table.latex(account.conditions) for table in shown).encode())
     write_atomically(out / JSON, json.dumps(to_json(account), indent=2).encode())
+
+
+def _shown(shown: Sequence[Table]) -> list[tuple[str, str]]:
+    """Titles and HTML of tables."""
+    return [(table.title, dataclasses.replace(table, title="").html()) for table in shown]
 
 
 def to_json(account: Account) -> dict[str, Any]:
@@ -80,7 +92,7 @@ def to_json(account: Account) -> dict[str, Any]:
         "policies": [policy._asdict() | {"what": what} for policy, what in account.policies],
         "cells": [dataclasses.asdict(cell) for cell in account.cells],
         "not_comparable": [
-            {"line": what, "reason": why, "nearest": nearest} for what, why, nearest in not_comparable(account.cells)
+            dict(zip(("line", "reason", "nearest"), row, strict=True)) for row in not_comparable(account.cells).rows
         ],
         "different_everywhere": _different(account.results),
         "failures": account.failures,
@@ -92,23 +104,10 @@ def to_json(account: Account) -> dict[str, Any]:
     }
 
 
-def summary(cells: Sequence[Cell]) -> str:
-    """Summarises how many of the paper's figures have a counterpart, and how they compare."""
-    rates = [cell for cell in cells if cell.quantity == SUCCESS]
-    compared = [cell for cell in rates if cell.ours is not None]
-    above = sum(cell.ours >= cell.paper for cell in compared if cell.ours is not None)
-    verdicts = collections.Counter(cell.verdict for cell in compared)
-    return (
-        f"{len(compared)} of the paper's {len(rates)} success rates have a comparable one. It is at or above the "
-        f"paper's in {above}; the whole 95 % interval is above it in {verdicts['better']}, and below it in "
-        f"{verdicts['worse']}."
-    )
-
-
 def _different(results: Sequence[Result]) -> list[str]:
     """Differences that apply to every table, and for each hand the share of headings that its rules keep."""
     rules = dict.fromkeys(result.about["heading_rules"] for result in results if result.about["heading_rules"])
-    return [*CONDITIONS, *rules]
+    return [*_CONDITIONS, *rules]
 
 
 def _times(seconds: Mapping[str, float]) -> str:
@@ -117,41 +116,26 @@ def _times(seconds: Mapping[str, float]) -> str:
     return f"{', '.join(took).capitalize()}." if took else ""
 
 
-class _Details(NamedTuple):
-    """A table of further rows of ours."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-
-
-def _details(results: Sequence[Result]) -> list[_Details]:
+def _details(results: Sequence[Result]) -> list[Table]:
     """Rates of rows without a counterpart in the paper, and the plausibility of all."""
-    own = ("table", "hand", "method")
-    rates, of_rate = RATES[:-1], _of(lambda row: rate_cells(row)[:-1])
-    all_rows = [(result, row) for result in results for row in result.rows]
+    measured = [
+        (result, row) for result in results for row in result.rows if row.plausibility.get("hand_hand_mm") is not None
+    ]
+    plausibility = (PLAUSIBILITY[0], ("held 2 s", RATE["held 2 s"]), *PLAUSIBILITY[1:])
     return [
-        _Details(
-            "Rows without a counterpart in the paper", (*own, *rates), [of_rate(*pair) for pair in unmatched(results)]
-        ),
-        _Details(
-            "Held for two seconds, and plausibility",
-            (*own, "constraint", "held 2 s", *PLAUSIBILITY[1:]),
-            [_of(_plausible)(*pair) for pair in all_rows if pair[1].plausibility.get("hand_hand_mm") is not None],
-        ),
+        Table.of("Rows without a counterpart in the paper", unmatched(results), _named(RATES[:-1])),
+        Table.of("Held for two seconds, and plausibility", measured, _named(plausibility)),
     ]
 
 
-def _of(cells: Callable[[Row], tuple[str, ...]]) -> Callable[[Result, Row], tuple[str, ...]]:
-    """Prepends table, hand and method to the cells of a row."""
-    return lambda result, row: (result.part.name.removeprefix(f"{result.part.policy.name}-"), row.hand, row.method,
-                                *cells(row))  # fmt: skip
-
-
-def _plausible(row: Row) -> tuple[str, ...]:
-    """Rate of grasps held for two seconds, and plausibility."""
-    name, *cells = plausibility_cells(row)
-    return name, rate_cells(row)[RATES.index("held 2 s")], *cells
+def _named(columns: Columns[Row]) -> Columns[tuple[Result, Row]]:
+    """Prepends table, hand and method to the columns of a row."""
+    return (
+        ("table", lambda pair: pair[0].part.name.removeprefix(f"{pair[0].part.policy.name}-")),
+        ("hand", lambda pair: pair[1].hand),
+        ("method", lambda pair: pair[1].method),
+        *((name, lambda pair, cell=cell: cell(pair[1])) for name, cell in columns),
+    )
 
 
 def _pictures(results: Sequence[Result]) -> Iterator[Picture]:

@@ -1,10 +1,12 @@
 """Plan of a reproduction: the policies it needs, and the parts that are evaluated in turn."""
 
 import pathlib
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from congrasp.common.task.methods import METHODS, STUDENTS
+from congrasp.services.evaluate.scores import Row
+from congrasp.services.train.presets import FULL
 
 BASELINES = tuple(name for name in METHODS if name not in ("ours", *STUDENTS))
 """Methods compared with the full system, all for one hand."""
@@ -23,6 +25,12 @@ class RequiredPolicy(NamedTuple):
         """Name of its run, and in texts."""
         return f"{self.hand}-{self.method}"
 
+    @property
+    def training(self) -> list[str]:
+        """Options of `congrasp train` for its run."""
+        method = ["--method", self.method] if self.method != "ours" else []
+        return ["--preset", FULL, "--hand", self.hand, *method]
+
 
 class Part(NamedTuple):
     """Rows that are evaluated and stored together."""
@@ -37,6 +45,24 @@ class Part(NamedTuple):
     def name(self) -> str:
         """Name of its files."""
         return f"{self.policy.name}-{self.data.resolve().name if self.data else self.table}"
+
+    @property
+    def pictured(self) -> bool:
+        """True if episodes are drawn: those of the full system, under constraints without noise."""
+        return self.policy.method == "ours" and self.table not in ("objects", "noise")
+
+
+class Result(NamedTuple):
+    """Result of a part."""
+
+    part: Part
+    source: str
+    """Source of its episodes (`services.evaluate.paper`)."""
+    rows: list[Row]
+    about: Mapping[str, Any]
+    """Further content of its JSON file: policy, settings, pictures, references, skipped rows, seconds."""
+    fresh: bool
+    """True if it was evaluated in this session."""
 
 
 def policies(hands: Sequence[str], methods: Sequence[str]) -> list[RequiredPolicy]:

@@ -20,7 +20,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, known, require_known
 from congrasp.common.task.constraints.priority import explain
 from congrasp.common.wire.codec import Message
-from congrasp.services.evaluate.failures import cause
+from congrasp.services.evaluate.pictures import cause
 from congrasp.services.grasp.grasper import costs, repeated, surface_of
 from congrasp.services.grasp.reach import with_planned_reach
 from congrasp.services.serve.server import Source

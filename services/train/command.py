@@ -18,7 +18,6 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, policy_spec
-from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.stages import imported, since_start, stages
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.checkpoint import Checkpoints
@@ -32,7 +31,7 @@ from congrasp.learner.run_directory import (
     has_checkpoints,
 )
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.ops.shutdown import on_signal
 from congrasp.services.serve.load import example_episode, one_answer, serving
@@ -272,11 +271,11 @@ def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, run_dir: p
         objects = ObjectsConfig(families=objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
     pool = load_pool(objects)
     console.print(f"Evaluating {episodes} episodes on {len(pool)} objects that no training sees …")
-    evaluator = Evaluator(policy, pool, batch=episodes, threads=cores(), task=config.task)
-    (row,) = evaluator.rows(["heading"], episodes, keep=True)
-    shown = evaluator.examples("heading", 1, 1)
-    save_png(run_dir / EPISODE, episode_sheet(shown[-1]))
-    return row
+    policy = dataclasses.replace(policy, task=config.task)
+    heading = Experiment(policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps)
+    (result,) = heading.run([Variation()], keep=True)
+    save_png(run_dir / EPISODE, episode_sheet(result.examples(1, 1)[-1]))
+    return result.row
 
 
 def _live_query(run_dir: pathlib.Path, hand: str) -> None:

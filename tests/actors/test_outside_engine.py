@@ -10,7 +10,7 @@ from congrasp.actors.physics import ENGINES, Engine, make_physics, resolve_physi
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.common.config import RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
-from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.experiment import Experiment, Variation
 from tests import task as suite
 from tests.task import BATCH, HAND, OBJECTS, TASK
 
@@ -41,8 +41,9 @@ def test_rollouts_are_made_on_it():
 
 @pytest.mark.slow
 def test_an_evaluation_takes_its_batch_from_its_row():
-    (row,) = Evaluator(suite.policy(), OBJECTS, physics="counting", threads=1).rows(["heading"], 2 * BATCH)
-    assert row.episodes == 2 * BATCH
+    own = Experiment(suite.policy(), OBJECTS, physics="counting", episodes=2 * BATCH, hold=TASK.hold_steps)
+    (result,) = own.run([Variation()])
+    assert result.row.episodes == 2 * BATCH
     assert CountingPhysics.steps == 2 * BATCH * (TASK.approach_steps + TASK.hold_steps)
 
 

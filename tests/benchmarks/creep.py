@@ -16,8 +16,7 @@ from congrasp.common.policy.bundle import acting
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.sampling.build import build_bank
-from congrasp.services.evaluate.plan import batches, plan_row
-from congrasp.services.evaluate.protocol import protocol, two_seconds
+from congrasp.services.evaluate.plan import batches, plan_row, protocol, two_seconds
 
 
 class Solver(NamedTuple):

@@ -23,7 +23,7 @@ from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task import plausibility
 from congrasp.common.task.sampling.build import build_bank
-from congrasp.services.evaluate.protocol import protocol, two_seconds
+from congrasp.services.evaluate.plan import protocol, two_seconds
 
 
 def measures(engine: PhysicsName = "auto", environments: int = 64, threads: int = 0, repeats: int = 5) -> int:

@@ -17,7 +17,7 @@ from congrasp.common.task import observation
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.services.cli.main import load
-from congrasp.services.evaluate.evaluator import Evaluator
+from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.export.motion_file import load_motion, save_motion
 from congrasp.services.export.policy import describe, export_policy
 from congrasp.services.grasp.files import RESULT
@@ -97,9 +97,9 @@ def test_the_studio_refuses_it_in_one_line() -> None:
 
 
 def test_an_evaluation_of_it_is_refused_in_one_line() -> None:
-    evaluator = Evaluator(untrained(dataclasses.replace(CONFIG, task=TaskConfig(constraints=PAPER))), [MUG], batch=8)
+    own = Experiment(untrained(dataclasses.replace(CONFIG, task=TaskConfig(constraints=PAPER))), [MUG], episodes=1)
     with pytest.raises(CongraspError, match=f"^The policy {REFUSED}"):
-        evaluator.rows(["fingers"], 1)
+        own.run([Variation("fingers")])
 
 
 # A policy that knows it.

@@ -22,8 +22,8 @@ from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects.named import objects_at
-from congrasp.services.dataset.card import CARD
-from congrasp.services.evaluate import protocol
+from congrasp.services.dataset.shards import CARD
+from congrasp.services.evaluate import plan
 from tests.waits import eventually
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
@@ -58,7 +58,7 @@ def loader() -> Callable:
 def short_protocol():
     """Holds and pushes that last an eighth and a fifth of their time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(protocol, "HOLD_SECONDS", 0.25)
+        patch.setattr(plan, "HOLD_SECONDS", 0.25)
         patch.setattr(stress, "PUSH_SECONDS", 0.05)
         yield
 
@@ -81,7 +81,7 @@ def columns(whole) -> dict[str, np.ndarray]:
 
 @pytest.mark.slow
 def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path, monkeypatch):
-    monkeypatch.setattr(protocol, "HOLD_SECONDS", 2.0)  # as in the process
+    monkeypatch.setattr(plan, "HOLD_SECONDS", 2.0)  # as in the process
     monkeypatch.setattr(stress, "PUSH_SECONDS", 0.25)
     made(whole := tmp_path_factory.mktemp("whole"))
     command = [sys.executable, "-m", "congrasp", *arguments(tmp_path)]

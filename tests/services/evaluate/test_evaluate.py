@@ -14,11 +14,13 @@ from congrasp.common.objects.store import Catalogue
 from congrasp.common.policy import bundle as bundles
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate import episodes as simulation
-from congrasp.services.evaluate import protocol, references
-from congrasp.services.evaluate.evaluator import Evaluator
-from congrasp.services.evaluate.failures import failure_sheets
-from congrasp.services.evaluate.loads import Load
+from congrasp.services.evaluate import plan, references
+from congrasp.services.evaluate.experiment import Experiment, Variation
+from congrasp.services.evaluate.heading_rules import heading_rules
 from congrasp.services.evaluate.paper import CENTER_GROUP
+from congrasp.services.evaluate.pictures import failure_sheets
+from congrasp.services.evaluate.tables import Center, Load
+from congrasp.services.train.student import TRACKERS
 from tests import task
 
 EPISODES = task.BATCH
@@ -46,18 +48,18 @@ def policy(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def evaluator():
-    return Evaluator(task.policy(), OBJECTS, batch=task.BATCH)
+def experiment():
+    return Experiment(task.policy(), OBJECTS, episodes=EPISODES, batch=task.BATCH, hold=task.TASK.hold_steps)
 
 
-def test_references_are_grasps_and_made_once(evaluator, cache, monkeypatch):
+def test_references_are_grasps_and_made_once(experiment, cache, monkeypatch):
     policy, told = references.reference_policy(task.policy())[0], []
-    arguments = (policy, evaluator.task, evaluator.objects, evaluator._bank)
-    made = references.make(*arguments, physics="native", threads=2, progress=lambda *counts: told.append(counts))
+    arguments = (policy, experiment.task, experiment.scaled, experiment.bank)
+    made = references.make(*arguments, physics="native", progress=lambda *counts: told.append(counts))
     assert made.grasps[:, 0].sum() > 8  # most of the 16 episodes succeed
     assert told[-1][0] >= made.grasps.sum() and [count for count, _ in told] == sorted(count for count, _ in told)
     monkeypatch.setattr(references, "Episodes", None)  # nothing is simulated again
-    again = references.make(*arguments, physics="native", threads=2)
+    again = references.make(*arguments, physics="native")
     assert isinstance(again, references.References)
     np.testing.assert_array_equal(again.bank.pose_q, made.bank.pose_q)
     np.testing.assert_array_equal(again.grasps, made.grasps)
@@ -65,19 +67,21 @@ def test_references_are_grasps_and_made_once(evaluator, cache, monkeypatch):
     whole = kept.read_bytes()
     kept.write_bytes(whole[:1000])
     with pytest.raises(TypeError):  # damaged ones are made again
-        references.make(*arguments, physics="native", threads=2)
+        references.make(*arguments, physics="native")
     kept.write_bytes(whole)
 
 
 def test_the_command_evaluates_by_the_protocol(policy, tmp_path, capsys, monkeypatch):
     hold = task.TASK.hold_steps
-    monkeypatch.setattr(protocol, "HOLD_SECONDS", hold * task.TASK.control_dt)  # the programs are the evaluator's
+    monkeypatch.setattr(plan, "HOLD_SECONDS", hold * task.TASK.control_dt)  # the programs are the experiment's
     monkeypatch.setattr(simulation, "two_seconds", lambda task: 0)  # without the stress test, too
     folder, out, samples = tmp_path / "objects", tmp_path / "rows.json", {}
     for obj in OBJECTS:
         Catalogue(folder).add(obj)
-    row = Evaluator.row
-    monkeypatch.setattr(Evaluator, "row", lambda self, name, sample: row(self, name, samples.setdefault(name, sample)))
+    row = Experiment.row
+    monkeypatch.setattr(
+        Experiment, "row", lambda self, variation, sample: row(self, variation, samples.setdefault(variation, sample))
+    )
     arguments = ["--policy", str(policy), "--objects", str(folder), "--table", "composed", "--by", "object"]
     assert (
         load("evaluate")([*arguments, "--episodes", str(EPISODES), "--batch", str(EPISODES), "--json", str(out)])() == 0
@@ -100,60 +104,72 @@ def test_the_command_evaluates_by_the_protocol(policy, tmp_path, capsys, monkeyp
         assert sample.torque.shape == (row["episodes"], hold, 20) and 0.0 < sample.torque.max() <= 1.0
 
 
-def test_rows_by_the_hand_centre_and_under_loads(evaluator):
-    told = []
-    row, rules = evaluator.row_by_center(EPISODES, told.append)
-    assert row.group == CENTER_GROUP and row.episodes == EPISODES == told[-1] and row.paper.success == 0.96
-    assert 0 < rules.kept < rules.kept_by_center <= 1 - rules.from_below + 1e-9 and 0 < rules.opposed <= 1
-    levels = [Load("light", mass=(0.1, 0.1)), Load("heavy", mass=(2, 2))]
-    light, heavy = evaluator.rows_under_loads(levels, print, EPISODES)
+def test_rows_by_the_hand_centre_and_under_loads(experiment):
+    light, heavy, center = (
+        result.row
+        for result in experiment.run([Load(label="light", mass=(0.1, 0.1)), Load(label="heavy", mass=(2, 2)), Center()])
+    )
+    assert center.group == CENTER_GROUP and center.episodes == EPISODES and center.paper.success == 0.96
     assert (light.group, light.mass_kg, heavy.mass_kg) == ("light", pytest.approx(0.1), pytest.approx(2.0))
     assert light.constraint == "heading" and light.paper is None and heavy.diverged == 0
+    assert center.mass_kg == pytest.approx(np.mean([obj.mass for obj in experiment.scaled])), "its own objects again"
 
 
-def test_rows_are_independent(evaluator):
-    """Equal to the last digit, whatever was simulated before it."""
-    names = ["affordance", "heading"]
-    among = evaluator.samples(names, EPISODES)
-    for name in names:
-        alone = evaluator.samples([name], EPISODES)[name]
-        for key, column in among[name].values.items():
-            np.testing.assert_array_equal(alone.values[key], column, err_msg=f"{name}: {key}")
+def test_shares_of_the_rules_for_headings(experiment):
+    """They add up, and agree with the bank."""
+    found, bank = heading_rules(experiment), experiment.bank
+    assert found.kept + found.from_below + found.no_room == pytest.approx(1.0) and 0 <= found.moved <= 1
+    assert 0 < found.kept < found.kept_by_center <= 1 - found.from_below + 1e-9 and 0 < found.opposed <= 1
+    kept = sum(
+        len(set(np.asarray(bank.heading_index)[n, 0, r]))
+        for n in range(len(OBJECTS))
+        for r in range(len({tuple(rest) for rest in np.asarray(bank.rest)[n].tolist()}))
+    )
+    assert found.kept * 256 * sum(len(obj.rest_poses) for obj in experiment.scaled) == pytest.approx(kept)
 
 
-def test_rows_of_fingers_and_of_a_force_limit(evaluator):
-    samples = evaluator.samples(["fingers", "force"], EPISODES)
-    for name, mask in (("fingers", "mask_fingers"), ("force", "mask_force_limit")):
-        sample, ratio = samples[name], samples[name].values[f"{name}_ratio"]
+def test_rows_are_independent_and_kept_episodes_are_drawn(experiment):
+    """Equal to the last digit, whatever was simulated before it, and whether every step is recorded."""
+    variations = [Variation("affordance"), Variation()]
+    among = experiment.run(variations, keep=True)
+    for variation, result in zip(variations, among, strict=True):
+        (alone,) = experiment.run([variation])
+        for key, column in result.sample.values.items():
+            np.testing.assert_array_equal(alone.sample.values[key], column, err_msg=f"{variation}: {key}")
+        assert alone.row.to_json() == result.row.to_json() and not alone.examples(1, 1)
+    heading = among[1]
+    assert len(heading.held) == heading.sample.values["held"].sum() == EPISODES - len(heading.lost)
+    ((name, sheet, causes),) = failure_sheets(experiment, [heading], successes=2, failures=2)
+    assert name == "heading" and len(causes) == len(heading.examples(2, 2))
+    assert sheet.shape[0] > 2 * 225 and sheet.shape[1] > 5 * 300
+
+
+def test_rows_of_fingers_and_of_a_force_limit(experiment):
+    for result, mask in zip(
+        experiment.run([Variation("fingers"), Variation("force")]), ("mask_fingers", "mask_force_limit"), strict=True
+    ):
+        name, sample, row = result.variation.constraint, result.sample, result.row
+        ratio = sample.values[f"{name}_ratio"]
         assert (sample.values[mask] == 1).all() and ((ratio >= 0) & (ratio <= 1)).all()
-        row = evaluator.row(name, sample)
         assert (row.constraint, row.episodes, row.paper) == (name, EPISODES, None)
         assert f"{name}_ratio" in row.errors and row.errors["heading_rad"] is None
         assert (row.errors[f"{name}_ratio"] is None) == (row.success == 0)
         assert {"force_peak_n", "force_mean_n"} <= set(row.to_json())
 
 
-def test_a_constraint_that_no_object_allows(evaluator, monkeypatch):
-    bank = evaluator._bank
+def test_a_constraint_that_no_object_allows(experiment):
+    bank = experiment.bank
     none = bank._replace(has_affordance=np.zeros_like(bank.has_affordance))
-    monkeypatch.setattr(evaluator, "_bank", none)
+    own = dataclasses.replace(experiment, constraints=none)
+    heading, affordance, composed = map(Variation, ("heading", "affordance", "trajectory+affordance"))
     with pytest.raises(CongraspError, match="None of the 4 objects allows the constraint 'affordance'"):
-        evaluator.samples(["heading", "affordance"], 1)
-    names, errors = evaluator.allowed(["heading", "affordance"])
-    assert names == ["heading"] and "'affordance'" in str(errors[0])
+        own.run([heading, affordance])
+    allowed, errors = own.allowed([heading, affordance])
+    assert allowed == [heading] and "'affordance'" in str(errors[0])
     with pytest.raises(CongraspError, match="'affordance'"):
-        evaluator.allowed(["affordance", "trajectory+affordance"])
+        own.allowed([affordance, composed])
     with pytest.raises(CongraspError, match="trajectory\\+affordance"):
-        evaluator.plan("trajectory+affordance", 1)
-
-
-@pytest.mark.slow
-def test_failures_of_an_untrained_policy_are_drawn(evaluator):
-    sample = evaluator.samples(["heading"], EPISODES, keep=True)["heading"]
-    assert not sample.values["held"].any()
-    ((name, sheet, causes),) = failure_sheets(evaluator, task.policy(), ["heading"], successes=2, failures=2)
-    assert name == "heading" and len(causes) == 2 and "held" not in causes
-    assert sheet.shape[0] > 2 * 225 and sheet.shape[1] > 5 * 300
+        own.plan(composed)
 
 
 @pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--pool", "-1"], ["--friction", "nan"]])
@@ -162,10 +178,12 @@ def test_numbers_out_of_range(policy, arguments):
         load("evaluate")(["--policy", str(policy), *arguments])()
 
 
-def test_nominal_mass_and_friction_and_two_seconds(monkeypatch):
-    assert protocol.two_seconds(task.TASK) == 200
-    monkeypatch.setattr("congrasp.services.evaluate.evaluator.build_bank", lambda *arguments: None)
-    ranged = dataclasses.replace(task.TASK, mass_range=(0.8, 1.5), friction_range=(0.6, 1.0))
-    found = Evaluator(task.policy(), task.OBJECTS, task=ranged).task
-    assert found.mass_range == (1.0, 1.0) and found.friction_range == (1.0, 1.0)
-    assert Evaluator(task.policy(), task.OBJECTS, task=ranged, friction=3.0).task.friction_range == (3.0, 3.0)
+def test_nominal_mass_and_friction_and_two_seconds():
+    assert Experiment(task.policy(), []).steps == plan.two_seconds(task.TASK) == 200
+    ranged = dataclasses.replace(
+        task.TASK, mass_range=(0.8, 1.5), friction_range=(0.6, 1.0), gain_range=(0.8, 1.2), sensing=TRACKERS
+    )
+    found = Experiment(dataclasses.replace(task.policy(), task=ranged), []).task
+    assert found.mass_range == found.friction_range == found.gain_range == (1.0, 1.0)
+    assert found.sensing == task.TASK.sensing, "a perfect tracker"
+    assert Experiment(task.policy(), [], friction=3.0).task.friction_range == (3.0, 3.0)

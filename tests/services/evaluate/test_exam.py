@@ -1,6 +1,4 @@
-"""What the exam is made of: objects, rules for headings, loads, and which episodes are the same."""
-
-import dataclasses
+"""What the exam is made of: objects, and which episodes are the same."""
 
 import jax
 import numpy as np
@@ -9,18 +7,9 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED
-from congrasp.services.evaluate import exam
+from congrasp.services.evaluate import pools
 from congrasp.services.evaluate.episodes import identity, reference
-from congrasp.services.evaluate.heading_rules import heading_rules
-from congrasp.services.evaluate.loads import MASSES, PEERS, Load, at_load, loaded, payload
 from tests import task
-
-OBJECTS = task.OBJECTS
-
-
-@pytest.fixture(scope="module")
-def bank():
-    return task.bank()
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +20,8 @@ def conditions():
 def test_an_exam_has_all_families_and_seeds_of_its_own(monkeypatch):
     asked = []
     monkeypatch.setattr(procedural, "parallel_map", lambda make, seeds, families: asked.append((list(seeds), families)))
-    exam.exam_pool("figures")
-    exam.exam_pool("development", 5)
+    pools.exam_pool("figures")
+    pools.exam_pool("development", 5)
     (figures, families), (development, _) = asked
     assert sorted(families) == sorted(procedural.FAMILIES), "one object of each family"
     assert figures == list(range(FIGURES_SEED, FIGURES_SEED + len(procedural.FAMILIES)))
@@ -40,49 +29,9 @@ def test_an_exam_has_all_families_and_seeds_of_its_own(monkeypatch):
 
 
 def test_the_development_exam_never_reaches_objects_for_figures():
-    assert exam.first_seed("development", 1_000_000) == HELD_OUT_SEED
+    assert pools.first_seed("development", 1_000_000) == HELD_OUT_SEED
     with pytest.raises(CongraspError, match="smaller --pool"):
-        exam.first_seed("development", 1_000_001)
-
-
-def test_shares_of_the_rules_for_headings(bank):
-    """They add up, and agree with the bank."""
-    found = heading_rules(bank, OBJECTS)
-    assert found.kept + found.from_below + found.no_room == pytest.approx(1.0) and 0 <= found.moved <= 1
-    kept = sum(
-        len(set(np.asarray(bank.heading_index)[n, 0, r]))
-        for n in range(len(OBJECTS))
-        for r in range(len({tuple(rest) for rest in np.asarray(bank.rest)[n].tolist()}))
-    )
-    assert found.kept * 256 * sum(len(obj.rest_poses) for obj in OBJECTS) == pytest.approx(kept)
-
-
-def test_a_load_sets_the_mass_of_objects_and_the_friction_of_the_same_episodes(conditions):
-    for obj, heavy in zip(OBJECTS, loaded(OBJECTS, Load("2 kg", mass=(2.0, 2.0))), strict=True):
-        assert heavy.mass == 2.0 and heavy.name == obj.name
-        np.testing.assert_allclose(heavy.inertia * obj.mass, 2.0 * obj.inertia)
-    for obj, half in zip(OBJECTS, loaded(OBJECTS, Load("half", factor=0.5)), strict=True):
-        assert half.mass == pytest.approx(obj.mass / 2)
-    many = [dataclasses.replace(OBJECTS[0], name=f"box_{i}") for i in range(64)]
-    masses = np.array([obj.mass for obj in loaded(many, PEERS[1])])
-    assert 0.04 <= masses.min() < 0.1 and 0.44 < masses.max() <= 0.5 and 0.2 < masses.mean() < 0.34
-    dexsuite = at_load(conditions, PEERS[1]).reset_state
-    assert 0.5 <= dexsuite.friction.min() < 0.6 and 0.9 < dexsuite.friction.max() <= 1.0
-    np.testing.assert_array_equal(dexsuite.q, conditions.reset_state.q)
-    assert at_load(conditions, Load("2 kg", mass=(2.0, 2.0))) is conditions
-    # An episode's friction does not depend on the others.
-    last = jax.tree.map(lambda leaf: leaf[-1:], conditions)
-    assert at_load(last, PEERS[1]).reset_state.friction[0] == dexsuite.friction[-1]
-
-
-@pytest.mark.parametrize("constant_mass", [True, False])
-def test_payload_has_the_literal_scaling_where_lengths_are_scaled(constant_mass):
-    """Objects of 1.4 times the length are 2.744 times as heavy at the same density."""
-    *masses, own, literal = payload(1.4, constant_mass=constant_mass)
-    assert [load.mass for load in masses] == [(mass, mass) for mass in MASSES]
-    assert literal.factor / own.factor == pytest.approx(2.744)
-    assert (own if constant_mass else literal).factor == pytest.approx(1.0)
-    assert len(payload(1.0, constant_mass=constant_mass)) == len(MASSES) + 1
+        pools.first_seed("development", 1_000_001)
 
 
 def test_episodes_that_begin_alike_are_one(conditions):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from congrasp.common.wire.codec import Message
-from congrasp.services.evaluate.failures import cause
+from congrasp.services.evaluate.pictures import cause
 
 
 def episode(heights, **metrics) -> Message:

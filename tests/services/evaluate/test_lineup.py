@@ -99,11 +99,12 @@ def test_what_cannot_be_compared_is_refused(saved, tmp_path, texts, words):
 
 
 def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monkeypatch):
-    def evaluate_tables(policy, names, setup, track, *, keep):
-        assert names == ("single",) and setup.episodes == 7
-        return tables.Found(None, [], [], [], [row("heading", 0.9, 0.8, 0.95, method=policy.task.method)], "")
+    def evaluate_tables(own, names, pools, kept, *, keep):
+        assert names == ("single",) and own.episodes == 7 and pools is None and not keep
+        return tables.Found(own, [], [row("heading", 0.9, 0.8, 0.95, method=own.policy.task.method)], [], "")
 
     monkeypatch.setattr(tables, "evaluate_tables", evaluate_tables)
+    monkeypatch.setattr("congrasp.services.evaluate.pools.exam_pool", lambda exam, count: [])
     files = [str(saved("ours")), f"no-feedforward={saved('no-feedforward')}"]
     command = ["--table", "ablation", "--policy", *files, "--episodes", "7", "--json", str(tmp_path / "rows.json")]
     assert load("evaluate")(command)() == 0

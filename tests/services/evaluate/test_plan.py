@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from congrasp.common.task.constraints import blocks
-from congrasp.services.evaluate.plan import ALIGNED, batches, plan_row
-from congrasp.services.evaluate.protocol import protocol
+from congrasp.services.evaluate.plan import ALIGNED, batches, plan_row, protocol
 from congrasp.services.evaluate.scores import TABLES
 from tests import task
 

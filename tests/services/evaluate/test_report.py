@@ -18,10 +18,17 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.services.assets.hands.check import Finding, write_findings
 from congrasp.services.cli import main
-from congrasp.services.evaluate.model_card import limits, model_card
-from congrasp.services.evaluate.report import Commands, Picture, count_causes, curves_of, write_report
-from congrasp.services.evaluate.reporting import Reported
-from congrasp.services.evaluate.turntable import turntable
+from congrasp.services.evaluate.pictures import turntable
+from congrasp.services.evaluate.report import (
+    Commands,
+    Picture,
+    count_causes,
+    curves_of,
+    limits,
+    model_card,
+    write_report,
+)
+from congrasp.services.evaluate.tables import Found
 from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.train.command import untrained
@@ -80,12 +87,13 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
     bundles.save(policy, tmp_path / "policy.safetensors")
     rows, out = [row("heading", 0.99, 0.975, 0.995)], tmp_path / "report.html"
 
-    def report_on(file, out, *, check, track, subject, **options):
-        assert subject == f"--policy {file}" and options["episodes"] == 8 and options["run_dir"] == tmp_path
-        write_report(out, policy, file.name, rows, "8 episodes", [], [], Commands("c", ""), check)
-        return Reported(rows, [CongraspError("Row x.", "Y.")])
+    def report_on(own, name, out, *, check, subject, objects, run_dir):
+        assert subject == f"--policy {tmp_path / name}" and own.episodes == 8 and run_dir == tmp_path
+        write_report(out, own.policy, name, rows, "8 episodes", [], [], Commands("c", ""), check)
+        return Found(None, [], rows, [CongraspError("Row x.", "Y.")], "")
 
-    monkeypatch.setattr("congrasp.services.evaluate.reporting.report_on", report_on)
+    monkeypatch.setattr("congrasp.services.evaluate.report.report_on", report_on)
+    monkeypatch.setattr("congrasp.services.evaluate.pools.exam_pool", lambda exam, count: [])
     command = ["report", str(tmp_path), "--out", str(out), "--episodes", "8", "--json", str(tmp_path / "rows.json")]
     assert main.run([*command, "--check", str(tmp_path / "check.json")]) == 0
     found = Reader(text := out.read_text())

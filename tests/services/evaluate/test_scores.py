@@ -8,18 +8,18 @@ import pytest
 
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks
-from congrasp.services.evaluate.cells import RATES, rate_cells, tables_of
-from congrasp.services.evaluate.intervals import clustered
+from congrasp.services.evaluate.episodes import PROBED_EPISODES, Sample, joined
 from congrasp.services.evaluate.paper import paper_row
 from congrasp.services.evaluate.scores import (
-    PROBED_EPISODES,
     TABLES,
-    Sample,
-    joined,
+    clustered,
+    independent_episodes,
     object_groups,
     summarise,
+    wilson,
     write_json,
 )
+from congrasp.services.evaluate.table import RATE, tables_of
 from tests.rows import row as made_row
 
 TASK = TaskConfig()
@@ -88,7 +88,7 @@ def test_uncovered_objects_count_as_failures():
     row = summarise("affordance", "human", sample, held_2s=True, objects=list("abcde"))
     assert (row.covered, row.pool, row.success, row.success_all) == (3, 5, 0.5, pytest.approx(0.3))
     assert row.held_2s == pytest.approx(1 / 3) and row.held_all == pytest.approx(0.2)
-    assert rate_cells(row)[RATES.index("of all objects")] == "30.0 %, 20.0 %"
+    assert RATE["of all objects"](row) == "30.0 %, 20.0 %"
     # Of a group of three of the five there is no uncovered object.
     assert summarise("heading", "human", sample, held_2s=True, objects=list("abcde"), pool=3).success_all == 0.5
 
@@ -97,7 +97,7 @@ def test_an_episode_that_repeats_counts_once_and_clusters_widen_the_interval():
     repeated = _sample([1] * 8 + [0] * 8, [0] * 16, identity=[0] * 8 + [1] * 8, object_index=[0] * 8 + [1] * 8)
     row = summarise("pose", "human", repeated, held_2s=True, objects=["a", "b"])
     assert (row.episodes, row.distinct, row.independent) == (16, 2, pytest.approx(1.0))
-    assert rate_cells(row)[1] == "16 (2 different)"
+    assert RATE["episodes"](row) == "16 (2 different)"
     spread = summarise("pose", "human", _sample([1] * 8 + [0] * 8, [0] * 16), held_2s=True, objects=["a"])
     assert spread.distinct == 16 and row.success_low < spread.success_low < spread.success_high < row.success_high
     # Sequences of one object are the clusters where references are.
@@ -175,18 +175,17 @@ def test_the_file_has_the_fixed_fields_and_the_table_a_line_a_row(tmp_path):
     for row in read["rows"]:
         assert set(REQUIRED) <= set(row) and row["method"] == "ours"
     assert read["rows"][0]["pose_rad"] is None and read["rows"][0]["heading_rad"] == 0.0
-    assert all(table.row_count == 10 for table in tables_of(rows, "title"))
+    assert all(table.terminal().row_count == len(table.rows) == 10 for table in tables_of(rows, "title"))
 
 
 def test_rows_of_several_policies_stand_together_and_missing_ones_are_named():
     rows = [made_row(name, 0.9, 0.8, 0.95, method=method) for method in ("ours", "pd") for name in ("heading", "pose")]
     rates, *_ = tables_of(rows, "title", [("human", "graspxl", "not trained")])
-    columns = [list(column.cells) for column in rates.columns]
-    assert [column.header for column in rates.columns][:3] == ["constraint", "hand", "method"]
-    assert columns[0] == ["heading", "heading", "pose", "pose", "not trained"]
-    assert columns[2] == ["ours", "pd", "ours", "pd", "graspxl"]
+    assert rates.columns[:3] == ["constraint", "hand", "method"]
+    assert [row[0] for row in rates.rows] == ["heading", "heading", "pose", "pose", "not trained"]
+    assert [row[2] for row in rates.rows] == ["ours", "pd", "ours", "pd", "graspxl"]
     alone, *_ = tables_of(rows[:2], "title")
-    assert [column.header for column in alone.columns][:2] == ["constraint", "episodes"]
+    assert alone.columns[:2] == ["constraint", "episodes"]
 
 
 def test_the_margin_of_a_mean_error_is_1_96_standard_errors():
@@ -196,3 +195,36 @@ def test_the_margin_of_a_mean_error_is_1_96_standard_errors():
     assert found.margins == pytest.approx({"heading_rad": 0.113161, "heading_m": 0.0}, abs=1e-5)
     only = summarise("heading", "human", sample.first(1), held_2s=True, objects=["box"])
     assert only.margins == {} and only.errors["heading_rad"] == pytest.approx(0.1)
+
+
+def test_wilson_interval():
+    # n = 10, p = 0.8, z = 1.96: centre (0.8 + 0.19207) / 1.38415, half width 1.96 sqrt(0.016 + 0.0096036) / 1.38415.
+    assert wilson(0.8, 10) == pytest.approx((0.49016, 0.94332), abs=1e-5)
+    # No success: 0 to z^2 / (n + z^2).
+    assert wilson(0.0, 10) == pytest.approx((0.0, 3.84146 / 13.84146), abs=1e-5)
+    assert wilson(1.0, 1000) == pytest.approx((1000 / 1003.84146, 1.0), abs=1e-6)
+    assert wilson(0.0, 0) == (0.0, 1.0)
+
+
+def test_clusters_count_by_the_design_effect():
+    """By hand: rates 1, 1/2, 1/2 and 0 of four clusters of four, p = 1/2, sums off the mean 2, 0, 0 and -2.
+
+    The robust variance is 4/3 * 8 / 16^2 = 1/24, that of 16 independent episodes 1/64: the design effect is 8/3.
+    """
+    outcomes = np.array([1, 1, 1, 1, 1, 0, 1, 0, 0, 1, 0, 1, 0, 0, 0, 0], bool)
+    clusters = np.repeat([7, 3, 5, 1], 4)
+    assert independent_episodes(outcomes, clusters) == pytest.approx(6.0)
+    # n = 6, p = 1/2: half width 1.96 sqrt(1/24 + 0.026677) / 1.640243.
+    assert clustered(outcomes, clusters) == pytest.approx((0.18761, 0.81239), abs=1e-4)
+
+
+def test_an_interval_is_never_narrower_than_that_of_independent_episodes():
+    alternating, clusters = np.tile([1, 0], 8), np.repeat(np.arange(8), 2)
+    assert independent_episodes(alternating, clusters) == 16.0
+    assert independent_episodes(alternating, np.arange(16)) == 15.0  # G / (G - 1), as of a sample's variance
+
+
+def test_clusters_that_end_alike_count_once():
+    assert independent_episodes(np.ones(20, bool), np.repeat(np.arange(5), 4)) == 5.0
+    assert clustered(np.ones(20, bool), np.repeat(np.arange(5), 4)) == wilson(1.0, 5.0)
+    assert independent_episodes(np.array([1, 0, 1, 1]), np.zeros(4)) == 4.0, "one object alone"

@@ -6,10 +6,10 @@ import pytest
 
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands
-from congrasp.services.evaluate.evaluator import Evaluator
-from congrasp.services.evaluate.exam import exam_pool
-from congrasp.services.evaluate.intervals import NORMAL_95
+from congrasp.services.evaluate.experiment import Experiment, Variation
+from congrasp.services.evaluate.pools import exam_pool
 from congrasp.services.evaluate.results import recorded
+from congrasp.services.evaluate.scores import NORMAL_95
 
 _SIGMAS = 3
 """Standard deviations of each bound: with two, one of the thirty that are checked would break half of the time."""
@@ -41,8 +41,8 @@ def check(hand, names, episodes):
     """A broken bundle, or physics that it does not know, falls below these floors."""
     recorded_rows = {row.constraint: row for row in RESULTS[hand].rows if not row.group}
     policy = bundles.load(policy_file(None, hand))
-    evaluator = Evaluator(policy, exam_pool("development", episodes), batch=episodes)
-    for row in evaluator.rows(names, episodes):
+    own = Experiment(policy, exam_pool("development", episodes), episodes=episodes, hold=policy.task.hold_steps)
+    for row in (result.row for result in own.run([Variation(name) for name in names])):
         record = recorded_rows[row.constraint]
         assert row.success >= farthest(record.success, row.covered, record.independent), row.constraint
         assert row.plausibility["hand_hand_mm"] < 2 and row.plausibility["hand_table_mm"] < 2, row.constraint

@@ -1,5 +1,7 @@
 """Objects in pools: each gets its share, what cannot be used is counted, and a stopped evaluation goes on."""
 
+import contextlib
+import dataclasses
 import types
 
 import numpy as np
@@ -9,34 +11,15 @@ from congrasp.actors.env import metric_names
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
-from congrasp.services.evaluate import exam, unseen
+from congrasp.services.evaluate import experiment
 from congrasp.services.evaluate import pools as of_objects
-from congrasp.services.evaluate.pools import Loaded, Pools, folder_pools, procedural_pools
-from congrasp.services.evaluate.scores import Sample
-from congrasp.services.evaluate.unseen import evaluate_objects
+from congrasp.services.evaluate.episodes import Sample
+from congrasp.services.evaluate.experiment import Experiment
+from congrasp.services.evaluate.pools import FAMILIES, Loaded, Pools, evaluate_pools, folder_pools, procedural_pools
 from tests.task import TASK, policy
 
-POLICY = policy()
 OBJECTS = procedural.generate_many(5, 1_000_000)
-SETTINGS = {"physics": "native", "batch": 0, "threads": 1, "seed": 0, "friction": 1.0}
-
-
-class Running:
-    """In place of `Episodes`: of every pool that it gets, whether all the rest was made for the same one."""
-
-    batch = 4
-
-    def __init__(self, bundle, task, objects, *, field, **settings):
-        self.pools = [objects]
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        pass
-
-    def replace_objects(self, objects, field):
-        self.pools.append(objects)
+EXPERIMENT = Experiment(policy(), [])
 
 
 @pytest.fixture
@@ -44,25 +27,32 @@ def simulated(monkeypatch):
     """Stands in for engine and constraints; lists the pools that were simulated."""
     done = []
 
-    def plan_row(task, bank, objects, name, episodes):
-        assert bank == [obj.name for obj in objects] and name == "heading"
-        index = np.tile(np.arange(len(objects)), episodes // len(objects))
+    def build_bank(hand, task, objects, seed):
+        return [obj.name for obj in objects]
+
+    def plan(self, variation):
+        assert self.bank == [obj.name for obj in self.objects] and variation.constraint == "heading"
+        index = np.tile(np.arange(len(self.objects)), self.episodes // len(self.objects))
         return types.SimpleNamespace(episodes=index, total=len(index))
 
-    def simulate(running, index, total, progress, stressed):
-        done.append(([obj.name for obj in running.pools[-1]], stressed))
-        progress(total)
-        values = {name: np.ones(total, np.float32) for name in metric_names(TASK)}
-        values |= {"object_index": index.astype(np.float32), "clean": np.zeros(total, np.float32)}
-        values |= {"mass_kg": np.full(total, 0.2, np.float32), "identity": np.arange(total, dtype=np.uint32)}
-        return Sample(values, np.ones((total, 1, 2), np.float16), np.ones((total, 1, 3), np.float16))
+    def sample(self, running, variation, plan, progress, *, stressed):
+        done.append(([obj.name for obj in self.objects], stressed))
+        progress(plan.total)
+        values = {name: np.ones(plan.total, np.float32) for name in metric_names(TASK)}
+        values |= {"object_index": plan.episodes.astype(np.float32), "clean": np.zeros(plan.total, np.float32)}
+        values |= {"mass_kg": np.full(plan.total, 0.2, np.float32), "identity": np.arange(plan.total, dtype=np.uint32)}
+        return Sample(values, np.ones((plan.total, 1, 2), np.float16), np.ones((plan.total, 1, 3), np.float16))
 
-    monkeypatch.setattr(unseen, "Episodes", Running)
-    monkeypatch.setattr(of_objects, "build_bank", lambda hand, task, objects, seed: [obj.name for obj in objects])
-    monkeypatch.setattr(unseen, "plan_row", plan_row)
-    monkeypatch.setattr(unseen, "batches", lambda hand, task, bank, plan, seed, size: plan.episodes)
-    monkeypatch.setattr(unseen, "simulate", simulate)
+    monkeypatch.setattr(experiment, "build_bank", build_bank)
+    monkeypatch.setattr(Experiment, "plan", plan)
+    monkeypatch.setattr(Experiment, "sample", sample)
+    monkeypatch.setattr(Experiment, "simulator", lambda self: contextlib.nullcontext("simulator"))
     return done
+
+
+def evaluated(pools, episodes, kept=None, *, seed=0, track=lambda label, total: lambda done: None):
+    """Rows of the test's policy."""
+    return evaluate_pools(dataclasses.replace(EXPERIMENT, episodes=episodes, seed=seed, track=track), pools, kept)
 
 
 def pools_of(*groups, left_out=()):
@@ -74,7 +64,7 @@ def pools_of(*groups, left_out=()):
 def test_every_object_has_the_same_episodes_whichever_pool_it_is_in(simulated):
     told = []
     pools = pools_of(OBJECTS[:3], OBJECTS[3:], left_out=["broken"])
-    whole, *groups = evaluate_objects(POLICY, pools, 11, **SETTINGS, progress=told.append)
+    whole, *groups = evaluated(pools, 11, track=lambda label, total: told.append)
     assert {obj["episodes"] for obj in whole.objects} == {2}
     assert [obj["name"] for obj in whole.objects] == [obj.name for obj in OBJECTS]
     assert (whole.episodes, whole.covered, whole.pool, whole.success) == (10, 5, 6, 1.0)
@@ -88,7 +78,7 @@ def test_every_object_has_the_same_episodes_whichever_pool_it_is_in(simulated):
 
 
 def test_sizes_masses_and_families_are_those_of_the_objects(simulated):
-    _, *groups = evaluate_objects(POLICY, pools_of(OBJECTS[:2], OBJECTS[2:4]), 4, **SETTINGS)
+    _, *groups = evaluated(pools_of(OBJECTS[:2], OBJECTS[2:4]), 4)
     for row in groups:
         if row.group.startswith("family"):
             names = {obj["name"] for obj in row.objects}
@@ -99,7 +89,7 @@ def test_sizes_masses_and_families_are_those_of_the_objects(simulated):
 
 
 def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
-    whole = evaluate_objects(POLICY, pools_of(OBJECTS[:2], OBJECTS[2:4]), 8, **SETTINGS)
+    whole = evaluated(pools_of(OBJECTS[:2], OBJECTS[2:4]), 8)
     simulated.clear()
 
     def stop():
@@ -107,16 +97,16 @@ def test_a_stopped_evaluation_goes_on_with_the_next_pool(simulated, tmp_path):
 
     first = pools_of(OBJECTS[:2], OBJECTS[2:4])
     with pytest.raises(KeyboardInterrupt):
-        evaluate_objects(POLICY, first._replace(make=[first.make[0], stop]), 8, **SETTINGS, keep=tmp_path)
+        evaluated(first._replace(make=[first.make[0], stop]), 8, tmp_path)
     assert len(simulated) == 1
     again = first._replace(make=[stop, first.make[1]])  # the first is not even made
-    rows = evaluate_objects(POLICY, again, 8, **SETTINGS, keep=tmp_path)
+    rows = evaluated(again, 8, tmp_path)
     assert [row.to_json() for row in rows] == [row.to_json() for row in whole]
     assert [names for names, _ in simulated] == [[o.name for o in OBJECTS[:2]], [o.name for o in OBJECTS[2:4]]]
-    evaluate_objects(POLICY, first, 8, **{**SETTINGS, "seed": 1}, keep=tmp_path)
+    evaluated(first, 8, tmp_path, seed=1)
     assert len(simulated) == 4  # other settings: both anew
-    (tmp_path / "pool-00001.safetensors").write_bytes(b"cut off")
-    evaluate_objects(POLICY, first, 8, **{**SETTINGS, "seed": 1}, keep=tmp_path)
+    max(tmp_path.glob("*-00001.safetensors"), key=lambda file: file.stat().st_mtime_ns).write_bytes(b"cut off")
+    evaluated(first, 8, tmp_path, seed=1)
     assert len(simulated) == 5
 
 
@@ -128,7 +118,7 @@ def test_no_more_than_the_next_pool_is_made_ahead(simulated):
         return Loaded(OBJECTS[:1], [])
 
     pools = Pools("test", 1, [lambda i=i: make(i) for i in range(5)])
-    evaluate_objects(POLICY, pools, 5, **SETTINGS, progress=lambda done: ahead.append(len(made) - len(simulated)))
+    evaluated(pools, 5, track=lambda label, total: lambda done: ahead.append(len(made) - len(simulated)))
     assert made == [0, 1, 2, 3, 4] and max(ahead) <= 1
 
 
@@ -146,13 +136,13 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(simulate
             raise CongraspError("no heading")
         return {"weight": np.float32(1.0)}
 
-    monkeypatch.setattr(of_objects, "build_bank", build_bank)
+    monkeypatch.setattr(experiment, "build_bank", build_bank)
     monkeypatch.setattr(of_objects, "headings_of", headings_of)
-    whole, *_ = evaluate_objects(POLICY, pools_of(OBJECTS[:3], OBJECTS[1:2]), 6, **SETTINGS)
+    whole, *_ = evaluated(pools_of(OBJECTS[:3], OBJECTS[1:2]), 6)
     assert [obj["name"] for obj in whole.objects] == [OBJECTS[0].name, OBJECTS[2].name]
     assert (whole.covered, whole.pool) == (2, 4) and lost in caplog.text
     with pytest.raises(CongraspError, match="None of the objects can be approached"):
-        evaluate_objects(POLICY, pools_of(OBJECTS[1:2]), 6, **SETTINGS)
+        evaluated(pools_of(OBJECTS[1:2]), 6)
 
 
 def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch):
@@ -172,4 +162,4 @@ def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
     objects = [make().objects for make in pools.make]
     assert pools.size == 2 and [len(pool) for pool in objects] == [2, 2, 2]
     names = [obj.name for pool in objects for obj in pool]
-    assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000, exam.FAMILIES)]
+    assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000, FAMILIES)]

@@ -10,12 +10,9 @@ from hypothesis import strategies as st
 
 from congrasp.services.evaluate.paper import TABLES, paper_lines, paper_row
 from congrasp.services.evaluate.scores import Row
-from congrasp.services.reproduce.comparison import SUCCESS, compare, unmatched
-from congrasp.services.reproduce.evaluation import Result
-from congrasp.services.reproduce.latex import escape, latex
-from congrasp.services.reproduce.layout import not_comparable, tables
-from congrasp.services.reproduce.page import summary
-from congrasp.services.reproduce.plan import Part, RequiredPolicy, parts, policies
+from congrasp.services.evaluate.table import escape
+from congrasp.services.reproduce.comparison import SUCCESS, compare, not_comparable, summary, tables, unmatched
+from congrasp.services.reproduce.plan import Part, RequiredPolicy, Result, parts, policies
 from tests.rows import row
 
 HANDS = ("human", "allegro", "sharpa")
@@ -77,7 +74,7 @@ def test_reasons_say_what_is_missing():
     (allegro,) = find(cells, "hands", "pose", hand="allegro")
     assert allegro.reason == "the hand 'allegro' was not requested"
     assert any("GraspXL" not in why and "graspxl" in what and "small objects" in what
-               for what, why, _ in not_comparable(cells))  # fmt: skip
+               for what, why, _ in not_comparable(cells).rows)  # fmt: skip
 
 
 def test_rows_without_an_episode_that_succeeds_have_no_error_to_compare():
@@ -122,14 +119,14 @@ def test_rows_come_back_from_json_as_they_were():
 def test_latex_is_balanced_and_holds_every_figure():
     rows = [row(name, 0.984, 0.945, 0.996, margins={"heading_rad": 0.01}) for name in ("heading", "pose")]
     shown = tables(compare([result("hands", *rows)], {}, HANDS))
-    text = latex(shown, "50 % of 3_objects & more.")
+    text = "\n".join(table.latex("50 % of 3_objects & more.") for table in shown)
     opened, closed = (re.findall(rf"\\{word}{{(\w+)}}", text) for word in ("begin", "end"))
     assert sorted(opened) == sorted(closed) == ["table"] * 6 + ["tabular"] * 6
     plain = re.sub(r"\\[\\%&#_{}$]|\\\w+(\{\})?", "", text)
     assert plain.count("{") == plain.count("}")
     body = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert len(body) == 6 + 47
-    wanted = [len(table.columns) - 1 for table in shown for _ in range(1 + len(table.lines))]
+    wanted = [len(table.columns) - 1 for table in shown for _ in range(1 + len(table.rows))]
     assert [len(re.findall(r"(?<!\\)&", line)) for line in body] == wanted and set(wanted) == {7, 9}
     for line in body:
         assert not re.search(r"(?<!\\)[%#_]", line)

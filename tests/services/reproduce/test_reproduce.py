@@ -11,9 +11,9 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate.lineup import read_entrant
-from congrasp.services.reproduce import evaluation, run
-from congrasp.services.reproduce.evaluation import Numbers, Result
-from congrasp.services.reproduce.plan import RequiredPolicy
+from congrasp.services.evaluate.tables import Found
+from congrasp.services.reproduce import run
+from congrasp.services.reproduce.plan import RequiredPolicy, Result
 from congrasp.services.train.command import untrained
 from tests.pages import Reader
 from tests.rows import row
@@ -67,7 +67,7 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, 
     def never(*arguments, **options):
         raise CongraspError("This must not be evaluated.")
 
-    monkeypatch.setattr(evaluation, "evaluate_tables", never)
+    monkeypatch.setattr(run, "evaluate_tables", never)
     again, printed = reproduced(), capsys.readouterr().out
     assert printed.count("evaluated before") == 2 and again["cells"] == first["cells"]
     assert Reader((tmp_path / "reproduction.html").read_text()).sources == page.sources
@@ -82,25 +82,25 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, 
     """A method whose training fails is named with the reason, and the others are evaluated."""
     asked = []
 
-    def train_all(folder, wanted, **options):
+    def train_all(request, wanted, track):
         asked.extend(wanted)
         return {one: "it failed" for one in wanted}
 
-    def evaluate_part(part, entrant, numbers, out, track):
+    def evaluate_part(part, entrant, request, track):
         asked.append(part.name)
         constraint = "heading" if part.table == "single" else "pose+trajectory"
         made = row(constraint, 0.9, 0.8, 0.95, hand=entrant.hand, method=entrant.method)
         about = {"pictures": [], "seconds": 1.0, "heading_rules": "Half of the headings are kept."}
         return Result(part, "hands", [made], about, True)
 
-    monkeypatch.setattr(run.training, "train_all", train_all)
+    monkeypatch.setattr(run, "train_all", train_all)
     monkeypatch.setattr(run, "evaluate_part", evaluate_part)
     request = run.Request(
         out=tmp_path, hands=("human", "allegro"), methods=("pd", "graspxl"), given={OURS: read_entrant(policy)},
         captured=(), quick=False, options=(), patience=1.0, command="congrasp reproduce",
+        episodes=3, pool=3, many=6, physics="native", seed=0,
     )  # fmt: skip
-    numbers = Numbers(3, 3, 6, "native", 0, 1.0)
-    account = run.reproduce(request, numbers, lambda text, total: lambda done: None)
+    account = run.reproduce(request, lambda text, total: lambda done: None)
     what = {one.name: text for one, text in account.policies}
     assert asked[:2] == [RequiredPolicy("allegro", "ours"), RequiredPolicy("human", "graspxl")]
     assert asked[2:6] == ["human-ours-single", "human-pd-single", "human-ours-composed", "human-ours-noise"]
@@ -132,8 +132,8 @@ def test_bad_input_is_refused_before_anything_begins(policy, tmp_path, monkeypat
 
 def test_captured_sets_are_looked_for_where_the_import_puts_them(policy, tmp_path, capsys, monkeypatch):
     (tmp_path / "grab" / "objects").mkdir(parents=True)
-    nothing = evaluation.Found(None, [], [], [], [], "")
-    monkeypatch.setattr(evaluation, "evaluate_tables", lambda *arguments, **options: nothing)
+    monkeypatch.setattr(run, "evaluate_tables", lambda own, *arguments, **options: Found(own, [], [], [], ""))
+    monkeypatch.setattr(run, "exam_pool", lambda exam, count: [])
     command = ["--quick", "--hands", "human", "--methods", "graspxl", "--policy", str(policy)]
     assert load("reproduce")([*command, "--captured", str(tmp_path / "grab"), "--out", str(tmp_path / "out")])() == 1
     assert "human-ours-grab: " in (printed := capsys.readouterr().out)

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from congrasp.services.cli import main
-from congrasp.services.reproduce import training
 from congrasp.services.reproduce.plan import RequiredPolicy
+from congrasp.services.reproduce.run import Request, train_all
 from congrasp.services.train import unattended
 from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import Child
@@ -38,40 +38,49 @@ def scripts(monkeypatch):
     assert all(child.process.poll() is not None for child in started)
 
 
+def request(out, patience, *options):
+    """A request whose trainings are in `out`."""
+    return Request(out, ("human",), (), {}, (), False, options, patience, "", 1, 1, 1, "native", 0)
+
+
+def silent(label, total):
+    return lambda done: None
+
+
 def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tmp_path):
     chosen, started = scripts
     chosen |= {OURS.name: FAILS, GRAPSXL.name: HANGS, PHASES.name: FINISHES}
-    lines = []
-    failures = training.train_all(
-        tmp_path, [OURS, GRAPSXL, PHASES], patience=3.0, progress=lambda policy, line: lines.append((policy, line))
-    )
+    wanted = request(tmp_path, 3.0)
+    failures = train_all(wanted, [OURS, GRAPSXL, PHASES], silent)
     assert set(failures) == {OURS, GRAPSXL}
     assert "human-ours failed: The disk is full." in failures[OURS] and "human-ours.log" in failures[OURS]
-    assert "human-graspxl was stopped" in failures[GRAPSXL] and (GRAPSXL, "update 3") in lines
-    assert training.trained(tmp_path, OURS) is None and training.seconds(tmp_path, OURS) is None
-    assert training.trained(tmp_path, PHASES) == tmp_path / PHASES.name / "policy.safetensors"
-    assert training.seconds(tmp_path, PHASES) > 0.0
+    assert "human-graspxl was stopped" in failures[GRAPSXL]
+    runs = wanted.runs
+    assert unattended.trained(runs / OURS.name) is None and unattended.seconds(runs / OURS.name) is None
+    assert unattended.trained(runs / PHASES.name) == runs / PHASES.name / "policy.safetensors"
+    assert unattended.seconds(runs / PHASES.name) > 0.0
     assert not any("--resume" in child.arguments for child in started)
 
 
 def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scripts, tmp_path):
     chosen, started = scripts
     chosen |= {OURS.name: FINISHES.replace("p.mkdir(); ", ""), GRAPSXL.name: FINISHES}
-    (tmp_path / OURS.name / "checkpoints").mkdir(parents=True)
-    (tmp_path / OURS.name / "checkpoints" / "checkpoint_00000003.safetensors").touch()
-    (tmp_path / GRAPSXL.name).mkdir()
-    (tmp_path / GRAPSXL.name / "config.json").touch()
-    assert training.train_all(tmp_path, [OURS, GRAPSXL], options=["--updates", "9"], patience=20.0) == {}
+    wanted = request(tmp_path, 20.0, "--updates", "9")
+    (wanted.runs / OURS.name / "checkpoints").mkdir(parents=True)
+    (wanted.runs / OURS.name / "checkpoints" / "checkpoint_00000003.safetensors").touch()
+    (wanted.runs / GRAPSXL.name).mkdir()
+    (wanted.runs / GRAPSXL.name / "config.json").touch()
+    assert train_all(wanted, [OURS, GRAPSXL], silent) == {}
     ours, graspxl = (child.arguments for child in started)
     assert "--resume" in ours and ours[-2:] == ["--updates", "9"] and "--preset" not in ours
-    run = str(tmp_path / GRAPSXL.name)
+    run = str(wanted.runs / GRAPSXL.name)
     assert graspxl[graspxl.index("--run-dir") + 1] == run and graspxl[graspxl.index("--evaluation") + 1] == "0"
-    assert "--resume" not in graspxl and not (tmp_path / GRAPSXL.name / "config.json").exists()
+    assert "--resume" not in graspxl and not (wanted.runs / GRAPSXL.name / "config.json").exists()
 
 
 @pytest.mark.parametrize("policy", [OURS, GRAPSXL, RequiredPolicy("allegro", "ours")], ids=lambda policy: policy.name)
 def test_its_command_lines_are_those_of_train(policy):
-    arguments = [*training.chosen(policy), "--environments", "4096"]
+    arguments = [*policy.training, "--environments", "4096"]
     train = main._parsed("train", main.load("train"), arguments)
     config = train.keywords["config"]
     assert (config.task.hand, config.environments) == (policy.hand, 4096)

@@ -11,8 +11,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.cli.plot import plot
-from congrasp.services.evaluate.plots import cells, plot_evaluation
-from congrasp.services.evaluate.scores import Sample, summarise, write_json
+from congrasp.services.evaluate.episodes import Sample
+from congrasp.services.evaluate.plots import compared, plot_evaluation
+from congrasp.services.evaluate.scores import Row, summarise, write_json
 
 TASK = TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))
 METRICS = metric_names(TASK)
@@ -42,22 +43,21 @@ def test_quantiles_are_of_the_successful_episodes(tmp_path: pathlib.Path) -> Non
 
 
 def test_the_table_has_every_row_beside_the_papers(tmp_path: pathlib.Path) -> None:
-    head, heading, composed, fingers = cells(evaluation(tmp_path / "e.json"))
-    assert heading[:5] == ["heading", "40", "75.0 (59.8-85.8)", "96.9", "0.0"]
-    at = head.index("Heading error, rad")
+    table = compared([Row.from_json(row) for row in evaluation(tmp_path / "e.json")])
+    heading, composed, fingers = table.rows
+    assert heading[:5] == ["heading", "40", "75.0 % (59.8-85.8)", "96.9 %", "0.0 %"]
+    at = table.columns.index("Heading error, rad")
     assert heading[at : at + 2] == ["0.250", "0.137"] and composed[at : at + 2] == ["", ""]
-    at = head.index("Affordance error, share")
+    at = table.columns.index("Affordance error, share")
     assert composed[at : at + 2] == ["0.250", "0.045"]
-    at = head.index("Fingers error, share")
+    at = table.columns.index("Fingers error, share")
     assert fingers[at : at + 2] == ["0.250", ""]
 
 
 def test_rows_of_several_policies_are_told_apart(tmp_path: pathlib.Path) -> None:
     heading, *_ = evaluation(tmp_path / "e.json")
-    assert [line[0] for line in cells([heading, {**heading, "method": "pd", "group": "small"}])[1:]] == [
-        "heading, human, ours",
-        "heading, small, human, pd",
-    ]
+    rows = [Row.from_json(row) for row in (heading, {**heading, "method": "pd", "group": "small"})]
+    assert [line[0] for line in compared(rows).rows] == ["heading, human, ours", "heading, small, human, pd"]
 
 
 def test_an_evaluation_becomes_png_and_pdf(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,323 @@
+"""Experiments: episodes of one policy on some objects by the paper's protocol. Each variation of one is a row."""
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+from congrasp.actors.initial import InitialConditions
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.distance import DistanceField, distance_field
+from congrasp.common.objects.pool import scale_objects
+from congrasp.common.objects.spec import GraspObject
+from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.sampling.bank import ConstraintBank, with_columns
+from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.wire.codec import Message
+from congrasp.services.evaluate import references
+from congrasp.services.evaluate.episodes import Batch, Episodes, Sample, joined
+from congrasp.services.evaluate.plan import (
+    NOMINAL_FRICTION,
+    RowPlan,
+    batches,
+    from_references,
+    plan_row,
+    protocol,
+    two_seconds,
+)
+from congrasp.services.evaluate.references import References
+from congrasp.services.evaluate.scores import Row, summarise
+
+STRESSED = 200
+"""Episodes of a row that continue after the hold with lift and pushes."""
+MEASURED = 512
+"""Number of objects above which distance fields, and thus plausibility, are skipped."""
+_KEPT = 8
+"""Episodes of a row kept for inspection: at most this many that hold the object to the end, and as many others."""
+Track = Callable[[str, int | None], Callable[[int], None]]
+"""(label, total if known) -> function to call with the number done."""
+
+
+def silent(label: str, total: int | None) -> Callable[[int], None]:
+    """A `Track` that shows nothing."""
+    return lambda done: None
+
+
+@dataclasses.dataclass(frozen=True)
+class Variation:
+    """A row of a table: the constraints of its episodes, and a change of the experiment, here none."""
+
+    constraint: str = "heading"
+    """Name of the row's constraints, see `services.evaluate.plan.plan_row`."""
+    label: str = ""
+    """Description of the change; the group of the row."""
+
+    def task(self, task: TaskConfig) -> TaskConfig:
+        """Returns the task of the simulation."""
+        return task
+
+    def bank(self, experiment: "Experiment") -> ConstraintBank:
+        """Returns the bank from which the constraints are drawn."""
+        return experiment.bank_for(self.constraint)
+
+    def objects(self, objects: Sequence[GraspObject]) -> Sequence[GraspObject]:
+        """Returns the objects of the simulation, scaled for the hand."""
+        return objects
+
+    def episodes(self, conditions: InitialConditions, control_dt: float) -> InitialConditions:
+        """Returns the initial conditions of the simulation; a control step lasts `control_dt` seconds."""
+        return conditions
+
+
+class Result(NamedTuple):
+    """Result of a variation."""
+
+    variation: Variation
+    sample: Sample
+    row: Row
+    held: list[Message]
+    """Kept episodes in which the object is held to the end."""
+    lost: list[Message]
+    """Other kept episodes."""
+
+    def examples(self, successes: int, failures: int) -> list[Message]:
+        """Returns some of the kept episodes, failures first."""
+        return [*self.lost[:failures], *self.held[:successes]]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Experiment:
+    """Episodes of one policy on some objects."""
+
+    policy: PolicyBundle
+    objects: Sequence[GraspObject]
+    """N objects, before they are scaled for the hand."""
+    constraints: ConstraintBank | None = None
+    """Constraints of these objects in this order (`common.task.sampling.sets.bank_of`); sampled if None, with
+    references of the reference policy (`services.evaluate.references`)."""
+    episodes: int = 1000
+    """Least number of episodes of a row."""
+    physics: PhysicsName = "native"
+    """Engine, except `auto`."""
+    batch: int = 0
+    """Most parallel worlds; 0 uses the engine's default."""
+    seed: int = 0
+    """Seed of constraints and episodes."""
+    friction: float = NOMINAL_FRICTION
+    """Sliding friction between hand and object."""
+    hold: int | None = None
+    """Control steps without the table; two seconds if None."""
+    paper: str = "hands"
+    """Table of the paper for comparison (`services.evaluate.paper`); empty for none."""
+    pool: int = 0
+    """Number of the pool of these objects, added to the seed of sampled constraints."""
+    measured: bool = True
+    """False skips the measures of plausibility, as do more than `MEASURED` objects."""
+    track: Track = silent
+    """Shows progress."""
+
+    @functools.cached_property
+    def hand(self) -> Hand:
+        """The policy's hand."""
+        return get_hand(self.policy.spec.hand)
+
+    @functools.cached_property
+    def steps(self) -> int:
+        """Control steps without the table."""
+        return two_seconds(self.policy.task) if self.hold is None else self.hold
+
+    @functools.cached_property
+    def task(self) -> TaskConfig:
+        """The policy's task under the protocol."""
+        return protocol(self.policy.task, self.steps, self.friction)
+
+    @functools.cached_property
+    def scaled(self) -> list[GraspObject]:
+        """The objects in the size in which the hand grasps them."""
+        return scale_objects(self.hand, self.task, self.objects)
+
+    @functools.cached_property
+    def bank(self) -> ConstraintBank:
+        """Constraints of the objects; those of sampled references are procedural.
+
+        Raises:
+          CongraspError: the hand cannot approach an object.
+        """
+        if self.constraints is not None:
+            return with_columns(self.hand, self.task, self.constraints)
+        return build_bank(self.hand, self.task, self.scaled, self.seed + self.pool)
+
+    @functools.cached_property
+    def by_center(self) -> ConstraintBank:
+        """Sampled constraints whose headings only keep the hand's centre above the table."""
+        task = dataclasses.replace(self.task, headings="center")
+        return build_bank(self.hand, task, self.scaled, self.seed + self.pool)
+
+    @functools.cached_property
+    def references(self) -> References | None:
+        """References of the reference policy on these objects; None if the constraints are not sampled."""
+        return None if self.constraints is not None else self.references_of(references.reference_policy(self.policy)[0])
+
+    def references_of(self, policy: PolicyBundle) -> References:
+        """Returns references of a policy on these objects; see `services.evaluate.references.make`."""
+        advance = self.track("Reference grasps", None)
+        return references.make(
+            policy, self.task, self.scaled, self.bank, physics=self.physics, progress=lambda done, of: advance(done)
+        )
+
+    @property
+    def worlds(self) -> int:
+        """Number of parallel worlds: a power of two, or the most; rows have an episode of every object."""
+        episodes = max(self.episodes, len(self.objects))
+        return min(self.batch or ENGINES[self.physics].batch, 1 << (episodes - 1).bit_length())
+
+    @functools.cached_property
+    def field(self) -> DistanceField | None:
+        """Grids of the objects' surfaces; None if plausibility is not measured."""
+        return distance_field(self.scaled) if self.measured and len(self.objects) <= MEASURED else None
+
+    def bank_for(self, constraint: str) -> ConstraintBank:
+        """Returns the bank of a row's episodes."""
+        made = self.references if from_references(constraint) else None
+        return made.bank if made else self.bank
+
+    def plan(self, variation: Variation) -> RowPlan:
+        """Plans the episodes of a row; see `services.evaluate.plan.plan_row`.
+
+        Raises:
+          CongraspError: no object allows the row's constraints, or the policy does not support them.
+        """
+        return plan_row(self.task, variation.bank(self), self.scaled, variation.constraint, self.episodes)
+
+    def allowed(self, variations: Iterable[Variation]) -> tuple[list[Variation], list[CongraspError]]:
+        """Returns the rows that some object allows, and errors for the others (captured objects may lack parts).
+
+        Raises:
+          CongraspError: no row is left.
+        """
+        allowed, errors = [], []
+        for variation in variations:
+            try:
+                self.plan(variation)
+                allowed.append(variation)
+            except CongraspError as error:
+                errors.append(error)
+        if errors and not allowed:
+            raise errors[0]
+        return allowed, errors
+
+    def run(self, variations: Sequence[Variation], *, keep: bool = False) -> list[Result]:
+        """Simulates rows; one does not depend on the others.
+
+        Args:
+          variations: the rows. Those of one task in a sequence share a simulator.
+          keep: keeps some episodes of each row; every step of all worlds is then in memory.
+
+        Raises:
+          CongraspError: no object allows a row's constraints, or the policy does not support them.
+        """
+        plans = [self.plan(variation) for variation in variations]
+        advance = self.track("Episodes", sum(plan.total for plan in plans))
+        results: list[Result] = []
+        rows = zip(variations, plans, strict=True)
+        for task, group in itertools.groupby(rows, lambda row: row[0].task(self.task)):
+            with self.simulator(task, traced=keep) as running:
+                for variation, plan in group:
+                    done = sum(result.row.episodes for result in results)
+                    progress = functools.partial(lambda before, n: advance(before + n), done)
+                    results.append(self._run(running, variation, plan, progress, keep))
+        return results
+
+    def simulator(self, task: TaskConfig | None = None, *, traced: bool = False) -> Episodes:
+        """Returns a simulator of the objects, by default of the experiment's task; its batch depends on `episodes`."""
+        return Episodes(
+            self.policy,
+            task or self.task,
+            self.scaled,
+            hold=self.steps,
+            batch=self.worlds,
+            physics=self.physics,
+            field=self.field,
+            traced=traced,
+        )
+
+    def _run(
+        self, running: Episodes, variation: Variation, plan: RowPlan, progress: Callable[[int], None], keep: bool
+    ) -> Result:
+        """Simulates a row, and keeps some episodes."""
+        kept: dict[bool, list[Message]] = {True: [], False: []}
+
+        def visit(batch: Batch, count: int) -> None:
+            for i in range(count if keep else 0):
+                like = kept[bool(batch.sample.values["held"][i] > 0)]
+                if len(like) < _KEPT:
+                    like.append(batch.message(i))
+
+        sample = self.sample(running, variation, plan, progress, visit)
+        return Result(variation, sample, self.row(variation, sample), kept[True], kept[False])
+
+    def sample(
+        self,
+        running: Episodes,
+        variation: Variation,
+        plan: RowPlan,
+        progress: Callable[[int], None],
+        visit: Callable[[Batch, int], None] = lambda batch, count: None,
+        stressed: int = STRESSED,
+    ) -> Sample:
+        """Returns the episodes of a row; see `batches`.
+
+        Args:
+          running: simulator.
+          variation: the row.
+          plan: its episodes.
+          progress: called with the number of finished episodes.
+          visit: called with each batch, and the number of its episodes that count.
+          stressed: least number of episodes that continue after the hold.
+        """
+        found, done = list[Sample](), 0
+        for batch, count in self.batches(running, variation, plan, stressed):
+            visit(batch, count)
+            found.append(batch.sample.first(count))
+            done += count
+            progress(done)
+        return joined(found)
+
+    def batches(
+        self, running: Episodes, variation: Variation, plan: RowPlan, stressed: int
+    ) -> Iterator[tuple[Batch, int]]:
+        """Simulates the episodes of a row in batches; yields each, and the number of its episodes that count.
+
+        Args:
+          running: simulator of this experiment, or of one with the same policy and as many objects.
+          variation: the row.
+          plan: its episodes.
+          stressed: least number of episodes that continue after the hold with lift and pushes; batches continue as a
+            whole.
+        """
+        if (objects := variation.objects(self.scaled)) is not running.objects:
+            running.replace_objects(objects, self.field)
+        task = variation.task(self.task)
+        done, most = 0, min(plan.total, stressed) if running.stressable else 0
+        for begun, count in batches(self.hand, task, variation.bank(self), plan, self.seed, running.batch):
+            yield running.run(variation.episodes(begun, task.control_dt), stressed=done < most), count
+            done += count
+
+    def row(self, variation: Variation, sample: Sample) -> Row:
+        """Returns the row of a variation's episodes."""
+        return summarise(
+            variation.constraint,
+            self.hand.name,
+            sample,
+            held_2s=self.steps == two_seconds(self.task),
+            by_reference=self.constraints is not None and from_references(variation.constraint),
+            group=variation.label,
+            method=self.task.method,
+            paper=self.paper,
+            objects=[obj.name for obj in self.objects],
+        )
