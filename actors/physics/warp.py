@@ -13,10 +13,17 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from congrasp.actors.physics.catalogue import Catalogue
-from congrasp.actors.physics.engine import PhysicsState, ResetState, where_environments
-from congrasp.actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
+from congrasp.actors.physics.engine import (
+    PhysicsState,
+    ResetState,
+    has_diverged,
+    initial_qpos,
+    initial_qvel,
+    physics_state,
+    where_environments,
+)
 from congrasp.actors.physics.scene import SENSOR_WIDTH, addresses
+from congrasp.actors.physics.slots import Catalogue
 from congrasp.actors.physics.warp_buffers import WarpBuffers, control_step, meshes_on, objects_on, register
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.actors.physics.catalogue import Catalogue
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.physics.scene import compile_scene
+from congrasp.actors.physics.slots import Catalogue
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject, Piece
