@@ -24,11 +24,11 @@ from congrasp.common.task.config import ControlConfig, RewardWeights, TaskConfig
 from congrasp.common.task.constraints import blocks
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.control import decode, track_load, wrist_load
-from congrasp.common.task.features import Features, features
+from congrasp.common.task.features import features
 from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
 from congrasp.common.task.reward import fallen, reward_terms, terms
 from congrasp.common.task.sensing import Readings, Tracker
-from congrasp.common.task.types import Action, Array, Goal, SceneState, Surface
+from congrasp.common.task.types import Action, Array, Features, Goal, SceneState, Surface
 
 
 class Success(NamedTuple):

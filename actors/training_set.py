@@ -13,8 +13,8 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.pool import load_pool, scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.stages import stage
-from congrasp.common.task.sampling.bank import ConstraintBank, rows_of, stacked, with_columns
-from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.task.sampling.bank import ConstraintBank, rows_of, stacked
+from congrasp.common.task.sampling.build import build_bank, with_columns
 from congrasp.common.task.sampling.sets import bank_of, load_for
 from congrasp.common.wire.codec import Message
 

@@ -30,8 +30,8 @@ from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.record import moved_arm
-from congrasp.services.train.student import CAMERAS, TRACKERS
-from congrasp.services.viz.titles import TITLES
+from congrasp.services.train.presets import CAMERAS, TRACKERS
+from congrasp.services.viz.plots import TITLES
 
 _CASES = pathlib.Path(__file__).parents[1] / "tests" / "cases"
 _WIDTH = 100

@@ -31,11 +31,9 @@ from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
 from congrasp.learner.batch import collate, rollout_form
 from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
-from congrasp.learner.collapse import CollapseWatch
 from congrasp.learner.distributed.ranks import Ranks, ended_by
-from congrasp.learner.hub.admission import Admission
+from congrasp.learner.hub.admission import Admission, task_ranges
 from congrasp.learner.hub.hub import LearnerHub
-from congrasp.learner.hub.ranges import task_ranges
 from congrasp.learner.hub.staleness import Counters, StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
@@ -50,7 +48,7 @@ from congrasp.learner.run_directory import (
     open_run,
     published_version,
 )
-from congrasp.learner.statistics import Pace, overall, summary
+from congrasp.learner.statistics import CollapseWatch, Pace, overall, summary
 
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0

@@ -41,9 +41,25 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
       congrasp bench query
       congrasp bench query --repeat 5000 --concurrency 4
     """
-    from congrasp.services.bench.query import bench_query
+    import tempfile
 
-    bench_query(repeat, concurrency, states)
+    from congrasp.common.policy import bundle as bundles
+    from congrasp.services.client.policy_client import PolicyClient
+    from congrasp.services.serve.load import example_episode, measure, processor_seconds, serving, wait_until_ready
+    from congrasp.services.train.command import untrained
+    from congrasp.services.train.presets import get_preset
+
+    with tempfile.TemporaryDirectory() as folder:
+        policy = pathlib.Path(folder, "policy.safetensors")
+        bundles.save(untrained(get_preset("quickstart")), policy)
+        with serving(policy, pathlib.Path(folder, "serve.log")) as (endpoint, server):
+            episode = example_episode(1_000_000)
+            with PolicyClient(endpoint, wait=60.0) as client:
+                wait_until_ready(client)
+            before = processor_seconds(server)
+            result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0, states=states)
+            result["server_cpu_ms"] = 1e3 * (processor_seconds(server) - before) / repeat / states
+    print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
     return 0
 
 

@@ -14,7 +14,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.caches import keep, read_kept, source_digest
 from congrasp.common.io.files import cache_folder, write_atomically
 from congrasp.common.objects import shapes
-from congrasp.common.objects.plain import plain_object
+from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.decompose import decompose

@@ -14,7 +14,7 @@ from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores, prepare_workers
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
-from congrasp.common.transport.pair import PairTransport
+from congrasp.common.transport.memory import PairTransport
 from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
 from congrasp.learner.process import run_learner
 from congrasp.services.ops.metrics import LearnerMetrics, exposed

@@ -1,7 +1,6 @@
 """The constraints, weakest first; layouts, masks, tables and the priority rules use this order."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,10 +14,8 @@ from congrasp.common.task.constraints.force import Force
 from congrasp.common.task.constraints.heading import Heading
 from congrasp.common.task.constraints.pose import Pose
 from congrasp.common.task.constraints.trajectory import Trajectory
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Goal
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
 
 CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers(), Force())
 PAPER = ("heading", "affordance", "pose", "trajectory")
@@ -39,7 +36,7 @@ def get_constraint(name: str) -> Constraint:
     raise unknown_constraint(name, [constraint.name for constraint in CONSTRAINTS])
 
 
-def known(task: "TaskConfig") -> tuple[Constraint, ...]:
+def known(task: TaskSettings) -> tuple[Constraint, ...]:
     """Returns the constraints supported by the task's policy, weakest first.
 
     Raises:
@@ -52,12 +49,12 @@ def known(task: "TaskConfig") -> tuple[Constraint, ...]:
     return tuple(constraint for constraint in CONSTRAINTS if constraint.name in task.constraints)
 
 
-def optional(task: "TaskConfig") -> tuple[Constraint, ...]:
+def optional(task: TaskSettings) -> tuple[Constraint, ...]:
     """Supported constraints that may be inactive in an episode."""
     return tuple(constraint for constraint in known(task) if constraint.optional)
 
 
-def blocks(task: "TaskConfig") -> tuple[str, ...]:
+def blocks(task: TaskSettings) -> tuple[str, ...]:
     """Names of the gated blocks of the observation, in order; each is a bit of the mask."""
     return tuple(block for constraint in known(task) for block in constraint.blocks)
 
@@ -67,7 +64,7 @@ def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
     return tuple(error for constraint in constraints for error in constraint.errors)
 
 
-def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
+def goal_of(hand: Hand, task: TaskSettings, request: GraspRequest) -> Goal:
     """Goal arrays of a request, without batch axis, before the priority rules; neutral where the request has none."""
     values = {}
     for constraint in known(task):
@@ -79,7 +76,7 @@ def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
     return Goal(values, {})
 
 
-def require_known(names: Iterable[str], task: "TaskConfig") -> None:
+def require_known(names: Iterable[str], task: TaskSettings) -> None:
     """Raises an `UnknownConstraintError` if a requested constraint is not supported by the task's policy."""
     for name in names:
         get_constraint(name)

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,9 @@ from congrasp.common.task.constraints.base import (
     Weight,
 )
 from congrasp.common.task.geometry import flat, share, squash
+from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal, Surface
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.sampling.bank import Draw
 
 MARGIN, SHARPNESS = 0.01, 0.003
 """Distance that the skin of the other fingers should keep from the object, and sharpness of the barrier, m."""
@@ -63,7 +61,7 @@ class Fingers(Constraint):
     )
     invalid = (_NEEDED, "Allow both.")
 
-    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for the set, the clearance of each other finger, and the forces on their links."""
         fingers, links = len(hand.fingers), len(hand.links)
         block = (
@@ -73,12 +71,12 @@ class Fingers(Constraint):
         )
         return (block,)
 
-    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> FingersGoal:
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> FingersGoal:
         """Samples any set with the thumb; pinch, tripod and all fingers are more likely than others."""
         sets, shares = finger_sets(hand)
         return FingersGoal(jnp.array(sets)[chance.weighted(uniform[:, 0], shares)])
 
-    def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
+    def suggested(self, hand: Hand, task: TaskSettings) -> dict[str, np.ndarray]:
         """A pinch."""
         return {"allowed": np.arange(len(hand.fingers)) < 2}
 

@@ -15,7 +15,7 @@ from congrasp.services.evaluate.evaluator import Evaluator
 from congrasp.services.evaluate.protocol import protocol
 from congrasp.services.evaluate.sensing import LEVELS, at_level, sensing_task
 from congrasp.services.train.command import untrained
-from congrasp.services.train.student import TRACKERS
+from congrasp.services.train.presets import TRACKERS
 from tests import draws, task
 
 OBJECTS = task.OBJECTS[:1]
