@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.constraints import known
+from congrasp.common.task.constraints import center_fingers, known
 from congrasp.common.task.constraints.base import Scene
-from congrasp.common.task.constraints.fingers import chosen_fingers
 from congrasp.common.task.geometry import hand_center, nearest_index, squared_distances, wrist_pose
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.settings import TaskSettings
@@ -57,7 +56,7 @@ def features(hand: Hand, task: TaskSettings, state: SceneState, surface: Surface
         object_position=object_position,
         object_quaternion=object_quaternion,
         keypoints=keypoints,
-        center=hand_center(hand, fingers, chosen_fingers(task.constraints, goal)),
+        center=hand_center(hand, fingers, center_fingers(task, goal)),
         nearest=rotations.apply(rotations.to_matrix(object_quaternion), nearest),
         normal=normal,
         height=height,

@@ -126,8 +126,9 @@ def _cloud(scene: Scene) -> Array:
     features, cloud = scene.features, scene.cloud
     points = rotations.inverse_transform(features.wrist_position, features.wrist_quaternion, cloud.points)
     labels = jnp.zeros(cloud.avoid.shape)
-    if "affordance" in scene.goal.active:
-        labels = cloud.avoid * scene.gate("affordance")[:, None]
+    for constraint in known(scene.task):
+        if (own := constraint.cloud_labels(scene)) is not None:
+            labels = jnp.maximum(labels, own)
     return flat(jnp.concatenate([points, labels[..., None]], -1))
 
 

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from congrasp.common import rotations
-from congrasp.common.task.constraints import known
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints import center_fingers, known
 from congrasp.common.task.constraints.base import Scene
-from congrasp.common.task.constraints.fingers import chosen_fingers, keypoint_weights
 from congrasp.common.task.geometry import FAR, square
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, SceneState
@@ -38,10 +38,23 @@ class Term(NamedTuple):
     """Value (B,) before the weight, signed and bounded; None for a parameter that other terms share."""
 
 
+def keypoint_weights(hand: Hand, chosen: Array | None) -> Array:
+    """Weights (P,) or (B, P) of the keypoints in the distance reward, for fingers of `center_fingers`.
+
+    Keypoints of other fingers get no weight; those of the set and the palm share it.
+    """
+    weights = jnp.array(hand.keypoint_weights)
+    if chosen is None:
+        return weights
+    owner = hand.link_fingers[hand.keypoint_links]
+    kept = jnp.where((owner < 0) | chosen[:, owner], weights, 0.0)
+    return kept * (jnp.sum(weights) / jnp.sum(kept, -1, keepdims=True))
+
+
 def _distance(scene: Scene, earning: Earning) -> Array:
     """Weighted distance from the keypoints to the surface."""
     distances = jnp.linalg.norm(scene.features.nearest, axis=-1)
-    weights = keypoint_weights(scene.hand, chosen_fingers(scene.task.constraints, scene.goal))
+    weights = keypoint_weights(scene.hand, center_fingers(scene.task, scene.goal))
     return -jnp.sum(weights * jnp.minimum(distances, FAR), -1)
 
 

@@ -1,5 +1,7 @@
 """The constraints, weakest first; layouts, masks, tables and the priority rules use this order."""
 
+import functools
+import operator
 from collections.abc import Iterable
 
 import numpy as np
@@ -15,7 +17,7 @@ from congrasp.common.task.constraints.heading import Heading
 from congrasp.common.task.constraints.pose import Pose
 from congrasp.common.task.constraints.trajectory import Trajectory
 from congrasp.common.task.settings import TaskSettings
-from congrasp.common.task.types import Goal
+from congrasp.common.task.types import Array, Goal
 
 CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers(), Force())
 PAPER = ("heading", "affordance", "pose", "trajectory")
@@ -59,6 +61,12 @@ def blocks(task: TaskSettings) -> tuple[str, ...]:
     return tuple(block for constraint in known(task) for block in constraint.blocks)
 
 
+def center_fingers(task: TaskSettings, goal: Goal) -> Array | None:
+    """(B, G) bool: fingers that define the hand centre and the distance reward; None if no constraint selects them."""
+    chosen = [fingers for c in known(task) if (fingers := c.center_fingers(goal)) is not None]
+    return functools.reduce(operator.and_, chosen) if chosen else None
+
+
 def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
     """Errors of several constraints, in order."""
     return tuple(error for constraint in constraints for error in constraint.errors)
@@ -93,6 +101,7 @@ __all__ = [
     "PAPER",
     "Constraint",
     "blocks",
+    "center_fingers",
     "error_specs",
     "get_constraint",
     "goal_of",

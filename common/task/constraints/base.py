@@ -198,6 +198,16 @@ class Constraint:
         """
         return None
 
+    def joined(self, task: TaskSettings, active: Mapping[str, Array], uniform: Array) -> Array | None:
+        """(B,) bool: training episodes that request it because of others; None for none.
+
+        Args:
+          task: the task.
+          active: (B,) bool by block, active blocks of the constraints requested so far.
+          uniform: (B,) random numbers in [0, 1).
+        """
+        return None
+
     def available(self, draw: Draw) -> Array:
         """(B,) bool: the drawn objects allow it, in their resting poses and regions.
 
@@ -259,6 +269,10 @@ class Constraint:
         """Geometry specific to the constraint that observation, reward and errors share, as a pytree."""
         return ()
 
+    def center_fingers(self, goal: Goal) -> Array | None:
+        """(B, G) bool: fingers that define the hand centre and the distance reward; None for all."""
+        return None
+
     def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
         """World wrist pose (B, 3), (B, 4) to which it guides, relative to the object's current or initial pose."""
         raise NotImplementedError
@@ -266,6 +280,10 @@ class Constraint:
     def observe(self, scene: Scene) -> tuple[Sequence[Array], ...]:
         """Values (B, ...) of the `fields` of each block; they are concatenated, then gated."""
         return ()
+
+    def cloud_labels(self, scene: Scene) -> Array | None:
+        """(B, N) labels of the points of a camera's cloud in the observation; None if it labels none."""
+        return None
 
     def forbidden(self, scene: Scene) -> Array | None:
         """(B, L) bool: links that must not touch the object, whether or not it is active; None for no restriction."""

@@ -86,6 +86,10 @@ class Fingers(Constraint):
         room = jnp.where(allowed, 0.0, jnp.minimum(_room(scene), 0.1))
         return ([allowed.astype(jnp.float32), room, flat(squash(scene.features.force * other[..., None]))],)
 
+    def center_fingers(self, goal: Goal) -> Array | None:
+        """The allowed fingers, where it is active."""
+        return chosen_fingers(goal.values, goal)
+
     def forbidden(self, scene: Scene) -> Array:
         """Links of fingers outside the set; their contacts earn nothing."""
         owner = scene.hand.link_fingers
@@ -148,19 +152,6 @@ def chosen_fingers(known: Collection[str], goal: Goal) -> Array | None:
     if "fingers" not in known:
         return None
     return goal["fingers"].allowed | ~goal.active["fingers"][:, None]
-
-
-def keypoint_weights(hand: Hand, chosen: Array | None) -> Array:
-    """Weights (P,) or (B, P) of the keypoints in the distance reward, for fingers of `chosen_fingers`.
-
-    Keypoints of other fingers get no weight; those of the set and the palm share it.
-    """
-    weights = jnp.array(hand.keypoint_weights)
-    if chosen is None:
-        return weights
-    owner = hand.link_fingers[hand.keypoint_links]
-    kept = jnp.where((owner < 0) | chosen[:, owner], weights, 0.0)
-    return kept * (jnp.sum(weights) / jnp.sum(kept, -1, keepdims=True))
 
 
 def _room(scene: Scene) -> Array:

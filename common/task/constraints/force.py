@@ -61,7 +61,7 @@ class Force(Constraint):
 
     def sample(self, hand: Hand, draw: Draw, uniform: Array) -> ForceGoal:
         """Samples log-uniformly between the least limit for the episode's object and 20 N."""
-        low = jnp.log(jnp.minimum(draw.least_force, MOST))
+        low = jnp.log(least_force(draw.mass, draw.friction))
         return ForceGoal(jnp.exp(low + uniform[:, 0] * (jnp.log(MOST) - low)))
 
     def suggested(self, hand: Hand, task: TaskSettings) -> dict[str, np.ndarray]:

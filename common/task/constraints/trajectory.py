@@ -89,6 +89,10 @@ class Trajectory(Constraint):
         """Those of a disturbed wrist."""
         return wrist_numbers(task.trajectory_points)
 
+    def joined(self, task: TaskSettings, active: Mapping[str, Array], uniform: Array) -> Array | None:
+        """Episodes with an affordance, with probability `p_together`."""
+        return active["affordance"] & (uniform < task.p_together) if "affordance" in active else None
+
     def sample(self, hand: Hand, draw: Draw, uniform: Array) -> TrajectoryGoal:
         """Samples the trajectory to one of the object's reference poses.
 

@@ -119,8 +119,10 @@ class Draw(NamedTuple):
     """(B,) int, index along the axis V: the region of the constraints requested so far."""
     reference: Mapping[str, Array] = MappingProxyType({})
     """(B,) int by constraint, for those drawn from references: index of an allowed reference, if there is any."""
-    least_force: Array = 1.0
-    """(B,) least limit on a link's force with which the episode's object can be held, N."""
+    mass: Array = 0.0
+    """(B,) mass of the episode's object, kg."""
+    friction: Array = 1.0
+    """(B,) sliding friction between hand and object."""
     disturbance: Array | None = None
     """(B,) in [0, 1], scale of the references' errors (`common.task.constraints.pose`); None for no errors."""
 
