@@ -178,7 +178,7 @@ def _measure(
 
 def _print(console: Console, config: RunConfig, stages: Sequence[Stage]) -> None:
     """Prints the table of the completed stages."""
-    steps = config.environments * config.rollout_steps * config.ppo.rollouts_per_update
+    steps = config.environments * config.rollout_steps * config.rollouts_per_update
     table = Table(title=f"{config.environments} environments, {steps} steps an update of each rank, '{config.physics}'")
     for column in ("ranks", "steps/s", "efficiency", "wait, s", "update, s", "updates", "start, s"):
         table.add_column(column, justify="right")

@@ -16,7 +16,7 @@ from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.stages import imported, since_start, stages
-from congrasp.services.train.warmup import until_first_update
+from congrasp.services.train.learn import until_first_update
 
 _STOPPED_SECONDS = 30.0
 _EVENTS = {

@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.outline import Outline, outline
+from congrasp.common.hands.closure import Outline, outline
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.distance import DistanceField, distance_field

@@ -27,9 +27,9 @@ from congrasp.common.hands.mjcf import WRIST_JOINTS
 from congrasp.common.hands.skeleton import skeleton_of
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand, Link, capsule_ends
-from congrasp.common.objects.checks import LARGEST
 from congrasp.common.objects.painting import nearest
 from congrasp.common.objects.spec import Colours
+from congrasp.common.objects.store import LARGEST
 from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import EPISODE, validate

@@ -115,7 +115,8 @@ def recipe(hand: Hand) -> RunConfig:
             ),
         ),
         objects=ObjectsConfig(families=("all", "scans", *HARD_FAMILIES), count=1600, by_failure=True),
-        ppo=PPOConfig(rollouts_per_update=1, gamma=0.99, settling=0.25, least_std=0.35),
+        rollouts_per_update=1,
+        ppo=PPOConfig(gamma=0.99, settling=0.25, least_std=0.35),
     )
 
 

@@ -15,7 +15,7 @@ from congrasp.actors.process.actor import Follower
 from congrasp.actors.process.link import RunInfo
 from congrasp.actors.rollout import Rollout, Trace
 from congrasp.actors.training_set import TrainingSet
-from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, to_json
+from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
@@ -45,7 +45,7 @@ CONFIG = RunConfig(
     task=TaskConfig(approach_steps=3, hold_steps=2, hold_steps_max=2),
     objects=ObjectsConfig(count=1),
     network=NetworkConfig(hidden=(8,), encoder=2),
-    ppo=PPOConfig(rollouts_per_update=1),
+    rollouts_per_update=1,
 )
 HAND = get_hand("human")
 SPEC = policy_spec(CONFIG.task, CONFIG.network)

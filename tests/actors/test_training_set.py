@@ -15,7 +15,7 @@ from congrasp.actors.training_set import FailureWeights, training_set
 from congrasp.common.config import ObjectsConfig, RunConfig, Split
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.outline import outline
+from congrasp.common.hands.closure import outline
 from congrasp.common.objects import procedural
 from congrasp.common.objects.store import Catalogue
 from congrasp.common.task.config import TaskConfig

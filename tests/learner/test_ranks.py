@@ -254,7 +254,7 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     assert kept >= 5  # the first update after a resume has a checkpoint of its own
     job.start(kept + 3, "resume")
     first, second = job.finish()
-    steps = 2 * CONFIG.ppo.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
+    steps = 2 * CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
     (said,), (other,) = (
         [line.split()[1:] for line in text.splitlines() if "bundle" in line] for text in (first, second)
     )

@@ -15,8 +15,8 @@ import congrasp.common
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import kinematics
+from congrasp.common.hands.closure import CENTER, Outline, outline
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.hands.outline import CENTER, Outline, outline
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.caches import keep, read_kept, source_digest
 from congrasp.common.io.files import cache_folder

@@ -8,7 +8,7 @@ from PIL import Image
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.outline import outline
+from congrasp.common.hands.closure import outline
 from congrasp.common.objects import store
 from congrasp.common.task.sampling import sets as stored_sets
 from congrasp.common.task.sampling import write_sets

@@ -24,10 +24,10 @@ from congrasp.common.wire.codec import decode
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record import scene
 from congrasp.services.record.channels import Entry
-from congrasp.services.record.entries import Converter
 from congrasp.services.record.goals import active_blocks, active_constraints
 from congrasp.services.record.palette import JOINT, SKIN
 from congrasp.services.record.palette import MATERIALS as COLOURS
+from congrasp.services.record.recorder import Converter
 from congrasp.services.record.scene import SPACING, surface_parts, surface_points
 from congrasp.services.record.writer import LogWriter
 from tests.episodes import CONTROL_DT, FORCE, episode, older

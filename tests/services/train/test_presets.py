@@ -25,7 +25,7 @@ def test_a_preset_travels_and_its_batch_can_be_cut(name):
     assert config.name == (name if name != "full" else "human") and run_config_from_json(to_json(config)) == config
     get_hand(config.task.hand)
     procedural.family_turns(1, 0, config.objects.families)  # a CongraspError where one is unknown
-    transitions = config.environments * config.rollout_steps * config.ppo.rollouts_per_update
+    transitions = config.environments * config.rollout_steps * config.rollouts_per_update
     assert transitions % config.ppo.minibatches == 0
 
 
