@@ -11,10 +11,9 @@ import numpy as np
 import trimesh
 
 from congrasp.common import mirror
-from congrasp.common.hands.flesh import Surface, flesh, wrist_circles
+from congrasp.common.hands.flesh import Skeleton, Surface, flesh, skeleton_of, wrist_circles
 from congrasp.common.hands.left import right_name
 from congrasp.common.hands.meshes import Meshes, own_meshes
-from congrasp.common.hands.skeleton import Skeleton, skeleton_of
 from congrasp.common.hands.spec import Hand, Link, link_origin
 
 _AROUND = 28  # points of a ring

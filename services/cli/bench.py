@@ -95,7 +95,7 @@ def scaling(
     """
     import dataclasses
 
-    from congrasp.services.bench.scaling import bench_scaling
+    from congrasp.services.bench.training import bench_scaling
     from congrasp.services.train.presets import get_preset
 
     config = get_preset(preset)
@@ -129,7 +129,7 @@ def startup(
     """
     import dataclasses
 
-    from congrasp.services.bench.startup import bench_startup
+    from congrasp.services.bench.training import bench_startup
     from congrasp.services.train.presets import get_preset
 
     config = get_preset(preset)

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
+from congrasp.common.hands.flesh import skeleton_of
 from congrasp.common.hands.mjcf import WRIST_JOINTS
-from congrasp.common.hands.skeleton import skeleton_of
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand, Link, capsule_ends
 from congrasp.common.objects.painting import nearest

@@ -5,8 +5,7 @@ import functools
 import numpy as np
 
 from congrasp.common.objects.families import draft
-from congrasp.common.objects.families.draft import Builder, Draft, Rng
-from congrasp.common.objects.families.profiles import extrude, hull, lathe, ring, slab, smooth, sweep
+from congrasp.common.objects.families.draft import Builder, Draft, Rng, extrude, hull, lathe, ring, slab, smooth, sweep
 from congrasp.common.objects.spec import Piece
 
 BUILDERS: dict[str, Builder] = {}
