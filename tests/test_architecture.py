@@ -85,6 +85,14 @@ def test_no_module_needs_itself():
     assert not left
 
 
+def test_constraints_are_used_by_their_hooks():
+    """No module outside their folder imports one of them, but for the heading, which every episode has."""
+    folder = "congrasp.common.task.constraints"
+    shared = {folder, *(f"{folder}.{name}" for name in ("base", "heading", "markers", "priority"))}
+    used = {t for m, targets in graph(everything=True).items() if not m.startswith(folder) for t in targets}
+    assert {target for target in used if target.startswith(folder)} <= shared
+
+
 LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 
