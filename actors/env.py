@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from congrasp.actors import harvest, success
+from congrasp.actors import harvest
 from congrasp.actors import stress as protocols
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
 from congrasp.actors.physics.engine import Physics, PhysicsState, ResetState, where_environments
 from congrasp.actors.stress import Frame, Protocol
-from congrasp.actors.success import Success
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import camera as cameras
@@ -25,11 +24,60 @@ from congrasp.common.task.config import ControlConfig, RewardWeights, TaskConfig
 from congrasp.common.task.constraints import blocks
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.control import decode, track_load, wrist_load
-from congrasp.common.task.features import Features, features
+from congrasp.common.task.features import features
 from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields, metric_names
-from congrasp.common.task.reward import reward_terms, terms
+from congrasp.common.task.reward import fallen, reward_terms, terms
 from congrasp.common.task.sensing import Readings, Tracker
-from congrasp.common.task.types import Action, Array, Goal, SceneState, Surface
+from congrasp.common.task.types import Action, Array, Features, Goal, SceneState, Surface
+
+
+class Success(NamedTuple):
+    """Progress of the success protocol in B episodes."""
+
+    removal_height: Array
+    """(B,) height of the object when the table was removed, m."""
+    links_at_removal: Array
+    """(B,) number of links in contact at that time."""
+    moved_at_removal: Array
+    """(B,) displacement of the object up to that time, m."""
+    kept: Array
+    """(B,) bool: the object had not fallen `hold_steps` after the removal (the paper's success)."""
+    diverged: Array
+    """(B,) bool: the physics diverged in this episode."""
+
+
+def begin_success(height: Array) -> Success:
+    """Returns the initial progress of episodes whose objects start at these heights (B,)."""
+    zero, no = jnp.zeros_like(height), jnp.zeros(height.shape, bool)
+    return Success(height, zero, zero, no, no)
+
+
+def track_success(task: TaskConfig, success: Success, scene: Scene, diverged: Array) -> tuple[Success, Array]:
+    """Advances the protocol by one control step.
+
+    Args:
+      task: the task, for the time of the table's removal and the drop height.
+      success: progress before the step.
+      scene: scene after the step.
+      diverged: (B,) bool, True if the physics diverged in this step.
+
+    Returns:
+      Progress after the step, and (B,) bool, True if the object is up.
+    """
+    state = scene.state
+    removed_now = state.time == task.approach_steps
+    height = state.object_position[:, 2]
+    links = jnp.sum(scene.features.touching, -1).astype(jnp.float32)
+    moved = jnp.linalg.norm(state.object_position - state.object_position_initial, axis=-1)
+    success = success._replace(
+        removal_height=jnp.where(removed_now, height, success.removal_height),
+        links_at_removal=jnp.where(removed_now, links, success.links_at_removal),
+        moved_at_removal=jnp.where(removed_now, moved, success.moved_at_removal),
+        diverged=success.diverged | diverged,
+    )
+    up = (height > success.removal_height - task.drop_height) & ~fallen(task, state) & ~success.diverged
+    up &= success.links_at_removal > 0
+    return success._replace(kept=jnp.where(state.time == task.approach_steps + task.hold_steps, up, success.kept)), up
 
 
 class Settings(NamedTuple):
@@ -172,7 +220,7 @@ class GraspEnv:
             u_target=jnp.zeros((batch, 6)),
             momentum=jnp.zeros((batch, 6)),
             **self._first_readings(initial),
-            success=success.begin(reset_state.object_position[:, 2]),
+            success=begin_success(reset_state.object_position[:, 2]),
             sums=sums,
             terms=jnp.zeros((batch, len(terms(self.task)))),
             grasps=Grasps(no, index, index, reset_state.q, reset_state.base_position, reset_state.base_quaternion),
@@ -246,7 +294,7 @@ class GraspEnv:
         state = state._replace(momentum=jnp.where(physics_state.diverged[:, None], 0.0, momentum))
         state = self._viewed(self._sense(state, physics_state, moved), moved, followed)
         scene = self.scene_of(state)
-        tracked, up = success.track(task, state.success, scene, physics_state.diverged)
+        tracked, up = track_success(task, state.success, scene, physics_state.diverged)
         found = reward_terms(scene, settings.weights)
         found["drop"] = jnp.where(tracked.diverged, -settings.weights.drop, found["drop"])
         stacked = jnp.stack([found[name] for name in terms(task)], -1)

@@ -14,7 +14,6 @@ from congrasp.common.hands.closure import MARGIN, preshape
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import known, optional
-from congrasp.common.task.constraints.force import least_force
 from congrasp.common.task.constraints.priority import Resolution, active_blocks, resolve
 from congrasp.common.task.sampling.bank import ConstraintBank, Draw, surface_of
 from congrasp.common.task.sampling.headings import Headings, local_width
@@ -88,8 +87,10 @@ def sample(
         c.name: uniform[c.name][:, 0] < share if (share := getattr(task, f"p_{c.name}")) else jnp.zeros(batch, bool)
         for c in optional(task)
     }
-    if "affordance" in wanted and "trajectory" in wanted:
-        wanted["trajectory"] |= active_blocks(wanted)["affordance"] & (episode[2] < task.p_together)
+    active = active_blocks(wanted)
+    for constraint in optional(task):
+        if (joined := constraint.joined(task, active, episode[2])) is not None:
+            wanted[constraint.name] |= joined
     disturbance = None
     if task.disturbed_references:
         disturbance = jnp.where(episode[3] < task.disturbed_references, episode[4], 0.0)
@@ -206,7 +207,7 @@ def _drawn(
     mass = low + (high - low) * mass
     friction = friction_low + (friction_high - friction_low) * friction
     draw, asked = _available(task, draw, wanted)
-    draw = draw._replace(least_force=least_force(bank.mass[draw.objects] * mass, friction))
+    draw = draw._replace(mass=bank.mass[draw.objects] * mass, friction=friction)
     draw = draw._replace(reference=_references(task, draw, asked, uniform, common))
     values = {c.name: c.sample(hand, draw, uniform[c.name][:, 2:]) for c in known(task)}
     surface = surface_of(task, bank, draw.objects)

@@ -79,13 +79,8 @@ class NetworkConfig:
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """Decoupled PPO (Hilton et al. 2021, arXiv 2110.00641) with adaptive-KL learning rate.
+    """Decoupled PPO (Hilton et al. 2021, arXiv 2110.00641) with adaptive-KL learning rate."""
 
-    `rollouts_per_update` and `max_staleness` apply to every algorithm.
-    """
-
-    rollouts_per_update: int = 2
-    """Rollouts consumed by one update (the batch)."""
     epochs: int = 4
     """Passes over the batch."""
     minibatches: int = 16
@@ -125,8 +120,6 @@ class PPOConfig:
     """Global norm at which gradients are clipped."""
     reward_scale: float = 0.1
     """Factor on rewards before returns are computed."""
-    max_staleness: int = 1
-    """eta: greatest number of versions between an accepted rollout and the update that uses it."""
 
     def kl_target_at(self, version: int, updates: int) -> float:
         """Returns the KL target of the update of this version, in a run of `updates` updates."""
@@ -213,6 +206,10 @@ class RunConfig:
     """Environments of one actor."""
     rollout_steps: int = 75
     """Control steps in one rollout message."""
+    rollouts_per_update: int = 2
+    """Rollouts consumed by one update (the batch), of each learner rank."""
+    max_staleness: int = 1
+    """eta: greatest number of versions between an accepted rollout and the update that uses it."""
     updates: int = 1000
     """Updates after which the run ends."""
     physics: PhysicsName = "auto"
@@ -261,6 +258,8 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         fields = json.loads(text, parse_constant=_no_constant)
         if not isinstance(fields, dict):
             raise ValueError("it is not an object")
+        if isinstance(ppo := fields.get("ppo"), dict):  # files of earlier versions
+            fields |= {name: ppo.pop(name) for name in ("rollouts_per_update", "max_staleness") if name in ppo}
         config = dacite.from_dict(RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float]))
     except (ValueError, RecursionError) as error:  # not UTF-8, or nested too deep
         raise CongraspError(

@@ -29,16 +29,15 @@ if TYPE_CHECKING:
     )
     from congrasp.common.request import GraspRequest
     from congrasp.services.assets.objects.options import ImportOptions
-    from congrasp.services.client.guard import Command, Guard
+    from congrasp.services.client.guard import Command, Guard, Ticker
     from congrasp.services.client.left import LeftPolicy
     from congrasp.services.client.limits import JointLimits
     from congrasp.services.client.policy import Answer, Policy
     from congrasp.services.client.policy_client import PolicyClient
-    from congrasp.services.client.ticker import Ticker
     from congrasp.services.export.motion_file import GraspMotion, load_motion, save_motion
     from congrasp.services.grasp.grasper import Grasp, Grasper, grasp
     from congrasp.services.gym.vector_env import make_vec
-    from congrasp.services.serve.local import load_policy
+    from congrasp.services.serve.inference import load_policy
 
 __all__ = [
     "Answer",
@@ -82,10 +81,10 @@ _MODULES = {
     "LeftPolicy": "congrasp.services.client.left",
     "Policy": "congrasp.services.client.policy",
     "PolicyClient": "congrasp.services.client.policy_client",
-    "Ticker": "congrasp.services.client.ticker",
+    "Ticker": "congrasp.services.client.guard",
     "grasp": "congrasp.services.grasp.grasper",
     "load_motion": "congrasp.services.export.motion_file",
-    "load_policy": "congrasp.services.serve.local",
+    "load_policy": "congrasp.services.serve.inference",
     "make_vec": "congrasp.services.gym.vector_env",
     "save_motion": "congrasp.services.export.motion_file",
 }

@@ -30,8 +30,8 @@ from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
 from congrasp.services.export.motion_file import GraspMotion
 from congrasp.services.record import moved_arm
-from congrasp.services.train.student import CAMERAS, TRACKERS
-from congrasp.services.viz.titles import TITLES
+from congrasp.services.train.presets import CAMERAS, TRACKERS
+from congrasp.services.viz.plots import TITLES
 
 _CASES = pathlib.Path(__file__).parents[1] / "tests" / "cases"
 _WIDTH = 100
@@ -239,7 +239,8 @@ def _fields(config: typing.Any, prefix: str) -> Iterator[tuple[str, typing.Any, 
 
 def _meanings(kind: type) -> dict[str, str]:
     """Returns the meaning of each field of a dataclass: its docstring, or `Doc` where constraints declare it."""
-    written = "".join(inspect.getsource(base) for base in kind.__mro__ if base.__module__ == kind.__module__)
+    ours = (base for base in kind.__mro__ if base.__module__.startswith("congrasp.") and base.__name__ != "Declared")
+    written = "".join(map(inspect.getsource, ours))
     hints = typing.get_type_hints(kind, include_extras=True)
     declared = {
         name: mark.documentation

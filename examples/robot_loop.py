@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 import congrasp
-from congrasp.actors.physics.physics_state import physics_state
+from congrasp.actors.physics.engine import physics_state
 from congrasp.actors.physics.scene import TABLE_AWAY, addresses, compile_scene
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand

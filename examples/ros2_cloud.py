@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import congrasp
 from congrasp.common.hands.spec import Hand, capsule_ends
-from congrasp.common.objects.plain import plain_object
+from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 

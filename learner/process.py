@@ -31,11 +31,9 @@ from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
 from congrasp.learner.batch import collate, rollout_form
 from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
-from congrasp.learner.collapse import CollapseWatch
 from congrasp.learner.distributed.ranks import Ranks, ended_by
-from congrasp.learner.hub.admission import Admission
+from congrasp.learner.hub.admission import Admission, task_ranges
 from congrasp.learner.hub.hub import LearnerHub
-from congrasp.learner.hub.ranges import task_ranges
 from congrasp.learner.hub.staleness import Counters, StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
@@ -50,7 +48,7 @@ from congrasp.learner.run_directory import (
     open_run,
     published_version,
 )
-from congrasp.learner.statistics import Pace, overall, summary
+from congrasp.learner.statistics import CollapseWatch, Pace, overall, summary
 
 _POLL_SECONDS = 0.2
 _STALL_SECONDS = 60.0
@@ -173,7 +171,7 @@ class _Learner:
         if ranks.count > 1:
             # Before the hub exists, and so before an actor in this process captures its engine's graphs.
             self._warm_up()
-        name, staleness = str(ranks.rank), config.ppo.max_staleness
+        name, staleness = str(ranks.rank), config.max_staleness
         log_error = functools.partial(self._event, "error")
         folder = run_dir / FOLDER / name
         self._hub = LearnerHub(
@@ -183,7 +181,7 @@ class _Learner:
             run_id=self._run_id,
             schema=self._spec.schema,
             form=self._form,
-            staleness=StalenessManager(staleness, config.ppo.rollouts_per_update),
+            staleness=StalenessManager(staleness, config.rollouts_per_update),
             name=name,
             durable=_durable(hubs, ranks.rank),
             on_event=notify,
@@ -301,9 +299,7 @@ class _Learner:
         posted, silent_since = "", time.monotonic()
         while True:
             end = deaths[0] if deaths else "it was stopped" if stop.is_set() else ""
-            found = bool(posted) or self._hub.has_batch(
-                self._config.ppo.rollouts_per_update, 0 if end else _POLL_SECONDS
-            )
+            found = bool(posted) or self._hub.has_batch(self._config.rollouts_per_update, 0 if end else _POLL_SECONDS)
             state = end or ("ready" if found else "")
             if state != posted:
                 self._ranks.post({"end": end}, urgent=bool(end))
@@ -318,7 +314,7 @@ class _Learner:
 
     def _update(self) -> tuple[dict[str, float], int]:
         """Runs one update on all ranks; returns its metrics and its number of environment steps."""
-        messages = self._hub.next_batch(self._config.ppo.rollouts_per_update, 0.0)
+        messages = self._hub.next_batch(self._config.rollouts_per_update, 0.0)
         assert messages is not None, "an available batch cannot disappear"
         mine = summary(messages, self._hub.lag)
         batch = collate([message.arrays for message in messages], self._form.arrays)
@@ -381,7 +377,7 @@ class _Learner:
 
     def _warm_up(self) -> None:
         """Compiles the update while the actors produce the first rollouts."""
-        batch = self._form.zeros(self._config.ppo.rollouts_per_update)
+        batch = self._form.zeros(self._config.rollouts_per_update)
         copy = self._state._replace(optimizer=jax.tree.map(np.array, self._state.optimizer))
         with self._ranks.watchdog(), stage("compile update"):
             self._algorithm.update(copy, batch, self._ranks.mesh)

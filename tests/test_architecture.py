@@ -75,11 +75,22 @@ def test_no_two_services_import_each_other():
 
 
 def test_no_module_needs_itself():
-    """Kahn's algorithm takes away modules of which nothing is left that they import: a cycle would remain."""
-    left = graph(everything=False)
+    """Not even for types, or in functions.
+
+    Kahn's algorithm takes away modules of which nothing is left that they import: a cycle would remain.
+    """
+    left = graph(everything=True)
     while free := [module for module, targets in left.items() if not targets & left.keys()]:
         left = {module: targets for module, targets in left.items() if module not in free}
     assert not left
+
+
+def test_constraints_are_used_by_their_hooks():
+    """No module outside their folder imports one of them, but for the heading, which every episode has."""
+    folder = "congrasp.common.task.constraints"
+    shared = {folder, *(f"{folder}.{name}" for name in ("base", "heading", "markers", "priority"))}
+    used = {t for m, targets in graph(everything=True).items() if not m.startswith(folder) for t in targets}
+    assert {target for target in used if target.startswith(folder)} <= shared
 
 
 LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}

@@ -13,8 +13,15 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from congrasp.actors.physics.engine import PhysicsState, ResetState, where_environments
-from congrasp.actors.physics.physics_state import has_diverged, initial_qpos, initial_qvel, physics_state
+from congrasp.actors.physics.engine import (
+    PhysicsState,
+    ResetState,
+    has_diverged,
+    initial_qpos,
+    initial_qvel,
+    physics_state,
+    where_environments,
+)
 from congrasp.actors.physics.scene import GAINS, MASS_POWERS, SENSOR_WIDTH, TABLE_AWAY, addresses
 from congrasp.actors.physics.slots import Pool
 from congrasp.common.errors import CongraspError

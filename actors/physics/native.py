@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from congrasp.actors.physics.engine import PhysicsState, ResetState
-from congrasp.actors.physics.physics_state import has_diverged, physics_state
+from congrasp.actors.physics.engine import PhysicsState, ResetState, has_diverged, physics_state
 from congrasp.actors.physics.scene import GAINS, MASS_POWERS, TABLE_AWAY, addresses, compile_scene
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import known
 from congrasp.common.task.normals import estimated_normals
 from congrasp.common.task.sensing import Sensors, arrival
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal, Surface
 
 _TOGETHER = 512
@@ -49,7 +49,7 @@ class Capsules(NamedTuple):
     """(C,) m."""
 
 
-def begin(task: TaskConfig, sensors: Sensors, steps: int, pose: Array, surface: Surface, goal: Goal) -> Camera:
+def begin(task: TaskSettings, sensors: Sensors, steps: int, pose: Array, surface: Surface, goal: Goal) -> Camera:
     """Returns cameras with one image before the reach, in which the hand hides nothing.
 
     Args:
@@ -203,7 +203,7 @@ def _filled(which: Array) -> Array:
     return jnp.take_along_axis(found, jnp.arange(size) * jnp.sum(which, -1, keepdims=True) // size, 1)
 
 
-def goal_in_world(task: TaskConfig, goal: Goal, position: Array, quaternion: Array) -> Goal:
+def goal_in_world(task: TaskSettings, goal: Goal, position: Array, quaternion: Array) -> Goal:
     """Returns goals of the object frame in the world frame, for objects at (B, 3), (B, 4)."""
 
     def turned(value: Array, turn: Callable[[Array, Array], Array]) -> Array:

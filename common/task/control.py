@@ -7,10 +7,10 @@ import jax.numpy as jnp
 
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.config import ControlConfig, TaskConfig
 from congrasp.common.task.constraints import known
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.geometry import wrist_to_joints
+from congrasp.common.task.settings import ControlConfig, TaskSettings
 from congrasp.common.task.types import Action, Array, SceneState
 
 jax.tree_util.register_dataclass(
@@ -137,7 +137,7 @@ def carried_lead(hand: Hand, state: SceneState) -> Array:
     return jnp.where(state.table[..., None], 0.0, -state.wrist_load / stiffness)
 
 
-def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array, u_target: Array) -> Array:
+def track_load(hand: Hand, task: TaskSettings, momentum: Array, u: Array, u_velocity: Array, u_target: Array) -> Array:
     """Updates the load observer's momentum z (B, 6) after a control step, m/s and rad/s; initially zero.
 
     With w = v + damping u, the servos' law is dw/dt = stiffness (u_tgt - u) + d, where d is the acceleration of the
@@ -160,12 +160,12 @@ def track_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_veloci
     return (momentum + gained) / (1.0 + decay)
 
 
-def wrist_load(hand: Hand, task: TaskConfig, momentum: Array, u: Array, u_velocity: Array) -> Array:
+def wrist_load(hand: Hand, task: TaskSettings, momentum: Array, u: Array, u_velocity: Array) -> Array:
     """Acceleration d (B, 6) of the wrist by everything but its servos, m/s^2 and rad/s^2; see `track_load`."""
     return task.control.load_rate * (_generalised_speed(hand, task, u, u_velocity) - momentum)
 
 
-def _generalised_speed(hand: Hand, task: TaskConfig, u: Array, u_velocity: Array) -> Array:
+def _generalised_speed(hand: Hand, task: TaskSettings, u: Array, u_velocity: Array) -> Array:
     """Speed w (B, 6) of `track_load`: with steps of dt, v + (damping - stiffness dt / 2) u."""
     stiffness, damping = hand.wrist_servos
     return u_velocity + (damping - 0.5 * task.control_dt * stiffness) * u

@@ -3,70 +3,20 @@
 It is computed once for each control step. Vectors are in the wrist frame unless stated otherwise.
 """
 
-from typing import Any, NamedTuple
-
 import jax.numpy as jnp
 
 from congrasp.common import rotations
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import known
+from congrasp.common.task.constraints import center_fingers, known
 from congrasp.common.task.constraints.base import Scene
-from congrasp.common.task.constraints.fingers import chosen_fingers
 from congrasp.common.task.geometry import hand_center, nearest_index, squared_distances, wrist_pose
 from congrasp.common.task.sensing import Readings
-from congrasp.common.task.types import Array, Goal, SceneState, Surface
+from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.types import Contacts, Features, Goal, SceneState, Surface
 
 
-class Features(NamedTuple):
-    """Geometry of one control step, with leading batch axis B."""
-
-    wrist_position: Array
-    """(B, 3) world frame."""
-    wrist_quaternion: Array
-    """(B, 4) world frame."""
-    object_position: Array
-    """(B, 3) the object's centre of mass."""
-    object_quaternion: Array
-    """(B, 4) object frame to wrist frame."""
-    keypoints: Array
-    """(B, P, 3) link origins and fingertips."""
-    center: Array
-    """(B, 3) hand centre p of the current fingers (in the ablation, of the initial fingers), restricted to those that
-    an active choice of fingers allows."""
-    nearest: Array
-    """(B, P, 3) d: from each keypoint to the nearest surface point."""
-    normal: Array | None
-    """(B, P, 3) n: outward unit normal at the nearest surface point; None if the surface has no normals."""
-    height: Array | None
-    """(B, P) -n . d: signed height of each keypoint above the tangent plane there, m; None without normals."""
-    force: Array
-    """(B, L, 3) f: net contact force on each link, N."""
-    touching: Array
-    """(B, L) bool b: the link touches the object."""
-    of: dict[str, Any]
-    """Features of the constraints, by their names (`Constraint.features`)."""
-
-
-class Contacts(NamedTuple):
-    """Intermediate results from which constraints compute their features."""
-
-    surface: Surface
-    """Labelled surface points, object frame."""
-    keypoints: Array
-    """(B, P, 3) object frame."""
-    squared: Array
-    """(B, N, P) squared distances between surface points and keypoints, m^2."""
-    nearest: Array
-    """(B, L, C) index of the surface point nearest to each contact."""
-    found: Array
-    """(B, L, C) bool."""
-    force: Array
-    """(B, L, C, 3) force of each contact, wrist frame, N."""
-
-
-def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal) -> Features:
+def features(hand: Hand, task: TaskSettings, state: SceneState, surface: Surface, goal: Goal) -> Features:
     """Computes the geometry of hand, object and goal in one control step."""
     wrist_position, wrist_quaternion = wrist_pose(state)
     object_position, object_quaternion = rotations.relative_pose(
@@ -106,7 +56,7 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
         object_position=object_position,
         object_quaternion=object_quaternion,
         keypoints=keypoints,
-        center=hand_center(hand, fingers, chosen_fingers(task.constraints, goal)),
+        center=hand_center(hand, fingers, center_fingers(task, goal)),
         nearest=rotations.apply(rotations.to_matrix(object_quaternion), nearest),
         normal=normal,
         height=height,
@@ -119,7 +69,7 @@ def features(hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, 
 
 
 def scene_of(
-    hand: Hand, task: TaskConfig, state: SceneState, surface: Surface, goal: Goal, readings: Readings | None = None
+    hand: Hand, task: TaskSettings, state: SceneState, surface: Surface, goal: Goal, readings: Readings | None = None
 ) -> Scene:
     """Returns one control step as input of the constraints."""
     return Scene(hand, task, state, features(hand, task, state, surface, goal), goal, readings)

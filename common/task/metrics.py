@@ -4,17 +4,17 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks, error_specs, known
 from congrasp.common.task.constraints.base import ErrorSpec, Scene
 from congrasp.common.task.reward import terms
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array
 
 FORCES = ("force_sum", "force_link_max")
 DIVERGED = "diverged"
 
 
-def metric_names(task: TaskConfig) -> tuple[str, ...]:
+def metric_names(task: TaskSettings) -> tuple[str, ...]:
     """Metrics of a finished episode: outcome, errors of the constraints, forces, and active blocks."""
     return (
         "success",
@@ -31,12 +31,12 @@ def metric_names(task: TaskConfig) -> tuple[str, ...]:
     )
 
 
-def episode_fields(task: TaskConfig) -> tuple[str, ...]:
+def episode_fields(task: TaskSettings) -> tuple[str, ...]:
     """Wire names of an actor's report of a finished episode: metrics, then sums of reward terms."""
     return (*(f"episode/{name}" for name in metric_names(task)), *(f"term/{name}" for name in terms(task)))
 
 
-def specs(task: TaskConfig) -> tuple[ErrorSpec, ...]:
+def specs(task: TaskSettings) -> tuple[ErrorSpec, ...]:
     """Errors of the constraints supported by a task."""
     return error_specs(known(task))
 
@@ -49,7 +49,7 @@ def errors(scene: Scene) -> dict[str, tuple[Array, Array]]:
 
 
 def accumulate(
-    task: TaskConfig, sums: Mapping[str, Array], step: Mapping[str, tuple[Array, Array]], approach: Array, hold: Array
+    task: TaskSettings, sums: Mapping[str, Array], step: Mapping[str, tuple[Array, Array]], approach: Array, hold: Array
 ) -> dict[str, Array]:
     """Adds one step to the sums of an episode.
 
@@ -68,13 +68,13 @@ def accumulate(
     return total
 
 
-def empty_sums(task: TaskConfig, batch: int) -> dict[str, Array]:
+def empty_sums(task: TaskSettings, batch: int) -> dict[str, Array]:
     """Sums before the first step."""
     zero = jnp.zeros(batch)
     return {name: zero for spec in specs(task) for name in (spec.name, f"{spec.name}/of")}
 
 
-def episode_errors(task: TaskConfig, sums: Mapping[str, Array]) -> dict[str, Array]:
+def episode_errors(task: TaskSettings, sums: Mapping[str, Array]) -> dict[str, Array]:
     """Errors (B,) of an episode by name: means over the summed steps, or ratios of two sums.
 
     The value is zero if there were no steps, as for errors of the hold when the table stays.

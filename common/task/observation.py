@@ -7,23 +7,23 @@ import jax.numpy as jnp
 
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks, known
 from congrasp.common.task.constraints.base import ObservationField, Scene
 from congrasp.common.task.geometry import flat, squash
 from congrasp.common.task.sensing import Readings
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array
 
 _OF_POSE = ("object_displacement", "object_rotation", "past object_position", "past object_rotation")
 """Fields that a camera does not provide, because they need the object's pose."""
 
 
-def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
+def layout(hand: Hand, task: TaskSettings) -> tuple[tuple[str, int], ...]:
     """Names and sizes of the observation's blocks, in order: the state, those of the constraints, and the mask."""
     return tuple((block, sum(field.size for field in content)) for block, content in fields(hand, task).items())
 
 
-def fields(hand: Hand, task: TaskConfig) -> dict[str, tuple[ObservationField, ...]]:
+def fields(hand: Hand, task: TaskSettings) -> dict[str, tuple[ObservationField, ...]]:
     """Fields of every block, in order, restricted to those that the task's policy observes."""
     mask = "1 for each active constraint in the order of 'masks'; the block of an inactive one is zero"
     past = _past_fields(hand, task) if task.observation != "full" else ()
@@ -43,14 +43,14 @@ def fields(hand: Hand, task: TaskConfig) -> dict[str, tuple[ObservationField, ..
     }
 
 
-def _is_seen(task: TaskConfig, field: ObservationField) -> bool:
+def _is_seen(task: TaskSettings, field: ObservationField) -> bool:
     """True if a field is part of the task's observation."""
     if task.observation == "camera" and field.name in _OF_POSE:
         return False
     return task.observation == "full" or not field.privileged
 
 
-def _state_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
+def _state_fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]:
     """Fields of the state of hand and object in the current control step."""
     f, n, p = len(hand.joints), len(hand.links), len(hand.keypoints)
     normals: tuple[tuple[Any, ...], ...] = (
@@ -81,14 +81,14 @@ def _state_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
 
 
 def _normals(scene: Scene) -> list[Array]:
-    """Arrays (B, ...) of the fields of `TaskConfig.surface_normals`."""
+    """Arrays (B, ...) of the fields of `TaskSettings.surface_normals`."""
     if not scene.task.surface_normals:
         return []
     assert scene.features.normal is not None and scene.features.height is not None, "the surface has no normals"
     return [flat(scene.features.normal), scene.features.height]
 
 
-def _past_fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
+def _past_fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]:
     """Fields of a robot's observation for earlier control steps."""
     f, past = len(hand.joints), task.history - 1
     order = f"for each of the last {past} control steps, newest first"
@@ -126,8 +126,9 @@ def _cloud(scene: Scene) -> Array:
     features, cloud = scene.features, scene.cloud
     points = rotations.inverse_transform(features.wrist_position, features.wrist_quaternion, cloud.points)
     labels = jnp.zeros(cloud.avoid.shape)
-    if "affordance" in scene.goal.active:
-        labels = cloud.avoid * scene.gate("affordance")[:, None]
+    for constraint in known(scene.task):
+        if (own := constraint.cloud_labels(scene)) is not None:
+            labels = jnp.maximum(labels, own)
     return flat(jnp.concatenate([points, labels[..., None]], -1))
 
 
@@ -177,6 +178,6 @@ def observe(scene: Scene) -> Array:
     return jnp.concatenate([*parts, *([jnp.stack(mask, -1)] if mask else [])], -1)
 
 
-def _seen(task: TaskConfig, values: Sequence[Array], content: Sequence[ObservationField]) -> list[Array]:
+def _seen(task: TaskSettings, values: Sequence[Array], content: Sequence[ObservationField]) -> list[Array]:
     """Selects the values (B, ...) of fields that are part of the task's observation."""
     return [value for value, field in zip(values, content, strict=True) if _is_seen(task, field)]

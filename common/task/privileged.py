@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from congrasp.common.hands.measures import tip_forces
+from congrasp.common.hands.motors import tip_forces
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import observation
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.base import ObservationField, Scene
 from congrasp.common.task.sensing import Sensors
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array
 
 GRAVITY = 9.81
@@ -40,12 +40,12 @@ class Parameters(NamedTuple):
     """The trackers; None if the policy observes the true poses."""
 
 
-def layout(hand: Hand, task: TaskConfig) -> tuple[tuple[str, int], ...]:
+def layout(hand: Hand, task: TaskSettings) -> tuple[tuple[str, int], ...]:
     """Names and sizes of the fields, in order."""
     return tuple((field.name, field.size) for field in fields(hand, task))
 
 
-def fields(hand: Hand, task: TaskConfig) -> tuple[ObservationField, ...]:
+def fields(hand: Hand, task: TaskSettings) -> tuple[ObservationField, ...]:
     """Description of the critic's privileged inputs, in order."""
     episode = (
         ObservationField("mass", 1, "kg, mass of the object"),
@@ -101,6 +101,6 @@ def observe(scene: Scene, parameters: Parameters) -> Array:
     return jnp.concatenate([numbers, observation.observe(scene._replace(task=_full(task)))], -1)
 
 
-def _full(task: TaskConfig) -> TaskConfig:
+def _full(task: TaskSettings) -> TaskSettings:
     """Returns the task with a policy that observes the full state."""
     return dataclasses.replace(task, observation="full")

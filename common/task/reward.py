@@ -1,19 +1,17 @@
 """Reward terms (paper, section Reward Function): those of the grasp are here, those of constraints in their files."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from congrasp.common import rotations
-from congrasp.common.task.constraints import known
+from congrasp.common.hands.spec import Hand
+from congrasp.common.task.constraints import center_fingers, known
 from congrasp.common.task.constraints.base import Scene
-from congrasp.common.task.constraints.fingers import chosen_fingers, keypoint_weights
 from congrasp.common.task.geometry import FAR, square
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, SceneState
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import RewardWeights, TaskConfig
 
 
 class Earning(NamedTuple):
@@ -40,10 +38,23 @@ class Term(NamedTuple):
     """Value (B,) before the weight, signed and bounded; None for a parameter that other terms share."""
 
 
+def keypoint_weights(hand: Hand, chosen: Array | None) -> Array:
+    """Weights (P,) or (B, P) of the keypoints in the distance reward, for fingers of `center_fingers`.
+
+    Keypoints of other fingers get no weight; those of the set and the palm share it.
+    """
+    weights = jnp.array(hand.keypoint_weights)
+    if chosen is None:
+        return weights
+    owner = hand.link_fingers[hand.keypoint_links]
+    kept = jnp.where((owner < 0) | chosen[:, owner], weights, 0.0)
+    return kept * (jnp.sum(weights) / jnp.sum(kept, -1, keepdims=True))
+
+
 def _distance(scene: Scene, earning: Earning) -> Array:
     """Weighted distance from the keypoints to the surface."""
     distances = jnp.linalg.norm(scene.features.nearest, axis=-1)
-    weights = keypoint_weights(scene.hand, chosen_fingers(scene.task.constraints, scene.goal))
+    weights = keypoint_weights(scene.hand, center_fingers(scene.task, scene.goal))
     return -jnp.sum(weights * jnp.minimum(distances, FAR), -1)
 
 
@@ -131,19 +142,19 @@ GRASP: tuple[Term, ...] = (
 """Terms of r^grasp; `RewardWeights` (`common.task.config`) and the names of all terms derive from them."""
 
 
-def terms(task: "TaskConfig") -> tuple[str, ...]:
+def terms(task: TaskSettings) -> tuple[str, ...]:
     """Names of the terms, which are those of their weights: the grasp's, then those of the constraints."""
     grasp = (term.name for term in GRASP if term.value is not None)
     return (*grasp, *(weight.name for constraint in known(task) for weight in constraint.weights))
 
 
-def fallen(task: "TaskConfig", state: SceneState) -> Array:
+def fallen(task: TaskSettings, state: SceneState) -> Array:
     """(B,) bool I_drop: the object is `drop_height` below its initial height."""
     return state.object_position[..., 2] < state.object_position_initial[..., 2] - task.drop_height
 
 
-def reward_terms(scene: Scene, weights: "RewardWeights") -> dict[str, Array]:
-    """Weighted terms (B,) by the names in `terms`; the reward is their sum."""
+def reward_terms(scene: Scene, weights: Any) -> dict[str, Array]:
+    """Weighted terms (B,) by the names in `terms`; the reward is their sum. `weights` are `RewardWeights`."""
     touching, force, most = scene.features.touching, scene.features.force, weights.force_max
     for constraint in known(scene.task):
         touching, force = constraint.earning(scene, touching, force)

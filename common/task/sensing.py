@@ -2,7 +2,7 @@
 
 A tracker samples the object's pose periodically. A sample arrives some control steps later, with errors, or is lost;
 the newest arrived sample is shown until the next one. A policy without privileged observations
-(`TaskConfig.observation` "tracked") observes the last control steps of it, with its joints and their targets, which
+(`TaskSettings.observation` "tracked") observes the last control steps of it, with its joints and their targets, which
 substitute for contact forces and velocities.
 """
 
@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import chance, rotations
-from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.resting import resting_mean
+from congrasp.common.task.settings import SensingConfig, TaskSettings
 from congrasp.common.task.types import Array, SceneState
 
 NEVER = 20_000.0
@@ -203,7 +203,7 @@ def push(readings: Readings, newest: Readings) -> Readings:
     )
 
 
-def seen_by(task: TaskConfig, state: SceneState, readings: Readings) -> SceneState:
+def seen_by(task: TaskSettings, state: SceneState, readings: Readings) -> SceneState:
     """Returns a control step as observed by the policy: the tracker's pose and the newest targets.
 
     In a tracked observation, forces and velocities are unknown except the wrist's velocity, on which its targets depend

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.config import ControlConfig
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.control import Guided, guided, wrist_lead
 from congrasp.common.task.observation import observe
+from congrasp.common.task.settings import ControlConfig
 from congrasp.common.task.types import Array
 
 _WRIST = (6, 7, 13, 14, 20)

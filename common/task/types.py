@@ -125,3 +125,50 @@ class Action(NamedTuple):
     """(B, F)."""
     u_target: Array
     """(B, 6)."""
+
+
+class Features(NamedTuple):
+    """Geometry of one control step, with leading batch axis B."""
+
+    wrist_position: Array
+    """(B, 3) world frame."""
+    wrist_quaternion: Array
+    """(B, 4) world frame."""
+    object_position: Array
+    """(B, 3) the object's centre of mass."""
+    object_quaternion: Array
+    """(B, 4) object frame to wrist frame."""
+    keypoints: Array
+    """(B, P, 3) link origins and fingertips."""
+    center: Array
+    """(B, 3) hand centre p of the current fingers (in the ablation, of the initial fingers), restricted to those that
+    an active choice of fingers allows."""
+    nearest: Array
+    """(B, P, 3) d: from each keypoint to the nearest surface point."""
+    normal: Array | None
+    """(B, P, 3) n: outward unit normal at the nearest surface point; None if the surface has no normals."""
+    height: Array | None
+    """(B, P) -n . d: signed height of each keypoint above the tangent plane there, m; None without normals."""
+    force: Array
+    """(B, L, 3) f: net contact force on each link, N."""
+    touching: Array
+    """(B, L) bool b: the link touches the object."""
+    of: dict[str, Any]
+    """Features of the constraints, by their names (`Constraint.features`)."""
+
+
+class Contacts(NamedTuple):
+    """Intermediate results from which constraints compute their features."""
+
+    surface: Surface
+    """Labelled surface points, object frame."""
+    keypoints: Array
+    """(B, P, 3) object frame."""
+    squared: Array
+    """(B, N, P) squared distances between surface points and keypoints, m^2."""
+    nearest: Array
+    """(B, L, C) index of the surface point nearest to each contact."""
+    found: Array
+    """(B, L, C) bool."""
+    force: Array
+    """(B, L, C, 3) force of each contact, wrist frame, N."""

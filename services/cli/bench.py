@@ -41,9 +41,29 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
       congrasp bench query
       congrasp bench query --repeat 5000 --concurrency 4
     """
-    from congrasp.services.bench.query import bench_query
+    import tempfile
 
-    bench_query(repeat, concurrency, states)
+    import psutil
+
+    from congrasp.common.policy import bundle as bundles
+    from congrasp.services.client.policy_client import PolicyClient
+    from congrasp.services.serve.load import example_episode, measure, serving
+    from congrasp.services.train.command import untrained
+    from congrasp.services.train.presets import get_preset
+
+    with tempfile.TemporaryDirectory() as folder:
+        policy = pathlib.Path(folder, "policy.safetensors")
+        bundles.save(untrained(get_preset("quickstart")), policy)
+        with serving(policy, pathlib.Path(folder, "serve.log")) as (endpoint, server):
+            episode = example_episode(1_000_000)
+            with PolicyClient(endpoint, wait=180.0) as client:
+                client.metadata()
+            process = psutil.Process(server)
+            before = process.cpu_times()
+            result = measure(endpoint, "policy", episode, repeat, concurrency, 5.0, states=states)
+            after = process.cpu_times()
+            result["server_cpu_ms"] = 1e3 * (sum(after[:2]) - sum(before[:2])) / repeat / states  # of user and system
+    print(", ".join(f"{name} {value:.2f}" for name, value in result.items()))
     return 0
 
 
@@ -79,7 +99,7 @@ def scaling(
     """
     import dataclasses
 
-    from congrasp.services.bench.scaling import bench_scaling
+    from congrasp.services.bench.training import bench_scaling
     from congrasp.services.train.presets import get_preset
 
     config = get_preset(preset)
@@ -113,7 +133,7 @@ def startup(
     """
     import dataclasses
 
-    from congrasp.services.bench.startup import bench_startup
+    from congrasp.services.bench.training import bench_startup
     from congrasp.services.train.presets import get_preset
 
     config = get_preset(preset)

@@ -280,7 +280,7 @@ def show(
         raise CongraspError(f"--rest is {rest}.", f"The object has the resting poses 1 to {rests}.")
     show_facts(describe(constraints))
     if png is not None:
-        from congrasp.services.viz.constraint_sheet import constraint_sheet
+        from congrasp.services.viz.object_sheet import constraint_sheet
         from congrasp.services.viz.sheets import save_png
 
         best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())

@@ -171,8 +171,8 @@ def check(
     from congrasp.common.hands import get_hand
     from congrasp.common.runtime.parallel import cores
     from congrasp.services.assets.hands.check import check_hand, write_findings
-    from congrasp.services.train.recipe import recipe
-    from congrasp.services.viz.check_sheet import check_sheet
+    from congrasp.services.train.presets import recipe
+    from congrasp.services.viz.hand_sheets import check_sheet
     from congrasp.services.viz.sheets import save_png
 
     found = get_hand(hand)

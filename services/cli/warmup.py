@@ -38,8 +38,8 @@ def warmup(
     from congrasp.common.runtime.stages import imported
     from congrasp.services.ops.shutdown import on_signal
     from congrasp.services.train.command import first_update
+    from congrasp.services.train.learn import until_first_update
     from congrasp.services.train.presets import get_preset
-    from congrasp.services.train.warmup import until_first_update
 
     imported()
     console = Console(highlight=False)

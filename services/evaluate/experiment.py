@@ -16,8 +16,8 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling.bank import ConstraintBank, with_columns
-from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.task.sampling.bank import ConstraintBank
+from congrasp.common.task.sampling.build import build_bank, with_columns
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate import references
 from congrasp.services.evaluate.episodes import Batch, Episodes, Sample, joined

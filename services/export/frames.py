@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand, own_hands
-from congrasp.common.hands.skeleton import Skeleton
+from congrasp.common.hands.flesh import Skeleton
 from congrasp.common.hands.skin import Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.painting import painted

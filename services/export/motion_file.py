@@ -14,13 +14,12 @@ from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 
-from congrasp.common.described import check_arrays
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.spec import Hand, capsule_ends
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import file_name
-from congrasp.common.io.npz import read_npz
+from congrasp.common.io.npz import check_arrays, read_npz
 from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.wire.codec import Message

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.outline import outline
+from congrasp.common.hands.closure import outline
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject

@@ -11,8 +11,8 @@ from typing import Annotated, NamedTuple, get_type_hints
 
 import numpy as np
 
-from congrasp.common.described import check_arrays
 from congrasp.common.errors import CongraspError
+from congrasp.common.io.npz import check_arrays
 from congrasp.common.wire.codec import Message
 
 UNLIMITED = 1e3

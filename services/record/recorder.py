@@ -1,20 +1,207 @@
-"""Records the messages that a run publishes under `log/**`, in a separate thread, without blocking the run."""
+"""Records the messages that a run publishes under `log/**`, in a separate thread, without blocking the run.
 
+Kinds of `congrasp/<run>/log/<kind>/<role>/<name>`: `metrics` (meta: time, update or version, values), `event` (time,
+level, text), `version` (any scalars), `rollout` (some worlds of an actor's rollout, opaque) and `episode` (see
+`services.record.scene`).
+"""
+
+import collections
 import pathlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name
 from congrasp.common.transport.base import Transport
-from congrasp.common.transport.keys import Keys
-from congrasp.common.wire.codec import Message
-from congrasp.services.record.channels import Entry
-from congrasp.services.record.entries import Converter
+from congrasp.common.transport.keys import Keys, check_name
+from congrasp.common.wire.codec import Message, encode, finite
+from congrasp.common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
+from congrasp.learner.hub.rate_limit import certificate
+from congrasp.services.record.channels import (
+    ROLLOUT_SCHEMA,
+    Entry,
+    JsonChannels,
+    check_field,
+    nest,
+    opaque_channel,
+    protobuf_channel,
+)
+from congrasp.services.record.scene import check_episode, duration, episode_entries
 from congrasp.services.record.writer import LogWriter
+
+Name = tuple[str, str]
+"""Role and name of a publisher."""
+
+_NAMES = 64  # names of one identity
+_IDENTITIES = 1024
+_IDLE = 60.0  # seconds after which a silent name may be replaced
+_PER_SECOND, _MOST = 16 << 20, 256 << 20  # bytes per second of an identity's entries, and their burst
+
+
+class LogBudget:
+    """Budgets of the logs of one identity: number of names, and bytes per second. Not thread-safe.
+
+    An identity is a role and, for actors, a certificate. The excess over a budget is dropped; the logs of others are
+    not affected.
+    """
+
+    def __init__(self, on_forget: Callable[[Name], None], clock: Callable[[], float] = time.monotonic):
+        """Starts without names.
+
+        Args:
+          on_forget: called with a name that is replaced by another.
+          clock: seconds, monotonic.
+        """
+        self._on_forget, self._clock = on_forget, clock
+        self._heard: dict[Name, collections.OrderedDict[Name, float]] = {}
+        self._bytes: dict[Name, tuple[float, float]] = {}
+
+    def admit(self, who: Name) -> None:
+        """Admits a message of a publisher.
+
+        Raises:
+          CongraspError: its identity has too many names, or has used up its bytes.
+        """
+        identity, now = _identity(who), self._clock()
+        if identity not in self._heard and len(self._heard) >= _IDENTITIES:
+            raise CongraspError(f"More than {_IDENTITIES} identities publish logs.")
+        heard = self._heard.setdefault(identity, collections.OrderedDict())
+        if who not in heard and len(heard) >= _NAMES:
+            oldest = next(iter(heard))
+            if heard[oldest] > now - _IDLE:
+                raise CongraspError(f"More than {_NAMES} names of one certificate publish logs.")
+            del heard[oldest]
+            self._on_forget(oldest)
+        heard[who] = now
+        heard.move_to_end(who)
+        if self._level(identity, now) <= 0:
+            raise CongraspError(f"One certificate publishes more than {_PER_SECOND >> 20} MiB of logs a second.")
+
+    def charge(self, who: Name, size: int) -> None:
+        """Charges a publisher for recorded bytes."""
+        identity, now = _identity(who), self._clock()
+        self._bytes[identity] = self._level(identity, now) - size, now
+
+    def _level(self, identity: Name, now: float) -> float:
+        level, since = self._bytes.get(identity, (float(_MOST), now))
+        return min(_MOST, level + (now - since) * _PER_SECOND)
+
+
+def _identity(who: Name) -> Name:
+    role, name = who
+    return role, certificate(name) if role == "actor" else ""
+
+
+_AHEAD = 60_000_000_000
+"""Longest queue of an actor's episodes in ns; later ones are dropped."""
+_TIMES = 2**62
+"""Limit of times, ns since 1970."""
+_LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
+
+
+class Converter:
+    """State across messages: fields of schemas, slots of actors, and the end of each actor's episode.
+
+    All of it is bounded, separately for every identity (`LogBudget`).
+    """
+
+    def __init__(self) -> None:
+        """Starts without messages."""
+        self._json = JsonChannels()
+        self._budget = LogBudget(self._forget)
+        self._slots: dict[str, int] = {}
+        self._ends: dict[str, int] = {}
+        self._now = 0
+        self._kinds: dict[str, Callable[[str, str, Message, int], Iterator[Entry]]] = {
+            "metrics": self._metrics,
+            "event": self._event,
+            "version": self._version,
+            "rollout": self._rollout,
+            "episode": self._episode,
+        }
+
+    def __call__(self, key: str, message: Message, now: int) -> list[Entry]:
+        """Converts one message that arrived at `now` (ns since 1970) to entries.
+
+        Raises:
+          CongraspError: it is not a valid log message, or exceeds its sender's budget.
+        """
+        if now < self._now:  # the clock was set back: what is still playing keeps its remaining time
+            self._ends = {name: end - (self._now - now) for name, end in self._ends.items()}
+        self._now = now
+        *_, kind, role, name = ("", "", *key.split("/"))
+        if kind not in self._kinds:
+            raise CongraspError(f"{ascii(kind)[:60]} is not a kind of log message.")
+        who = check_name("role", role), check_name("role", name)
+        self._budget.admit(who)
+        try:
+            entries = list(self._kinds[kind](role, name, Message(message.arrays, finite(message.meta)), now))
+        except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
+            raise CongraspError(f"It is not a valid {kind} message ({type(error).__name__}).") from None
+        self._budget.charge(who, sum(len(entry.data) for entry in entries))
+        return entries
+
+    def _forget(self, who: Name) -> None:
+        """Drops the state of a silent publisher."""
+        role, name = who
+        for topic in (f"/metrics/{role}/{name}", f"/version/{role}/{name}", f"/episode/{name}/signals"):
+            self._json.forget(topic)
+        self._slots.pop(name, None)
+        self._ends.pop(name, None)
+
+    def _metrics(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """Yields the numbers of an update or a rollout."""
+        validate(_timed(message, now), METRICS)
+        values = {check_field(key): float(value) for key, value in message.meta["values"].items()}
+        yield self._json.entry(f"/metrics/{role}/{name}", now, {**_scalars(message.meta), "values": nest(values)})
+
+    def _version(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """Yields a published version."""
+        yield self._json.entry(f"/version/{role}/{name}", now, _scalars(message.meta))
+
+    def _event(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """Yields a line of the log."""
+        validate(event := _timed(message, now), EVENT)
+        level = _LEVELS.get(event.meta["level"].lower(), Log.UNKNOWN)
+        log = Log(level=level, message=event.meta["text"], name=f"{role}/{name}")
+        log.timestamp.FromNanoseconds(max(0, min(_TIMES, round(1e9 * float(event.meta["time"])))))
+        yield Entry(protobuf_channel(f"/events/{role}/{name}", Log), now, log.SerializeToString())
+
+    def _rollout(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """Yields a rollout unchanged."""
+        yield Entry(opaque_channel(f"/rollout/{name}", ROLLOUT_SCHEMA), now, encode(message))
+
+    def _episode(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
+        """Yields an episode's scene, step by step."""
+        check_episode(message)
+        # An episode that arrives while the previous one is playing waits for its end.
+        start = max(now, self._ends.get(name, 0))
+        if start > now + _AHEAD:
+            raise CongraspError(f"The previous episodes are still playing for {(start - now) / 1e9:.0f} s.")
+        taken = set(self._slots.values())
+        slot = self._slots.setdefault(name, next(i for i in range(len(taken) + 1) if i not in taken))
+        yield from episode_entries(name, message, start, slot, self._json)
+        self._ends[name] = start + duration(message)
+
+
+def _timed(message: Message, now: int) -> Message:
+    """Returns the message with its time of arrival (ns) if it has no time."""
+    return Message(message.arrays, {"time": now / 1e9, **message.meta})
+
+
+def _scalars(meta: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the entries of a message's metadata that are plain values of bounded length."""
+    return {
+        check_field(key): value
+        for key, value in meta.items()
+        if isinstance(value, bool | int | float | str) and len(str(value)) <= LONGEST_TEXT
+    }
+
 
 FLUSH_SECONDS = 0.5
 """Seconds between two flushes; a killed recorder loses no more than these."""

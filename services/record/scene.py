@@ -4,10 +4,13 @@ Each actor has a separate frame in a row under `world`. Constant parts of an epi
 frames, contacts and signals follow at each control step.
 """
 
+import contextlib
+import functools
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import trimesh
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
@@ -20,11 +23,13 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
+from congrasp.common.hands.flesh import skeleton_of
 from congrasp.common.hands.mjcf import WRIST_JOINTS
+from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand, Link, capsule_ends
-from congrasp.common.objects.checks import LARGEST
 from congrasp.common.objects.painting import nearest
 from congrasp.common.objects.spec import Colours
+from congrasp.common.objects.store import LARGEST
 from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import EPISODE, validate
@@ -32,8 +37,86 @@ from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
 from congrasp.services.record.goals import markers
 from congrasp.services.record.moved_arm import MovedArm, arm_of_episode
-from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE, HEADING, OBJECT, TABLE, WAYPOINT
-from congrasp.services.record.surface import surface_parts, surface_points
+from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE, HEADING, OBJECT, TABLE, WAYPOINT, Colour
+from congrasp.services.record.palette import MATERIALS as COLOURS
+
+_OVERLAP = 0.4  # weight of a link on a vertex above which the triangle belongs to the link
+_MOST_FACES = 12_000  # triangles of a hand; meshes of links may have more
+_GRID = 2.0**-14  # resolution of coordinates, m: few digits compress well
+_POINTS = 2048  # points on a hand
+
+
+class Part(NamedTuple):
+    """A rigid part of a link in one colour, in the link's frame, m."""
+
+    colour: Colour
+    points: np.ndarray
+    """(V, 3), within 0.05 mm."""
+    faces: np.ndarray
+    """(E, 3) int, with outward normals."""
+
+
+@functools.lru_cache(maxsize=16)
+def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
+    """Rigid parts of the surface of each link, one of each material, in the link's frame; each is sent once.
+
+    A human hand's skin deforms, but its points at every step would make a recording many times as large. A triangle of
+    skin therefore belongs to every link with a noticeable weight on it, so that the parts of two links overlap at a
+    bent joint.
+    """
+    skin = _skin(hand)
+    strongest = np.eye(len(hand.links), dtype=bool)[skin.weights[skin.faces].sum(1).argmax(-1)]
+    members = strongest | (skin.weights[skin.faces].max(1) >= _OVERLAP)
+    kept = min(1.0, _MOST_FACES / len(skin.faces))
+    found = []
+    for member, origin in zip(members.T, skin.origins, strict=True):
+        parts = []
+        for number, name in enumerate(MATERIALS):
+            faces = skin.faces[member & (skin.material[skin.faces[:, 0]] == number)]
+            if len(faces):
+                parts.append(Part(COLOURS[name], *_light(skin.points[faces] - origin, kept)))
+        found.append(tuple(parts))
+    return tuple(found)
+
+
+@functools.lru_cache(maxsize=16)
+def surface_points(hand: Hand) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Points (n, 3) on the parts of each link, in its frame, and their colours (n, 3), for viewers without meshes."""
+    parts = surface_parts(hand)
+    area = sum(_mesh(part).area for own in parts for part in own)
+    found = []
+    for own in parts:
+        points, colours = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        for part in own:
+            mesh = _mesh(part)
+            points.append(trimesh.sample.sample_surface(mesh, round(_POINTS * mesh.area / area), seed=0)[0])
+            colours.append(np.tile(part.colour, (len(points[-1]), 1)))
+        found.append((np.concatenate(points), np.concatenate(colours)))
+    return tuple(found)
+
+
+def _skin(hand: Hand) -> Skin:
+    """Surface of the hand; made of its capsules if custom meshes cannot be read."""
+    with contextlib.suppress(CongraspError):
+        return skin_of(hand)
+    return skin_on(skeleton_of(hand))
+
+
+def _light(corners: np.ndarray, kept: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points and faces of a share of triangles (E, 3, 3), on a grid and without duplicate points."""
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    if kept < 1.0:
+        mesh = mesh.simplify_quadric_decimation(face_count=max(4, int(kept * len(mesh.faces))))
+    points, found = np.unique(np.round(mesh.vertices / _GRID), axis=0, return_inverse=True)
+    faces = found.reshape(-1)[mesh.faces]
+    a, b, c = faces.T
+    return points * _GRID, faces[(a != b) & (b != c) & (c != a)]
+
+
+def _mesh(part: Part) -> trimesh.Trimesh:
+    """Returns a part as a trimesh mesh."""
+    return trimesh.Trimesh(part.points, part.faces, process=False)
+
 
 EPISODE_SCHEMA = "congrasp.Episode"
 _MOST = {"T": 2000, "V": 200_000, "Fc": 400_000, "N": 4096, "n": 64, "P": 100_000}
@@ -41,7 +124,7 @@ _GOAL, _ARRAYS = 10_000, 128
 _OPEN = ("reward/", "error/", "goal/", "active/")
 SPACING = 0.8
 """Distance between the frames of two actors in the world frame, m."""
-Colour = tuple[float, float, float, float]
+Rgba = tuple[float, float, float, float]
 _GHOST, _OBJECT, _TABLE = (*HEADING, 0.25), (*OBJECT, 1.0), (*TABLE, 1.0)
 _HEADING, _WAYPOINT, _FORCE = (*HEADING, 1.0), (*WAYPOINT, 1.0), (0.93, 0.26, 0.21, 1.0)
 _AXES = ((0.9, 0.2, 0.2, 1.0), (0.2, 0.7, 0.2, 1.0), (0.2, 0.3, 0.9, 1.0))
@@ -285,7 +368,7 @@ def _entity(update: SceneUpdate, name: str, frame: str, now: int, *, lifetime: i
     return entity
 
 
-def _add_triangles(entity: SceneEntity, points: np.ndarray, faces: np.ndarray, colour: Colour) -> TriangleListPrimitive:
+def _add_triangles(entity: SceneEntity, points: np.ndarray, faces: np.ndarray, colour: Rgba) -> TriangleListPrimitive:
     """Adds a mesh (V, 3), (E, 3) in the entity's frame."""
     mesh = entity.triangles.add()
     mesh.pose.orientation.w = 1.0
@@ -296,7 +379,7 @@ def _add_triangles(entity: SceneEntity, points: np.ndarray, faces: np.ndarray, c
     return mesh
 
 
-def _add_capsules(entity: SceneEntity, link: Link, colour: Colour) -> None:
+def _add_capsules(entity: SceneEntity, link: Link, colour: Rgba) -> None:
     """Adds a link's capsules, which fill gaps in its skin at bent joints."""
     for capsule, (start, end) in zip(link.capsules, capsule_ends(link), strict=True):
         length = float(np.linalg.norm(end - start))
@@ -310,7 +393,7 @@ def _add_capsules(entity: SceneEntity, link: Link, colour: Colour) -> None:
         _add_sphere(entity, start, capsule.radius, colour)
 
 
-def _add_sphere(entity: SceneEntity, center: np.ndarray, radius: float, colour: Colour) -> None:
+def _add_sphere(entity: SceneEntity, center: np.ndarray, radius: float, colour: Rgba) -> None:
     """Adds a ball."""
     sphere = entity.spheres.add()
     _set_vector(sphere.pose.position, center)
@@ -320,7 +403,7 @@ def _add_sphere(entity: SceneEntity, center: np.ndarray, radius: float, colour: 
 
 
 def _add_arrow(
-    entity: SceneEntity, start: np.ndarray, direction: np.ndarray, length: float, width: float, colour: Colour
+    entity: SceneEntity, start: np.ndarray, direction: np.ndarray, length: float, width: float, colour: Rgba
 ) -> None:
     """Adds an arrow of some length and width (m) along a unit direction."""
     arrow = entity.arrows.add(
@@ -346,6 +429,6 @@ def _set_quaternion(target: Any, value: Any) -> None:
     target.w, target.x, target.y, target.z = map(float, value)
 
 
-def _set_colour(target: Any, value: Colour) -> None:
+def _set_colour(target: Any, value: Rgba) -> None:
     """Sets red, green, blue and alpha."""
     target.r, target.g, target.b, target.a = value

@@ -1,7 +1,8 @@
-"""The policy as one compiled function from a batch of flat queries to joint targets."""
+"""The policy as one compiled function from a batch of flat queries to joint targets, for a server and this process."""
 
 import functools
 import itertools
+import os
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,9 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common.errors import CongraspError, ContradictionError
+from congrasp.common.errors import CongraspError, ContradictionError, error_of
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.left import right_name
 from congrasp.common.hands.spec import Hand
-from congrasp.common.policy.bundle import InferenceParameters, mean_action
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, mean_action
+from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task import control, observation
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.priority import explain, resolve
@@ -20,8 +25,10 @@ from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import seen_by
 from congrasp.common.task.types import SceneState
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.episode import PACKED
+from congrasp.services.client.episode import PACKED, EpisodePolicy
+from congrasp.services.client.left import LeftPolicy
 from congrasp.services.client.limits import JointLimits
+from congrasp.services.client.policy import Policy
 from congrasp.services.serve.requests import STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)
@@ -132,3 +139,48 @@ def _infer(layout: Layout, weights: InferenceParameters, vectors: jax.Array) -> 
     action = control.decode(scene, task.control, mean)
     notes = jnp.stack([resolution.redirected, resolution.aligned], -1)
     return jnp.concatenate([mean, action.q_target, action.u_target, notes, checks], -1)
+
+
+class LocalPolicy(EpisodePolicy):
+    """The `Policy` of a bundle."""
+
+    def __init__(self, bundle: PolicyBundle):
+        """Compiles `act`, so that no control step waits for it; `act_each` is compiled at its first call.
+
+        Args:
+          bundle: the policy, which determines the hand.
+        """
+        super().__init__()
+        self._bundle = bundle
+        self._function = PolicyFunction(get_hand(bundle.spec.hand), bundle.task)
+        self._function.warm_up(bundle.inference_parameters, BATCH_SIZES[:1])
+
+    def _described(self) -> dict[str, Any]:
+        """The metadata of the bundle."""
+        return self._function.metadata()
+
+    def _query(self, query: Message) -> Message:
+        """Returns the reply of a server with this bundle."""
+        began = time.perf_counter()
+        try:
+            parsed = self._function.layout.parse(query)
+            (answer,) = self._function(self._bundle.inference_parameters, [parsed])
+            if isinstance(answer, Exception):
+                raise answer
+        except CongraspError as error:
+            raise error_of(error.code, str(error)) from None
+        return answer.reply({"version": self._bundle.version, "total_ms": 1e3 * (time.perf_counter() - began)})
+
+
+def load_policy(policy: str | os.PathLike[str] = "human") -> Policy:
+    """Loads the policy of a file, or the pretrained one of a hand, in this process.
+
+    Args:
+      policy: a policy file (`policy.safetensors` in a run's folder), or the name of a hand (`human:left` for the left).
+
+    Raises:
+      CongraspError: there is no such file or hand, or the file is damaged.
+    """
+    right, left = right_name(str(policy))
+    found = LocalPolicy(bundles.load(named_policy(right)))
+    return LeftPolicy(found) if left else found

@@ -256,7 +256,7 @@ def first_update() -> str:
 
 def _steps_per_update(config: RunConfig) -> int:
     """Number of environment steps of one update of one rank."""
-    return config.rollout_steps * config.environments * config.ppo.rollouts_per_update
+    return config.rollout_steps * config.environments * config.rollouts_per_update
 
 
 def _minutes(seconds: float) -> str:

@@ -182,7 +182,7 @@ def _run(request: Request, name: str, arguments: list[str], fine: tuple[int, ...
 def _what_a_gpu_would_take(request: Request) -> str:
     """Describes what the short training omits."""
     full = get_preset(FULL, request.reference)
-    steps = _UPDATES * full.environments * full.rollout_steps * full.ppo.rollouts_per_update
+    steps = _UPDATES * full.environments * full.rollout_steps * full.rollouts_per_update
     return (
         "This machine has no GPU: a short training of an easier task follows, whose policy grasps from above at "
         f"best. On a GPU the same command trains the full task: {steps / 1e6:.0f} million steps, about "

@@ -1,13 +1,124 @@
-"""Named initial configurations; every field can be overridden on the command line."""
+"""Named configurations: the full task for any hand, students with the sensors of a robot, and short runs.
+
+Differences between hands in the recipe of the full task are computed from the hand.
+
+The size of a hand determines the factor s on its objects (`Hand.object_scale`; the paper's for its hands,
+`common.hands.motors.fitting_scale` for others), its strength is the force F with which its fingertips can press (the
+mean of `common.hands.motors.tip_forces`: torque limits over lengths); G is the number of its fingers. Its mass has no
+effect, because the virtual wrist is scaled to it (`common.hands.spec.wrist_gains`).
+
+* **Squeeze** k = s^2 5 / G. All fingers together may press so that the pressure on the object is that of the human
+  hand's five: their force grows with the object's surface, s^2, and fewer fingers press more each.
+* `force_max` = 5 N k, to half a newton: 5 N, 12 N (Allegro), 6 N (Sharpa).
+* `heading_position` = 12 k: 12, 29, 15. The hand's centre is the middle of its fingertips; that its position needs more
+  weight in larger hands of fewer fingers is empirical.
+* **Weakness** h = (force_max / F - 0.3) / 0.7, between 0 and 1: 0 for fingertips that can press three times what is
+  required, as human ones can; 1 for those that cannot press that much (Allegro). Weak hands lose what they may hold
+  at a part only, so that they train it more: `p_affordance` = 0.6 + 0.2 h, and against what they then touch
+  `affordance_distance` = 0.15 + 0.05 h, `affordance_force` = 0.30 + 0.10 h.
+
+Everything else is the same for all hands.
+"""
 
 import dataclasses
+import pathlib
 
-from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig
+from congrasp.common.config import CurriculumConfig, NetworkConfig, ObjectsConfig, PPOConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.task.config import ControlConfig, TaskConfig
+from congrasp.common.hands.motors import tip_forces
+from congrasp.common.hands.spec import Hand
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.task.config import ControlConfig, RewardWeights, SensingConfig, TaskConfig
 from congrasp.common.task.constraints import optional
-from congrasp.services.train.recipe import recipe
+from congrasp.common.task.methods import CAMERA, STUDENT, with_method
+
+HARD_FAMILIES = ("cross", "compound", "camera", "hammer")
+"""Families that are hardest to hold by a part, included twice in training."""
+_FORCE, _HEADING, _AFFORDANCE = 5.0, 12.0, 0.6  # of the human hand: N, weight, share of the episodes
+_STRONG = 0.3  # share of its fingertips' strength required of a strong hand
+
+
+@dataclasses.dataclass(frozen=True)
+class Rules:
+    """Settings of the recipe that depend on the hand."""
+
+    force_max: float
+    """f_max of a link, N."""
+    heading_position: float
+    """Weight at the end of the ramp, like the following two."""
+    affordance_distance: float
+    affordance_force: float
+    p_affordance: float
+    """Probability that an episode has an affordance."""
+
+
+def rules(hand: Hand) -> Rules:
+    """Computes the recipe's rules (see the module) for a hand."""
+    squeeze = hand.object_scale**2 * 5 / len(hand.tip_links)
+    force_max = max(round(2 * _FORCE * squeeze), 1) / 2
+    weakness = min(max((force_max / float(tip_forces(hand).mean()) - _STRONG) / (1 - _STRONG), 0.0), 1.0)
+    return Rules(
+        force_max=force_max,
+        heading_position=float(max(round(_HEADING * squeeze), 1)),
+        affordance_distance=round(0.15 + 0.05 * weakness, 2),
+        affordance_force=round(0.3 + 0.1 * weakness, 2),
+        p_affordance=round(_AFFORDANCE + 0.2 * weakness, 2),
+    )
+
+
+def recipe(hand: Hand) -> RunConfig:
+    """Returns the paper's full task for a hand, sized for a GPU."""
+    own = rules(hand)
+    return RunConfig(
+        name=hand.name,
+        environments=32_768,
+        rollout_steps=10,
+        updates=800,
+        task=TaskConfig(
+            hand=hand.reference,
+            p_affordance=own.p_affordance,
+            p_pose=0.35,
+            p_trajectory=0.35,
+            p_fingers=0.2,
+            p_force=0.25,
+            p_together=0.45,  # trajectory and affordance in 15 % of the episodes (Allegro: 17), without it in 8 (9)
+            hold_steps_max=200,
+            surface_normals=True,
+            disturbed_references=0.5,
+            mass_range=(0.6, 2.4),
+            friction_range=(0.6, 1.2),
+            reward=RewardWeights(force_max=own.force_max),
+        ),
+        # Grasps first, then the precision of constraints: with the second weights from the beginning, trajectories are
+        # not learnt.
+        curriculum=CurriculumConfig(
+            ramp=(80, 160),
+            reward=RewardWeights(
+                force=0.8,
+                force_max=own.force_max,
+                force_excess=0.02,
+                object_position=80.0,
+                object_rotation=6.0,
+                drop=5.0,
+                heading_direction=2.5,
+                heading_position=own.heading_position,
+                pose_finger=0.15,
+                pose_link=8.0,
+                pose_wrist_position=150.0,
+                pose_wrist_rotation=3.0,
+                trajectory_position=500.0,
+                trajectory_rotation=18.0,
+                affordance_distance=own.affordance_distance,
+                affordance_force=own.affordance_force,
+            ),
+        ),
+        objects=ObjectsConfig(families=("all", "scans", *HARD_FAMILIES), count=1600, by_failure=True),
+        rollouts_per_update=1,
+        ppo=PPOConfig(gamma=0.99, settling=0.25, least_std=0.35),
+    )
+
 
 FULL = "full"
 """Preset of the full task for the hand of the command line, the human hand by default."""
@@ -77,7 +188,7 @@ def get_preset(name: str, hand: str | None = None) -> RunConfig:
 
     Args:
       name: one of `PRESETS`.
-      hand: the name, file or text of a hand. A full task depends on the hand (`services.train.recipe`); in the others
+      hand: the name, file or text of a hand. A full task depends on the hand (`services.train.presets`); in the others
         only the hand changes.
 
     Raises:
@@ -94,3 +205,70 @@ def with_hand(config: RunConfig, hand: str | None) -> RunConfig:
     """Returns the configuration with another hand, or unchanged; a hand's file is included, for remote actors."""
     found = get_hand(hand or config.task.hand)
     return dataclasses.replace(config, task=dataclasses.replace(config.task, hand=found.reference))
+
+
+TRACKERS = SensingConfig(
+    period=(0.0, 0.1),
+    delay=(0.0, 0.1),
+    position_noise=(0.0, 0.01),
+    rotation_noise=(0.0, 0.105),
+    latency=(0.0, 0.04),
+    dropout=(0.0, 0.3),
+    position_bias=(0.0, 0.005),
+    rotation_bias=(0.0, 0.035),
+    settle=0.04,
+)
+"""From a perfect tracker to one with 10 Hz, 0.1 s latency, errors of 1 cm and 6°, and 30 % lost samples.
+
+All samples of an episode share a further error of up to 5 mm and 2° (standard deviations, like the others). Servos
+follow targets up to 40 ms late."""
+
+
+CAMERAS = SensingConfig(
+    period=(0.1, 0.1),
+    delay=(0.0, 0.1),
+    position_noise=(0.0, 0.004),
+    latency=(0.0, 0.04),
+    dropout=(0.0, 0.5),
+    position_bias=(0.0, 0.005),
+    rotation_bias=(0.0, 0.035),
+    single_image=0.5,
+)
+"""A depth camera on one side: an image before the reach, in half of the episodes another at 10 Hz.
+
+The points' depth has errors of up to 4 mm, half of them may be missing, and the hand-eye calibration is off by up to
+5 mm and 2° (standard deviations), constant in an episode."""
+_SENSING = {STUDENT: TRACKERS, CAMERA: CAMERAS}
+
+
+def student_of(config: RunConfig, teacher: str, method: str = STUDENT) -> RunConfig:
+    """Returns the run that distils a teacher, with a robot's sensors, and random sensors, mass, friction and gains.
+
+    Args:
+      config: numbers, objects and networks.
+      teacher: a policy file, or the hand of a pretrained policy.
+      method: `student`, with a tracker, or `camera`.
+
+    Raises:
+      CongraspError: there is no such policy.
+    """
+    file = named_policy(teacher)
+    task = dataclasses.replace(
+        bundles.load(file).task,
+        sensing=_SENSING[method],
+        mass_range=(0.7, 1.4),
+        friction_range=(0.5, 1.2),
+        gain_range=(0.8, 1.2),
+    )
+    return with_method(
+        dataclasses.replace(
+            config,
+            name=f"{config.name}-{method}",
+            task=task,
+            algorithm="distill",
+            distill=dataclasses.replace(
+                config.distill, teacher=str(file.resolve()) if pathlib.Path(teacher) == file else teacher
+            ),
+        ),
+        method,
+    )

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from congrasp.actors.process.own_references import references_file
+from congrasp.actors.harvest import references_file
 from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.io.journal import AUDIT

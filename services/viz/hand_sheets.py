@@ -1,19 +1,24 @@
-"""Contact sheets of hands: their poses with the grasp frame, and the motion of every joint."""
+"""Contact sheets of hands: poses with the grasp frame, the motion of every joint, and the grips of a self-check."""
 
 import itertools
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.motors import joint_positions, motor_limits, motor_positions, transmission
 from congrasp.common.hands.skin import Skin
 from congrasp.common.hands.spec import Hand, link_origin
 from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
-from congrasp.services.viz.raster import render_scene
+from congrasp.services.viz.raster import render_fitted, render_scene
 from congrasp.services.viz.scene import Shape
-from congrasp.services.viz.shapes import arrow, beads, fit, posed_hand, shape_points, upright
-from congrasp.services.viz.sheets import contact_sheet
+from congrasp.services.viz.shapes import arrow, beads, fit, object_shape, posed_hand, shape_points, upright
+from congrasp.services.viz.sheets import contact_sheet, stacked
+
+if TYPE_CHECKING:
+    from congrasp.services.assets.hands.grips import Grip
 
 _VIEW = np.array([0.75, 0.65, 0.35])
 
@@ -108,3 +113,30 @@ def joints_sheet(hand: Hand, *, size: tuple[int, int] = (220, 220)) -> np.ndarra
     parts = f"{len(hand.joints)} joints, {len(hand.motors)} motors, {len(hand.links)} links"
     title = f"{hand.name}: {parts}, {100 * reach:.0f} cm to the last joint"
     return contact_sheet(images, list(rows), columns=8, title=title)
+
+
+_SIZE = (296, 296)
+_VIEWS = {"": np.array([0.75, 0.65, 0.35]), ", other side": np.array([0.75, -0.65, 0.35])}
+
+
+def check_sheet(hand: Hand, grips: "Sequence[Grip]") -> np.ndarray:
+    """The grips of a hand from two sides, with the links in contact in colour, above its joints (`joints_sheet`)."""
+    images, labels = [], []
+    for grip in grips:
+        shapes = _grip(hand, grip)
+        # A lost object may be far away, so that the camera then fits the hand alone.
+        near = len(shapes) if grip.held else -1
+        for side, view in _VIEWS.items():
+            images.append(render_fitted(shapes[:near], view, _SIZE, shapes[near:]))
+            labels.append(f"{grip.obj.name} {'held' if grip.held else 'lost'}{side}")
+    title = f"{hand.name}: self-check, links in contact in violet"
+    return stacked([contact_sheet(images, labels, columns=len(images), title=title), joints_sheet(hand)])
+
+
+def _grip(hand: Hand, grip: "Grip") -> list[Shape]:
+    """The hand upright, followed by the object."""
+    turn = upright(hand)
+    placed = turn * Rotation.from_quat(grip.object_quaternion, scalar_first=True)
+    mesh = grip.obj.visual_vertices, grip.obj.visual_faces
+    obj = object_shape(mesh, turn.apply(grip.object_position), placed.as_quat(scalar_first=True))
+    return [posed_hand(hand, grip.q, np.zeros(3), turn, WAYPOINT, grip.touching), obj]

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from congrasp.actors.harvest import Grasps, renew
-from congrasp.actors.process.own_references import save_references, with_kept_references
+from congrasp.actors.harvest import Grasps, renew, save_references, with_kept_references
 from congrasp.common import rotations as module
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms

@@ -9,9 +9,9 @@ import pytest
 from congrasp.common.hands import get_hand
 from congrasp.common.objects import procedural
 from congrasp.common.task.config import RewardWeights, TaskConfig
-from congrasp.common.task.sampling import kept as kept_banks
+from congrasp.common.task.sampling import build as kept_banks
 from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
-from congrasp.common.task.sampling.kept import kept_bank
+from congrasp.common.task.sampling.build import kept_bank
 
 HAND = get_hand("human")
 TASK = TaskConfig()

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from congrasp.actors.process import uploads
+from congrasp.actors.process import link as link_module
 from congrasp.actors.process.link import ActorLink, RunFinished, RunRestarted, Ticket
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.keys import Keys, below
@@ -242,7 +242,7 @@ def test_silent_learner_is_given_up(joined):
 
 
 def test_one_line_is_logged_while_a_learner_does_not_answer(joined, monkeypatch, caplog):
-    monkeypatch.setattr(uploads, "_NOTICED", 0.2)
+    monkeypatch.setattr(link_module, "_NOTICED", 0.2)
     learner, link = joined(patience=20.0)
     learner.transport.close()
     outcome = link.upload(rollout(), TICKET)

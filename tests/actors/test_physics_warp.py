@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.actors.physics.catalogue import Catalogue
 from congrasp.actors.physics.engine import ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.physics.scene import compile_scene
+from congrasp.actors.physics.slots import Catalogue
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject, Piece
@@ -272,7 +272,7 @@ def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(st
 
 
 def test_buffers_are_as_full_as_what_mujoco_finds(start):
-    from congrasp.actors.physics import warp_buffers
+    from congrasp.actors.physics.warp import CONSTRAINTS_PER_ENVIRONMENT, CONTACTS_PER_ENVIRONMENT
 
     warp, native = warp_engine(OBJECTS), NativePhysics(HAND, TASK, OBJECTS, 1)
     state, a = warp.start(start), native.start(start)
@@ -283,13 +283,13 @@ def test_buffers_are_as_full_as_what_mujoco_finds(start):
             sum(instance.data.ncon for instance in native.instances),
             max(instance.data.nefc for instance in native.instances),
         ]
-        room = [4 * warp_buffers.CONTACTS_PER_ENVIRONMENT, warp_buffers.CONSTRAINTS_PER_ENVIRONMENT]
+        room = [4 * CONTACTS_PER_ENVIRONMENT, CONSTRAINTS_PER_ENVIRONMENT]
         np.testing.assert_allclose(after.occupancy[:2], np.divide(found, room), rtol=1e-5)
     native.close()
 
 
 def test_what_had_no_room_is_counted(start, monkeypatch):
-    monkeypatch.setattr("congrasp.actors.physics.warp_buffers.CONTACTS_PER_ENVIRONMENT", 2)
+    monkeypatch.setattr("congrasp.actors.physics.warp.CONTACTS_PER_ENVIRONMENT", 2)
     warp = warp_engine(OBJECTS)
     _, crowded = warp.step(warp.start(start), jnp.asarray(grasp(start, 0)), jnp.ones(4, bool))
     assert crowded.occupancy[0] > 1 > crowded.occupancy[1]

@@ -17,7 +17,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import file_name
-from congrasp.common.objects.plain import plain_object
+from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import MAX_MESH_PIECES, GraspObject, Piece
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.objects.decompose import decompose

@@ -9,11 +9,22 @@ from congrasp.common.config import CurriculumConfig, run_config_from_json, to_js
 from congrasp.common.errors import CongraspError
 from congrasp.common.task.config import RewardWeights
 from congrasp.services.train.presets import PRESETS, get_preset
+from tests.conftest import ROOT
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_configurations_survive_the_wire(name):
     assert run_config_from_json(to_json(get_preset(name))) == get_preset(name)
+
+
+@pytest.mark.parametrize("file", sorted(ROOT.glob("checkpoints/*/config.json")), ids=lambda file: file.parent.name)
+def test_runs_of_earlier_versions_keep_their_batch_and_staleness(file):
+    earlier = json.loads(file.read_text())
+    config = run_config_from_json(file.read_text())
+    assert (config.rollouts_per_update, config.max_staleness) == (
+        earlier["ppo"]["rollouts_per_update"],
+        earlier["ppo"]["max_staleness"],
+    )
 
 
 @pytest.mark.parametrize("task", [None, 3, [], "task", {"control": None}, {"control": [1]}])

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
-from congrasp.common.task.sampling.disturbances import (
+from congrasp.common.task.constraints.pose import (
     CLOSURE,
     JITTER,
     JOINTS,

@@ -18,10 +18,10 @@ from congrasp.common.policy.pretrained import policy_file, pretrained_hands
 from congrasp.common.task import metrics
 from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import get_constraint
-from congrasp.common.task.constraints.fingers import FingersGoal, finger_sets, keypoint_weights
+from congrasp.common.task.constraints.fingers import FingersGoal, finger_sets
 from congrasp.common.task.geometry import hand_center
 from congrasp.common.task.observation import fields, layout
-from congrasp.common.task.reward import reward_terms, terms
+from congrasp.common.task.reward import keypoint_weights, reward_terms, terms
 from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.types import Surface
 from tests.scenes import HAND, L, active, evaluated, scene, scene_of

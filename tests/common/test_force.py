@@ -94,7 +94,7 @@ def _uniform(batch, seed):
 def test_draws_are_log_uniform_above_what_the_weight_needs():
     count = 4000
     zero, low = np.zeros(count, int), np.where(np.arange(count) % 2, 1.0, 5.0)
-    limit = np.asarray(FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, low), _uniform(count, 0)).limit)
+    limit = np.asarray(FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, 2 * low / 9.81), _uniform(count, 0)).limit)
     for least in (1.0, 5.0):
         own = limit[low == least]
         assert own.min() >= least * 0.999 and own.max() <= 20.001
@@ -105,9 +105,11 @@ def test_draws_are_log_uniform_above_what_the_weight_needs():
 @settings(max_examples=40, deadline=None)
 @given(st.floats(0.001, 50.0), st.floats(0.2, 2.0), st.integers(0, 1000))
 def test_a_drawn_limit_is_valid_and_enough(mass, friction, seed):
-    low = np.asarray(least_force(np.full(3, mass), np.full(3, friction)))
-    zero = np.zeros(3, int)
-    own = FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, low), _uniform(3, seed))
+    weight, zero = (np.full(3, mass), np.full(3, friction)), np.zeros(3, int)
+    low, own = (
+        np.asarray(least_force(*weight)),
+        FORCE.sample(HAND, Draw(None, zero, zero, zero, {}, *weight), _uniform(3, seed)),
+    )
     assert np.asarray(FORCE.valid(Surface(np.zeros((3, 1, 3)), np.zeros((3, 1), bool)), own)).all()
     assert (np.asarray(own.limit) >= low * 0.999).all() and (np.asarray(own.limit) <= 20.001).all()
 

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from congrasp.common.errors import TooWideError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.closure import CLOSURES
+from congrasp.common.hands.closure import CENTER, CLOSURES, Outline, depth_below, outline
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
-from congrasp.common.hands.outline import CENTER, Outline, depth_below, outline
 from congrasp.common.objects.procedural import FAMILIES, GROUPS, generate, generate_many
 from congrasp.common.task.sampling.headings import (
     INWARD,

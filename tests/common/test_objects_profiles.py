@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common.objects import shapes
-from congrasp.common.objects.families.profiles import extrude, lathe, shell, slab, smooth, sweep, vessel
+from congrasp.common.objects.families.draft import extrude, lathe, shell, slab, smooth, sweep, vessel
 from congrasp.common.objects.spec import MAX_MESH_VERTICES
 
 

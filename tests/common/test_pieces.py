@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common.errors import TransportError
-from congrasp.common.transport import pieces
+from congrasp.common.transport import zenoh_transport
 from congrasp.common.transport.keys import account
-from congrasp.common.transport.pieces import Outbox, Pace, fetch, is_request
+from congrasp.common.transport.zenoh_transport import Outbox, Pace, fetch, is_request
 
 
 def _first(outbox, payload, wish=b"", account="a"):
@@ -43,7 +43,7 @@ def test_a_reply_is_whole_again(size, lost, no_pauses):
 def no_pauses():
     """No pauses after lost pieces."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pieces, "_PAUSE", 0.0)
+        patch.setattr(zenoh_transport, "_PAUSE", 0.0)
         yield patch
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.measures import tip_forces
+from congrasp.common.hands.motors import tip_forces
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import privileged
 from congrasp.common.task.config import SensingConfig, TaskConfig

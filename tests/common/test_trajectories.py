@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.task.sampling.approach_paths import AMPLITUDE, CONE, DISTANCE, ROTATION, make_trajectories
+from congrasp.common.task.sampling.build import AMPLITUDE, CONE, DISTANCE, ROTATION, make_trajectories
 from tests.scenes import quaternions
 
 HAND = get_hand("human")

@@ -35,9 +35,8 @@ from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.grasp.wrist_paths import read_bvh, read_wrist_path
-from congrasp.services.record.entries import Converter
 from congrasp.services.record.reader import read_episodes, read_metrics
-from congrasp.services.record.recorder import Recorder
+from congrasp.services.record.recorder import Converter, Recorder
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.serve.requests import Layout
 from congrasp.services.serve.server import PolicyServer

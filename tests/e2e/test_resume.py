@@ -24,7 +24,7 @@ from tests.learner.test_process import CONFIG
 UPDATES, EVERY, KILLED_AFTER = 8, 3, 5
 # The stream is fixed by `feed` alone: what a write-ahead log takes up would be used in another order.
 RUN = dataclasses.replace(CONFIG, updates=UPDATES, checkpoint_every=EVERY, write_ahead=False)
-STEPS, WORLDS, BATCH = RUN.rollout_steps, RUN.environments, RUN.ppo.rollouts_per_update
+STEPS, WORLDS, BATCH = RUN.rollout_steps, RUN.environments, RUN.rollouts_per_update
 
 
 def rollout(number, bundle):

@@ -30,7 +30,9 @@ CONFIG = RunConfig(
     half_observations=False,
     network=toy.SPEC.network,
     algorithm="a2c",
-    ppo=PPOConfig(rollouts_per_update=1, max_staleness=0, gamma=0.9),
+    rollouts_per_update=1,
+    max_staleness=0,
+    ppo=PPOConfig(gamma=0.9),
 )
 
 

@@ -16,7 +16,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.teaching import extra, student_action
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate, random_policy
-from congrasp.services.train.student import TRACKERS
+from congrasp.services.train.presets import TRACKERS
 
 NETWORK = NetworkConfig(hidden=(32,), encoder=4)
 TASK = TaskConfig(hand="allegro", constraints=("heading",), surface_points=64)

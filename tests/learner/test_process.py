@@ -88,7 +88,7 @@ def test_a_run_from_beginning_to_end(tmp_path, hub, act):
     assert [meta["version"] for meta in kinds["version"]] == [0, 1, 2, 3]
     values = kinds["metrics"][-1]["values"]
     assert values["episode/success"] == 0.75 and values["episodes"] == 8
-    assert 0 <= values["staleness_mean"] <= values["staleness_max"] <= CONFIG.ppo.max_staleness
+    assert 0 <= values["staleness_mean"] <= values["staleness_max"] <= CONFIG.max_staleness
     assert all(np.isfinite(value) for value in values.values())
     assert any("complete after 3 updates" in meta["text"] for meta in kinds["event"])
 

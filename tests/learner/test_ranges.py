@@ -12,8 +12,7 @@ from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.metrics import episode_fields
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.schema import RECORDED
-from congrasp.learner.hub.admission import Admission
-from congrasp.learner.hub.ranges import task_ranges
+from congrasp.learner.hub.admission import Admission, task_ranges
 from tests import task as suite
 
 TASK = TaskConfig(constraints=PAPER, surface_points=32, trajectory_points=4, approach_steps=50, hold_steps_max=40)

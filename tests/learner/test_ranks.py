@@ -18,8 +18,7 @@ import pytest
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
 from congrasp.learner.distributed import ranks as ranks_module
-from congrasp.learner.distributed.ranks import Ranks, ended_by
-from congrasp.learner.distributed.relay import relay
+from congrasp.learner.distributed.ranks import Ranks, ended_by, relay
 from congrasp.learner.run_directory import create_run
 from tests.conftest import ROOT
 from tests.learner.rank_process import CONFIG
@@ -255,7 +254,7 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     assert kept >= 5  # the first update after a resume has a checkpoint of its own
     job.start(kept + 3, "resume")
     first, second = job.finish()
-    steps = 2 * CONFIG.ppo.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
+    steps = 2 * CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
     (said,), (other,) = (
         [line.split()[1:] for line in text.splitlines() if "bundle" in line] for text in (first, second)
     )

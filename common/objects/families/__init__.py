@@ -5,12 +5,12 @@ A family is a function of a random generator that returns a `Draft`, listed in t
 rejected.
 """
 
-from congrasp.common.objects.families import basic, flat, scans, solids, tools, vessels
+from congrasp.common.objects.families import basic, scans, solids, tools, vessels
 from congrasp.common.objects.families.draft import Builder, Draft
 
 BASIC: dict[str, Builder] = basic.BUILDERS
 """Simple objects; the default of a run that names no families."""
-HOUSEHOLD: dict[str, Builder] = {**vessels.BUILDERS, **tools.BUILDERS, **flat.BUILDERS, **solids.BUILDERS}
+HOUSEHOLD: dict[str, Builder] = {**vessels.BUILDERS, **tools.BUILDERS, **solids.BUILDERS}
 """Objects with realistic shapes and sizes, most of them of convex mesh pieces."""
 SCANS: dict[str, Builder] = scans.BUILDERS
 """Shapes found in scans that other families lack."""

@@ -1,11 +1,18 @@
-"""Draft of an object, returned by families of the procedural generator, and its primitive pieces."""
+"""Draft of an object, returned by families of the procedural generator, and its pieces.
 
-from collections.abc import Callable
+Mesh pieces of lathed, hollow, extruded and swept shapes are convex and gapless by construction: neighbours share the
+face between them, so that their union has no cracks, and volumes add up.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
-from congrasp.common.objects.spec import Piece
+from congrasp.common.objects.spec import MAX_MESH_VERTICES, Piece
 
 Rng = np.random.Generator
 Vector = tuple[float, float, float]
@@ -84,3 +91,216 @@ def _between(start: Vector, end: Vector) -> tuple[Vector, tuple[float, float, fl
     q = np.array([1 + z, -y, x, 0.0]) if z > -1 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
     q /= np.linalg.norm(q)
     return tuple((a + b) / 2), tuple(q), float(np.linalg.norm(b - a)) / 2
+
+
+_SIDES = 16
+_FLAT = 3e-4  # tolerance of a profile below the chord that replaces it, m
+_STATIONS = 3  # outer corners of a wall's segment around the axis
+
+
+def hull(*parts: Sequence[Sequence[float]] | np.ndarray, part: int = 0) -> Piece:
+    """A mesh piece from the corners of the convex hull of points (V, 3), given in any number of arrays."""
+    points = np.concatenate([np.asarray(points, float) for points in parts])
+    return mesh(points[np.sort(ConvexHull(points).vertices)], part)
+
+
+def lathe(
+    profile: Sequence[tuple[float, float]], *, part: int = 0, squash: float = 1.0, sides: int = _SIDES
+) -> list[Piece]:
+    """A solid of revolution around z, with one piece for each stretch of the profile that is convex.
+
+    Args:
+      profile: (height, radius) in ascending order of heights, m; straight between.
+      part: part of the pieces.
+      squash: factor on y: below 1 the cross-section is an ellipse.
+      sides: number of corners of a cross-section.
+    """
+    most = MAX_MESH_VERTICES // sides
+    pieces, first = [], 0
+    while first < len(profile) - 1:
+        last = first + 1
+        while last + 1 < len(profile) and last + 1 - first < most and _bulges(profile[first : last + 2]):
+            last += 1
+        rings = [ring(radius, z, sides, squash) for z, radius in profile[first : last + 1]]
+        pieces.append(hull(*rings, part=part))
+        first = last
+    return pieces
+
+
+def shell(
+    profile: Sequence[tuple[float, float, float]], sides: int, *, part: int = 0, squash: float = 1.0
+) -> list[Piece]:
+    """A wall of revolution around z: `sides` pieces for each step of the profile.
+
+    Args:
+      profile: (height, outer radius, inner radius) in ascending order of heights, m; straight between.
+      sides: pieces around the axis; the outside of each has two facets, the inside one.
+      part: part of the pieces.
+      squash: factor on y.
+    """
+    turns = 2 * np.pi / sides * np.arange(sides + 1)
+    pieces = []
+    for pair in itertools.pairwise(profile):
+        for start, end in itertools.pairwise(turns):
+            outside = np.linspace(start, end, _STATIONS)
+            corners = [_around(radius, turn, z, squash) for z, radius, _ in pair for turn in outside]
+            corners += [_around(radius, turn, z, squash) for z, _, radius in pair for turn in (start, end)]
+            pieces.append(hull(corners, part=part))
+    return pieces
+
+
+def vessel(
+    profile: Sequence[tuple[float, float]], wall: float, sides: int, *, part: int = 0, squash: float = 1.0
+) -> list[Piece]:
+    """An open vessel: a floor, and a wall of the same thickness.
+
+    Args:
+      profile: (height, outer radius) in ascending order of heights from 0, m; the first step holds the floor.
+      wall: thickness, m.
+      sides: pieces around the axis.
+      part: part of the pieces.
+      squash: factor on y.
+    """
+    heights, radii = np.array(profile).T
+    corners = (_STATIONS - 1) * sides
+    inside = np.interp(wall, heights, radii)
+    floor = hull(ring(radii[0], heights[0], corners, squash), ring(inside, wall, corners, squash), part=part)
+    rest = [(wall, inside), *((z, radius) for z, radius in profile if z > wall)]
+    return [floor, *shell([(z, r, r - wall) for z, r in rest], sides, part=part, squash=squash)]
+
+
+def extrude(outline: np.ndarray, low: float, high: float, *, taper: float = 1.0, part: int = 0) -> list[Piece]:
+    """A prism over a star-shaped outline, with one piece for each convex sector.
+
+    Args:
+      outline: (V, 2) corners, counterclockwise around the origin, from which all of the border is visible, m.
+      low: height of the bottom, m.
+      high: height of the top, m.
+      taper: factor on the outline at the top.
+      part: part of the pieces.
+    """
+    most = MAX_MESH_VERTICES // 2 - 1
+    count = len(outline)
+    convex = _turns_left(np.roll(outline, 1, 0), outline, np.roll(outline, -1, 0))
+    if convex.all() and count <= most:
+        return [_prism(outline, low, high, taper, part)]
+    # Sectors begin at a reflex corner if there is one.
+    outline, convex = (np.roll(values, -int(convex.argmin()), 0) for values in (outline, convex))
+    closed, first, pieces = np.concatenate([outline, outline[:1]]), 0, []
+    while first < count:
+        last = first + 1
+        while last < count and last - first < most - 2 and convex[last] and _sector(closed[first : last + 2]):
+            last += 1
+        pieces.append(_prism(np.concatenate([np.zeros((1, 2)), closed[first : last + 1]]), low, high, taper, part))
+        first = last
+    return pieces
+
+
+def sweep(
+    path: np.ndarray,
+    normal: Sequence[float] | np.ndarray,
+    width: float | np.ndarray,
+    thickness: float | np.ndarray,
+    *,
+    rounded: bool = False,
+    closed: bool = False,
+    part: int = 0,
+) -> list[Piece]:
+    """A bar along a path in a plane, with one piece for each of its segments.
+
+    Args:
+      path: (n, 3) centres of cross-sections, m; bends are below a right angle.
+      normal: (3,) unit normal of the plane.
+      width: across the path in its plane, m; one, or (n,).
+      thickness: along the normal, m; one, or (n,).
+      rounded: True for octagonal cross-sections, False for rectangular ones.
+      closed: joins the last centre to the first.
+      part: part of the pieces.
+    """
+    count, up = len(path), np.array(normal, float)
+    ways = np.roll(path, -1, 0) - path
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    if closed:
+        before = np.roll(ways, 1, 0)
+    else:
+        ways[-1] = ways[-2]
+        before = np.concatenate([ways[:1], ways[:-1]])
+    side = np.cross(up, before + ways)
+    side /= np.linalg.norm(side, axis=-1, keepdims=True)
+    side /= (side * np.cross(up, ways)).sum(-1, keepdims=True)  # a mitre is longer than the bar's width
+    turns = np.pi / 4 * np.arange(8) + np.pi / 8 if rounded else np.pi / 2 * np.arange(4) + np.pi / 4
+    corners = np.stack([np.cos(turns), np.sin(turns)], -1) / np.cos(turns[0])
+    across = np.broadcast_to(width, count)[:, None] / 2 * side
+    along = np.broadcast_to(thickness, count)[:, None] / 2 * up
+    sections = path[:, None] + corners[:, :1] * across[:, None] + corners[:, 1:] * along[:, None]
+    pairs = list(itertools.pairwise(sections)) + ([(sections[-1], sections[0])] if closed else [])
+    return [hull(*pair, part=part) for pair in pairs]
+
+
+def slab(half: Sequence[float], corner: float, center: Sequence[float] = (0, 0, 0), *, part: int = 0) -> Piece:
+    """A plate of half extents (3,) along z whose upright edges are rounded with a radius, m."""
+    x, y, z = half
+    turns = np.linspace(0, np.pi / 2, 4)
+    arc = corner * np.stack([np.cos(turns), np.sin(turns)], -1)
+    quarters = [
+        (arc + np.array([x - corner, y - corner])) * [sx, sy] for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    ]
+    return _prism(np.concatenate(quarters) + np.array(center[:2]), center[2] - z, center[2] + z, 1.0, part)
+
+
+def moved(piece: Piece, shift: Sequence[float]) -> Piece:
+    """Returns the piece translated by (3,) metres."""
+    x, y, z = np.add(piece.pos, shift)
+    return dataclasses.replace(piece, pos=(x, y, z))
+
+
+def ring(radius: float, z: float, sides: int = _SIDES, squash: float = 1.0) -> np.ndarray:
+    """Corners (sides, 3) of a polygon around z."""
+    return np.array([_around(radius, turn, z, squash) for turn in 2 * np.pi / sides * np.arange(sides)])
+
+
+def arc(start: float, end: float, count: int, radii: tuple[float, float], center: Sequence[float]) -> np.ndarray:
+    """Points (count, 3) on an ellipse in the x-z plane between two angles, rad, with radii along x and z."""
+    turns = np.linspace(start, end, count)
+    return np.array(center) + np.stack([radii[0] * np.cos(turns), 0 * turns, radii[1] * np.sin(turns)], -1)
+
+
+def smooth(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
+    """Values (count,) of a random smooth curve that reaches both bounds."""
+    at = np.linspace(0, 1, count)[:, None]
+    waves = rng.normal(size=3) / np.array([1.0, 1.5, 2.5])
+    values = (waves * np.cos(np.pi * np.array([1, 2, 3]) * at + rng.uniform(0, 2 * np.pi, 3))).sum(-1)
+    return low + (high - low) * (values - values.min()) / np.ptp(values)
+
+
+def _around(radius: float, turn: float, z: float, squash: float) -> tuple[float, float, float]:
+    """A point by cylindrical coordinates, squashed along y."""
+    return radius * np.cos(turn), squash * radius * np.sin(turn), z
+
+
+def _bulges(profile: Sequence[tuple[float, float]]) -> bool:
+    """True if a profile of (height, radius) is convex: nowhere below the chords between its points."""
+    z, radius = np.array(profile).T
+    return all(
+        radius[j] > np.interp(z[j], z[[i, k]], radius[[i, k]]) - _FLAT
+        for i, j, k in itertools.combinations(range(len(z)), 3)
+    )
+
+
+def _turns_left(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(...,) bool: True where the path over points (..., 2) turns left or is straight."""
+    first, second = b - a, c - b
+    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0] > -1e-12
+
+
+def _sector(corners: np.ndarray) -> bool:
+    """True if the origin and corners (n, 2) around it make a convex polygon."""
+    loop = np.concatenate([np.zeros((1, 2)), corners])
+    return bool(_turns_left(np.roll(loop, 1, 0), loop, np.roll(loop, -1, 0)).all())
+
+
+def _prism(outline: np.ndarray, low: float, high: float, taper: float, part: int) -> Piece:
+    """The hull of an outline (V, 2) at the bottom and, scaled about the origin, at the top."""
+    return hull(
+        *(np.column_stack([s * outline, np.full(len(outline), z)]) for s, z in ((1, low), (taper, high))), part=part
+    )

@@ -5,8 +5,7 @@ import functools
 import numpy as np
 
 from congrasp.common.objects.families import draft
-from congrasp.common.objects.families.draft import Builder, Draft, Rng
-from congrasp.common.objects.families.profiles import arc, hull, lathe, moved, slab, sweep, vessel
+from congrasp.common.objects.families.draft import Builder, Draft, Rng, arc, hull, lathe, moved, slab, sweep, vessel
 from congrasp.common.objects.spec import Piece
 
 BUILDERS: dict[str, Builder] = {}

@@ -6,8 +6,19 @@ import itertools
 import numpy as np
 
 from congrasp.common.objects.families import draft
-from congrasp.common.objects.families.draft import Builder, Draft, Rng
-from congrasp.common.objects.families.profiles import arc, hull, lathe, moved, shell, smooth, sweep, vessel
+from congrasp.common.objects.families.draft import (
+    Builder,
+    Draft,
+    Rng,
+    arc,
+    hull,
+    lathe,
+    moved,
+    shell,
+    smooth,
+    sweep,
+    vessel,
+)
 from congrasp.common.objects.spec import Piece
 
 BUILDERS: dict[str, Builder] = {}

@@ -1,7 +1,8 @@
 """The constraints, weakest first; layouts, masks, tables and the priority rules use this order."""
 
+import functools
+import operator
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,10 +16,8 @@ from congrasp.common.task.constraints.force import Force
 from congrasp.common.task.constraints.heading import Heading
 from congrasp.common.task.constraints.pose import Pose
 from congrasp.common.task.constraints.trajectory import Trajectory
-from congrasp.common.task.types import Goal
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.types import Array, Goal
 
 CONSTRAINTS: tuple[Constraint, ...] = (Heading(), Affordance(), Pose(), Trajectory(), Fingers(), Force())
 PAPER = ("heading", "affordance", "pose", "trajectory")
@@ -39,7 +38,7 @@ def get_constraint(name: str) -> Constraint:
     raise unknown_constraint(name, [constraint.name for constraint in CONSTRAINTS])
 
 
-def known(task: "TaskConfig") -> tuple[Constraint, ...]:
+def known(task: TaskSettings) -> tuple[Constraint, ...]:
     """Returns the constraints supported by the task's policy, weakest first.
 
     Raises:
@@ -52,14 +51,20 @@ def known(task: "TaskConfig") -> tuple[Constraint, ...]:
     return tuple(constraint for constraint in CONSTRAINTS if constraint.name in task.constraints)
 
 
-def optional(task: "TaskConfig") -> tuple[Constraint, ...]:
+def optional(task: TaskSettings) -> tuple[Constraint, ...]:
     """Supported constraints that may be inactive in an episode."""
     return tuple(constraint for constraint in known(task) if constraint.optional)
 
 
-def blocks(task: "TaskConfig") -> tuple[str, ...]:
+def blocks(task: TaskSettings) -> tuple[str, ...]:
     """Names of the gated blocks of the observation, in order; each is a bit of the mask."""
     return tuple(block for constraint in known(task) for block in constraint.blocks)
+
+
+def center_fingers(task: TaskSettings, goal: Goal) -> Array | None:
+    """(B, G) bool: fingers that define the hand centre and the distance reward; None if no constraint selects them."""
+    chosen = [fingers for c in known(task) if (fingers := c.center_fingers(goal)) is not None]
+    return functools.reduce(operator.and_, chosen) if chosen else None
 
 
 def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
@@ -67,7 +72,7 @@ def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
     return tuple(error for constraint in constraints for error in constraint.errors)
 
 
-def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
+def goal_of(hand: Hand, task: TaskSettings, request: GraspRequest) -> Goal:
     """Goal arrays of a request, without batch axis, before the priority rules; neutral where the request has none."""
     values = {}
     for constraint in known(task):
@@ -79,7 +84,7 @@ def goal_of(hand: Hand, task: "TaskConfig", request: GraspRequest) -> Goal:
     return Goal(values, {})
 
 
-def require_known(names: Iterable[str], task: "TaskConfig") -> None:
+def require_known(names: Iterable[str], task: TaskSettings) -> None:
     """Raises an `UnknownConstraintError` if a requested constraint is not supported by the task's policy."""
     for name in names:
         get_constraint(name)
@@ -96,6 +101,7 @@ __all__ = [
     "PAPER",
     "Constraint",
     "blocks",
+    "center_fingers",
     "error_specs",
     "get_constraint",
     "goal_of",

@@ -1,7 +1,7 @@
 """Affordance: the region of the object that may be grasped (O+ in the paper), and the one to avoid (O-)."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,13 +23,10 @@ from congrasp.common.task.constraints.base import (
 from congrasp.common.task.constraints.heading import HeadingGoal
 from congrasp.common.task.constraints.markers import Marker, Paint
 from congrasp.common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, squash
+from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.sampling.headings import INWARD, MAX_WIDTH
-from congrasp.common.task.types import Array, Goal, Surface
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.features import Contacts, Features
-    from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.types import Array, Contacts, Features, Goal, Surface
 
 REACH = 0.15
 """Length of the approach before the heading position that is checked against the avoid region, m."""
@@ -95,7 +92,7 @@ class Affordance(Constraint):
     needs = ("surface_avoid",)
     invalid = ("An affordance needs surface points on both sides.", "Set some of 'surface_avoid'.")
 
-    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Nearest-point vectors and forces."""
         vectors, forces = 3 * len(hand.keypoints), 3 * len(hand.links)
         block = (
@@ -106,11 +103,11 @@ class Affordance(Constraint):
         )
         return (block,)
 
-    def available(self, draw: "Draw") -> Array:
+    def available(self, draw: Draw) -> Array:
         """True where the object has both regions, and its graspable one can be approached in the resting pose."""
         return draw.bank.has_affordance[draw.objects, draw.rests]
 
-    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> AffordanceGoal:
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> AffordanceGoal:
         """Regions of the object."""
         return AffordanceGoal()
 
@@ -123,7 +120,7 @@ class Affordance(Constraint):
         turned = asked["affordance"] & _contradicts_heading(_apart_from_heading(hand, surface, goal))
         return goal.where(turned, "heading", **redirected(hand, surface, goal["heading"])._asdict())
 
-    def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> AffordanceFeatures:
+    def features(self, hand: Hand, contacts: Contacts, features: Features, goal: Goal) -> AffordanceFeatures:
         """Distances, contacts and forces by region; the label of a contact is that of the nearest surface point."""
         surface = contacts.surface
         index = nearest_index(jnp.where(surface.avoid[..., None], contacts.squared, jnp.inf))
@@ -144,6 +141,11 @@ class Affordance(Constraint):
         """Nearest-point vectors to the avoid region, and squashed forces from it."""
         own = scene.features.of["affordance"]
         return ([flat(own.nearest), flat(squash(own.force))],)
+
+    def cloud_labels(self, scene: Scene) -> Array | None:
+        """One for points of the avoid region, while it is active."""
+        assert scene.cloud is not None, "a camera observation needs a cloud"
+        return scene.cloud.avoid * scene.gate("affordance")[:, None]
 
     def earning(self, scene: Scene, touching: Array, force: Array) -> tuple[Array, Array]:
         """Contacts on the graspable region only: pressing on the avoid region earns nothing."""

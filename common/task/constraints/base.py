@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_type_hints
+from typing import Any, ClassVar, Literal, NamedTuple, get_type_hints
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,13 +17,10 @@ from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.markers import Marker
-from congrasp.common.task.types import Array, Goal, SceneState, Surface
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.features import Contacts, Features
-    from congrasp.common.task.sampling.bank import ConstraintBank, Draw
-    from congrasp.common.task.sensing import Readings
+from congrasp.common.task.sampling.bank import ConstraintBank, Draw
+from congrasp.common.task.sensing import Readings
+from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.types import Array, Contacts, Features, Goal, SceneState, Surface
 
 Window = Literal["approach", "hold"]
 """Steps over which an error is averaged: before the table's removal, or in the `hold_steps` after it."""
@@ -106,9 +103,9 @@ class Scene(NamedTuple):
     """One control step, as input of a constraint's terms."""
 
     hand: Hand
-    task: "TaskConfig"
+    task: TaskSettings
     state: SceneState
-    features: "Features"
+    features: Features
     goal: Goal
     readings: "Readings | None" = None
     """Last control steps, if the policy observes them."""
@@ -182,7 +179,7 @@ class Constraint:
     invalid: ClassVar[tuple[str, str]] = ("", "")
     """Fault of arrays that are not `valid`, and the remedy."""
 
-    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields of each of its blocks of the observation, in order."""
         return ()
 
@@ -194,32 +191,42 @@ class Constraint:
 
     # Sampling and the start of an episode.
 
-    def columns(self, hand: Hand, bank: "ConstraintBank") -> Any:
+    def columns(self, hand: Hand, bank: ConstraintBank) -> Any:
         """Pytree of arrays (N, ...) that `sample` needs of each object (`Draw.own`), computed once; None for nothing.
 
         Headings, reference poses and trajectories, which constraints share, belong to the bank.
         """
         return None
 
-    def available(self, draw: "Draw") -> Array:
+    def joined(self, task: TaskSettings, active: Mapping[str, Array], uniform: Array) -> Array | None:
+        """(B,) bool: training episodes that request it because of others; None for none.
+
+        Args:
+          task: the task.
+          active: (B,) bool by block, active blocks of the constraints requested so far.
+          uniform: (B,) random numbers in [0, 1).
+        """
+        return None
+
+    def available(self, draw: Draw) -> Array:
         """(B,) bool: the drawn objects allow it, in their resting poses and regions.
 
         The default is True where a reference allows it if it is drawn from references, and True everywhere otherwise.
         """
         return jnp.any(self.allowed(draw), -1) if self.from_reference else jnp.ones(draw.objects.shape, bool)
 
-    def allowed(self, draw: "Draw") -> Array:
+    def allowed(self, draw: Draw) -> Array:
         """(B, M) bool: references of the drawn objects from which it may be drawn; by default those clear of the table.
 
         `draw` has no `reference` at this point.
         """
         return draw.allowed
 
-    def numbers(self, hand: Hand, task: "TaskConfig") -> int:
+    def numbers(self, hand: Hand, task: TaskSettings) -> int:
         """Number U of random numbers that `sample` uses for an episode."""
         return 1
 
-    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> Any:
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> Any:
         """Samples its goal arrays for the drawn episodes, whether or not they request it.
 
         Args:
@@ -248,7 +255,7 @@ class Constraint:
         """
         return None
 
-    def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
+    def suggested(self, hand: Hand, task: TaskSettings) -> dict[str, np.ndarray]:
         """Initial goal arrays by field, when a user switches it on."""
         return self.neutral(hand, task)._asdict()
 
@@ -258,9 +265,13 @@ class Constraint:
 
     # One control step.
 
-    def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> Any:
+    def features(self, hand: Hand, contacts: Contacts, features: Features, goal: Goal) -> Any:
         """Geometry specific to the constraint that observation, reward and errors share, as a pytree."""
         return ()
+
+    def center_fingers(self, goal: Goal) -> Array | None:
+        """(B, G) bool: fingers that define the hand centre and the distance reward; None for all."""
+        return None
 
     def guidance(self, scene: Scene, *, current: bool) -> tuple[Array, Array]:
         """World wrist pose (B, 3), (B, 4) to which it guides, relative to the object's current or initial pose."""
@@ -269,6 +280,10 @@ class Constraint:
     def observe(self, scene: Scene) -> tuple[Sequence[Array], ...]:
         """Values (B, ...) of the `fields` of each block; they are concatenated, then gated."""
         return ()
+
+    def cloud_labels(self, scene: Scene) -> Array | None:
+        """(B, N) labels of the points of a camera's cloud in the observation; None if it labels none."""
+        return None
 
     def forbidden(self, scene: Scene) -> Array | None:
         """(B, L) bool: links that must not touch the object, whether or not it is active; None for no restriction."""
@@ -375,7 +390,7 @@ class Constraint:
         hints = get_type_hints(self.goal, include_extras=True)
         return {name: hints[name].__metadata__[0] for name in self.goal._fields}  # type: ignore[attr-defined]
 
-    def neutral(self, hand: Hand, task: "TaskConfig") -> Any:
+    def neutral(self, hand: Hand, task: TaskSettings) -> Any:
         """Goal arrays, without batch axis, of an episode that does not request it."""
         symbols = symbol_sizes(hand, task)
         made = {}
@@ -397,7 +412,7 @@ class Constraint:
         return functools.reduce(operator.or_, (blocks[block] for block in self.blocks))
 
 
-def symbol_sizes(hand: Hand, task: "TaskConfig") -> dict[str, int]:
+def symbol_sizes(hand: Hand, task: TaskSettings) -> dict[str, int]:
     """Sizes of the symbols in goal arrays: F finger joints, G fingers, K waypoints."""
     return {"F": len(hand.joints), "G": len(hand.fingers), "K": task.trajectory_points}
 

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,9 @@ from congrasp.common.task.constraints.base import (
     Weight,
 )
 from congrasp.common.task.geometry import flat, share, squash
+from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal, Surface
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.sampling.bank import Draw
 
 MARGIN, SHARPNESS = 0.01, 0.003
 """Distance that the skin of the other fingers should keep from the object, and sharpness of the barrier, m."""
@@ -63,7 +61,7 @@ class Fingers(Constraint):
     )
     invalid = (_NEEDED, "Allow both.")
 
-    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for the set, the clearance of each other finger, and the forces on their links."""
         fingers, links = len(hand.fingers), len(hand.links)
         block = (
@@ -73,12 +71,12 @@ class Fingers(Constraint):
         )
         return (block,)
 
-    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> FingersGoal:
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> FingersGoal:
         """Samples any set with the thumb; pinch, tripod and all fingers are more likely than others."""
         sets, shares = finger_sets(hand)
         return FingersGoal(jnp.array(sets)[chance.weighted(uniform[:, 0], shares)])
 
-    def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
+    def suggested(self, hand: Hand, task: TaskSettings) -> dict[str, np.ndarray]:
         """A pinch."""
         return {"allowed": np.arange(len(hand.fingers)) < 2}
 
@@ -87,6 +85,10 @@ class Fingers(Constraint):
         allowed, other = scene.goal["fingers"].allowed, self.forbidden(scene)
         room = jnp.where(allowed, 0.0, jnp.minimum(_room(scene), 0.1))
         return ([allowed.astype(jnp.float32), room, flat(squash(scene.features.force * other[..., None]))],)
+
+    def center_fingers(self, goal: Goal) -> Array | None:
+        """The allowed fingers, where it is active."""
+        return chosen_fingers(goal.values, goal)
 
     def forbidden(self, scene: Scene) -> Array:
         """Links of fingers outside the set; their contacts earn nothing."""
@@ -150,19 +152,6 @@ def chosen_fingers(known: Collection[str], goal: Goal) -> Array | None:
     if "fingers" not in known:
         return None
     return goal["fingers"].allowed | ~goal.active["fingers"][:, None]
-
-
-def keypoint_weights(hand: Hand, chosen: Array | None) -> Array:
-    """Weights (P,) or (B, P) of the keypoints in the distance reward, for fingers of `chosen_fingers`.
-
-    Keypoints of other fingers get no weight; those of the set and the palm share it.
-    """
-    weights = jnp.array(hand.keypoint_weights)
-    if chosen is None:
-        return weights
-    owner = hand.link_fingers[hand.keypoint_links]
-    kept = jnp.where((owner < 0) | chosen[:, owner], weights, 0.0)
-    return kept * (jnp.sum(weights) / jnp.sum(kept, -1, keepdims=True))
 
 
 def _room(scene: Scene) -> Array:

@@ -1,7 +1,7 @@
 """Upper limit of the force with which a link may press on the object (ours)."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +19,9 @@ from congrasp.common.task.constraints.base import (
     Weight,
 )
 from congrasp.common.task.geometry import FORCE_SCALE
+from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Surface
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.sampling.bank import Draw
 
 LEAST, MOST = 1.0, 20.0
 """Limits drawn in training, N, as far as the object's weight allows."""
@@ -52,7 +50,7 @@ class Force(Constraint):
     )
     invalid = (f"The constraint 'force' takes a limit between {_LOWEST:g} and {_HIGHEST:g} N.", "Set 'force_limit'.")
 
-    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for the limit and each link's excess."""
         return (
             (
@@ -61,12 +59,12 @@ class Force(Constraint):
             ),
         )
 
-    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> ForceGoal:
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> ForceGoal:
         """Samples log-uniformly between the least limit for the episode's object and 20 N."""
-        low = jnp.log(jnp.minimum(draw.least_force, MOST))
+        low = jnp.log(least_force(draw.mass, draw.friction))
         return ForceGoal(jnp.exp(low + uniform[:, 0] * (jnp.log(MOST) - low)))
 
-    def suggested(self, hand: Hand, task: "TaskConfig") -> dict[str, np.ndarray]:
+    def suggested(self, hand: Hand, task: TaskSettings) -> dict[str, np.ndarray]:
         """A limit of 5 N."""
         return {"limit": np.array(_SUGGESTED, np.float32)}
 

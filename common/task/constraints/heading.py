@@ -1,7 +1,7 @@
 """Heading: approach direction of the hand and target of its centre. The default, which is always active."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,12 +23,9 @@ from congrasp.common.task.constraints.base import (
 from congrasp.common.task.constraints.fingers import chosen_fingers
 from congrasp.common.task.constraints.markers import Arrow, Marker
 from congrasp.common.task.geometry import flat, hand_center, in_world
-from congrasp.common.task.types import Array, Goal
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.features import Contacts, Features
-    from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.types import Array, Contacts, Features, Goal
 
 ABOVE = "above"
 """Literal for the heading straight down, in any pose of the object."""
@@ -91,7 +88,7 @@ class Heading(Constraint):
         ),
     )
 
-    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for hand centre, target, residual, direction and object rotation."""
         block = (
             ObservationField("center", 3, "m, midpoint of the thumb's tip and the mean of the other tips, wrist frame"),
@@ -102,7 +99,7 @@ class Heading(Constraint):
         )
         return (block,)
 
-    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> HeadingGoal:
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> HeadingGoal:
         """Samples one of the object's headings for its resting pose and region, moved back clear of the table."""
         bank, where = draw.bank, (draw.objects, draw.region)
         slot = chance.index(uniform[:, 0], bank.heading_index.shape[-1])
@@ -119,7 +116,7 @@ class Heading(Constraint):
         position = position - back_off[:, None] * goal["heading"].direction
         return jnp.ones(position.shape[0], bool), position, quaternion
 
-    def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> HeadingFeatures:
+    def features(self, hand: Hand, contacts: Contacts, features: Features, goal: Goal) -> HeadingFeatures:
         """Target in the wrist frame."""
         own = goal["heading"]
         return HeadingFeatures(

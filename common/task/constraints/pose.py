@@ -1,13 +1,20 @@
-"""Reference pose: target pose of wrist and fingers in the grasp."""
+"""Reference pose: target pose of wrist and fingers in the grasp.
+
+In training, references are disturbed like captured human grasps. In a captured pose, joints are off by some tenths of a
+radian and the wrist by a centimetre, the fingers are more or less closed than those of the hand that follows it, and
+the waypoints of a captured path jitter. The size of the disturbance is drawn for each episode, between none and the
+maxima below.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common import rotations
+from congrasp.common import chance, rotations
 from congrasp.common.hands import kinematics
+from congrasp.common.hands.motors import coupled
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
@@ -23,18 +30,64 @@ from congrasp.common.task.constraints.base import (
 from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
 from congrasp.common.task.constraints.markers import Ghost, Marker
 from congrasp.common.task.geometry import flat, in_world, square, squared_distances, wrist_to_joints
-from congrasp.common.task.sampling.disturbances import (
-    disturbed_fingers,
-    disturbed_wrist,
-    fingers_numbers,
-    wrist_numbers,
-)
-from congrasp.common.task.types import Array, Goal, Surface
+from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.types import Array, Contacts, Features, Goal, Surface
 
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.features import Contacts, Features
-    from congrasp.common.task.sampling.bank import Draw
+JOINTS = 0.3
+"""rad, largest standard deviation of an independent error of every finger joint."""
+CLOSURE = (0.6, 1.1)
+"""Least and greatest closure at full scale, as a share of the range from the open hand to the reference's fingers."""
+WRIST = 0.01, 0.2
+"""m and rad, largest standard deviation of the wrist's errors along and about each axis."""
+JITTER = 0.005
+"""m, largest standard deviation of an independent error of every coordinate of every waypoint but the last."""
+
+
+def fingers_numbers(hand: Hand) -> int:
+    """Number of random numbers that `disturbed_fingers` uses for a pose: the closure, and each joint."""
+    return 1 + len(hand.joints)
+
+
+def wrist_numbers(waypoints: int) -> int:
+    """Number of random numbers that `disturbed_wrist` uses for K waypoints: translation, rotation, 3 K of jitter."""
+    return 6 + 3 * waypoints
+
+
+def disturbed_fingers(hand: Hand, q: Array, amount: Array, uniform: Array) -> Array:
+    """Disturbs reference fingers (B, F), within their limits.
+
+    Args:
+      hand: the hand.
+      q: (B, F) finger angles, rad.
+      amount: (B,) between 0 and 1, scale of the errors.
+      uniform: (B, 1 + F) random numbers in [0, 1).
+    """
+    share = CLOSURE[0] + (CLOSURE[1] - CLOSURE[0]) * uniform[:, :1]
+    q_open, amount = jnp.array(hand.q_open), amount[:, None]
+    q = q_open + (1 + amount * (share - 1)) * (q - q_open)
+    q = q + amount * JOINTS * chance.normal(uniform[:, 1:])
+    return coupled(hand, jnp.clip(q, hand.lower, hand.upper))
+
+
+def disturbed_wrist(position: Array, quaternion: Array, amount: Array, uniform: Array) -> tuple[Array, Array]:
+    """Disturbs wrist poses (B, K, 3), (B, K, 4) by one rigid motion for all K, with jitter of the waypoints.
+
+    All rotate about the last one, so that a path keeps its shape.
+
+    Args:
+      position: positions in the object frame, m.
+      quaternion: rotations from the wrist frame to the object frame.
+      amount: (B,) between 0 and 1, scale of the errors.
+      uniform: (B, 6 + 3 K) random numbers in [0, 1).
+    """
+    noise = amount[:, None] * chance.normal(uniform)
+    move, turn = WRIST[0] * noise[:, :3], rotations.from_rotation_vector(WRIST[1] * noise[:, 3:6])
+    last_is_kept = (np.arange(position.shape[1]) < position.shape[1] - 1)[:, None]
+    jitter = JITTER * last_is_kept * noise[:, 6:].reshape(position.shape)
+    turn, last = jnp.broadcast_to(turn[:, None], quaternion.shape), position[:, -1:]
+    return last + move[:, None] + rotations.rotate(turn, position - last) + jitter, rotations.multiply(turn, quaternion)
+
 
 TOUCHING = 0.015
 """Distance from a joint or fingertip of a reference pose to the surface below which it counts as touching, m."""
@@ -90,7 +143,7 @@ class Pose(Constraint):
         ),
     )
 
-    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for residuals of joints and keypoints, and of the virtual wrist joints."""
         fingers = (
             ObservationField("pose_q - q", len(hand.joints), "rad, to the reference pose"),
@@ -101,11 +154,11 @@ class Pose(Constraint):
         )
         return fingers, (wrist,)
 
-    def numbers(self, hand: Hand, task: "TaskConfig") -> int:
+    def numbers(self, hand: Hand, task: TaskSettings) -> int:
         """Those of disturbed fingers and of a disturbed wrist."""
         return fingers_numbers(hand) + wrist_numbers(1)
 
-    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> PoseGoal:
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> PoseGoal:
         """Samples one of the object's reference poses."""
         index = draw.objects, draw.region, draw.reference["pose"]
         q, position, quaternion = (getattr(draw.bank, f"pose_{name}")[index] for name in PoseGoal._fields)
@@ -129,7 +182,7 @@ class Pose(Constraint):
         """Reference finger angles (paper, section Hand Initialization)."""
         return goal.active["pose_finger"], goal["pose"].q
 
-    def features(self, hand: Hand, contacts: "Contacts", features: "Features", goal: Goal) -> PoseFeatures:
+    def features(self, hand: Hand, contacts: Contacts, features: Features, goal: Goal) -> PoseFeatures:
         """Keypoints of the reference pose."""
         own = goal["pose"]
         points = kinematics.keypoints(hand, kinematics.link_transforms(hand, own.q))

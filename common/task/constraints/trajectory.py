@@ -1,7 +1,7 @@
 """Wrist trajectory: path of the approaching wrist."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,14 +23,11 @@ from congrasp.common.task.constraints.base import (
 from congrasp.common.task.constraints.fingers import chosen_fingers
 from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
 from congrasp.common.task.constraints.markers import Marker, Polyline
-from congrasp.common.task.constraints.pose import heading_message
+from congrasp.common.task.constraints.pose import disturbed_wrist, heading_message, wrist_numbers
 from congrasp.common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
-from congrasp.common.task.sampling.disturbances import disturbed_wrist, wrist_numbers
+from congrasp.common.task.sampling.bank import Draw
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal, Surface
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.sampling.bank import Draw
 
 APART = 0.02
 """Distance between a pose's wrist and a trajectory's end above which they contradict, m."""
@@ -78,21 +75,25 @@ class Trajectory(Constraint):
         ),
     )
 
-    def fields(self, hand: Hand, task: "TaskConfig") -> tuple[tuple[ObservationField, ...], ...]:
+    def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for residuals of the virtual wrist joints, of every waypoint."""
         size, meaning = 6 * task.trajectory_points, "m and rad, wrist joints of every waypoint minus the current ones"
         return ((ObservationField("waypoint_u - u", size, meaning),),)
 
-    def allowed(self, draw: "Draw") -> Array:
+    def allowed(self, draw: Draw) -> Array:
         """References clear of the table that agree with an affordance, if one is requested (region 1)."""
         ends = draw.bank.trajectory_position[draw.objects, draw.region, :, -1]
         return draw.allowed & jax.vmap(_agrees, (None, 1), 1)(draw, ends)
 
-    def numbers(self, hand: Hand, task: "TaskConfig") -> int:
+    def numbers(self, hand: Hand, task: TaskSettings) -> int:
         """Those of a disturbed wrist."""
         return wrist_numbers(task.trajectory_points)
 
-    def sample(self, hand: Hand, draw: "Draw", uniform: Array) -> TrajectoryGoal:
+    def joined(self, task: TaskSettings, active: Mapping[str, Array], uniform: Array) -> Array | None:
+        """Episodes with an affordance, with probability `p_together`."""
+        return active["affordance"] & (uniform < task.p_together) if "affordance" in active else None
+
+    def sample(self, hand: Hand, draw: Draw, uniform: Array) -> TrajectoryGoal:
         """Samples the trajectory to one of the object's reference poses.
 
         A disturbance that would make it contradict an affordance is dropped.
@@ -219,7 +220,7 @@ def _apart_from_regions(surface: Surface, end: Array) -> dict[str, Array]:
     }
 
 
-def _agrees(draw: "Draw", end: Array) -> Array:
+def _agrees(draw: Draw, end: Array) -> Array:
     """(B,) bool: trajectories that end at (B, 3) agree with the affordance of a draw, or it has none (region 0)."""
     surface = Surface(draw.bank.points[draw.objects], draw.bank.avoid[draw.objects])
     return (draw.region == 0) | ~_contradicts_affordance(_apart_from_regions(surface, end))

@@ -2,17 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from congrasp.common.hands.spec import Hand
-from congrasp.common.task.constraints import known
+from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Surface
-
-if TYPE_CHECKING:
-    from congrasp.common.task.config import TaskConfig
 
 
 class ConstraintBank(NamedTuple):
@@ -82,16 +78,10 @@ SHARED = ConstraintBank._fields[:-1]
 """Fields of the bank that do not belong to a single constraint."""
 
 
-def surface_of(task: "TaskConfig", bank: ConstraintBank, objects: Array) -> Surface:
+def surface_of(task: TaskSettings, bank: ConstraintBank, objects: Array) -> Surface:
     """Surfaces (B, P, ...) of the objects (B,), with normals if the task's policy observes them."""
     normals = bank.normals[objects] if task.surface_normals else None
     return Surface(bank.points[objects], bank.avoid[objects], normals)
-
-
-def with_columns(hand: Hand, task: "TaskConfig", bank: ConstraintBank) -> ConstraintBank:
-    """Returns the bank with the columns of the task's constraints."""
-    found = {constraint.name: constraint.columns(hand, bank) for constraint in known(task)}
-    return bank._replace(own={name: columns for name, columns in found.items() if columns is not None})
 
 
 def rows_of(bank: ConstraintBank) -> list[ConstraintBank]:
@@ -129,10 +119,12 @@ class Draw(NamedTuple):
     """(B,) int, index along the axis V: the region of the constraints requested so far."""
     reference: Mapping[str, Array] = MappingProxyType({})
     """(B,) int by constraint, for those drawn from references: index of an allowed reference, if there is any."""
-    least_force: Array = 1.0
-    """(B,) least limit on a link's force with which the episode's object can be held, N."""
+    mass: Array = 0.0
+    """(B,) mass of the episode's object, kg."""
+    friction: Array = 1.0
+    """(B,) sliding friction between hand and object."""
     disturbance: Array | None = None
-    """(B,) in [0, 1], scale of the references' errors (`common.task.sampling.disturbances`); None for no errors."""
+    """(B,) in [0, 1], scale of the references' errors (`common.task.constraints.pose`); None for no errors."""
 
     def own(self, constraint: str) -> Any:
         """Columns (B, ...) of a constraint for the drawn objects (`Constraint.columns`)."""

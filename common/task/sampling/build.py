@@ -1,25 +1,32 @@
 """Builds constraint banks: resting poses, heading sets, reference poses and wrist trajectories of a pool of objects."""
 
+import dataclasses
 import functools
+import hashlib
 import itertools
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+import congrasp.common
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import kinematics
+from congrasp.common.hands.closure import CENTER, Outline, outline
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.hands.outline import CENTER, Outline, outline
 from congrasp.common.hands.spec import Hand
+from congrasp.common.io.caches import keep, read_kept, source_digest
+from congrasp.common.io.files import cache_folder
+from congrasp.common.objects import store
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.sampling.approach_paths import make_trajectories
-from congrasp.common.task.sampling.bank import ConstraintBank, with_columns
+from congrasp.common.task.constraints import known
+from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
 from congrasp.common.task.sampling.headings import (
     INWARD,
@@ -29,8 +36,8 @@ from congrasp.common.task.sampling.headings import (
     sample_headings,
     within_reach,
 )
-from congrasp.common.task.sampling.kept import kept_bank
 from congrasp.common.task.types import Array
+from congrasp.common.wire.codec import Message
 
 HEADINGS = 256
 POSES = 20
@@ -323,3 +330,135 @@ def _spread(rng: np.random.Generator, allowed: np.ndarray) -> tuple[np.ndarray, 
     rests = np.resize(rng.permutation(rests), POSES)
     weights = allowed[rests] if allowed.any() else np.ones((POSES, allowed.shape[1]))
     return rests, np.array([rng.choice(len(row), p=row / row.sum()) for row in weights])
+
+
+def with_columns(hand: Hand, task: TaskConfig, bank: ConstraintBank) -> ConstraintBank:
+    """Returns the bank with the columns of the task's constraints."""
+    found = {constraint.name: constraint.columns(hand, bank) for constraint in known(task)}
+    return bank._replace(own={name: columns for name, columns in found.items() if columns is not None})
+
+
+LEAST_OBJECTS = 64
+"""Pools of at least this size are cached."""
+MOST_FILES = 8
+"""Most banks in the cache; that of 800 objects takes about 50 MB."""
+_IRRELEVANT = (
+    *("reward", "control", "mass_range", "friction_range", "gain_range", "hold_steps", "drop_height", "disturbed"),
+    *("p_", "observation", "history", "sensing", "surface_normals"),
+)
+"""Prefixes of the settings that no bank depends on."""
+
+
+def kept_bank(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, build: Callable[[], ConstraintBank]
+) -> ConstraintBank:
+    """Returns the bank built by `build` from these arguments, from the cache on disk if possible.
+
+    Only banks of large pools are cached: they depend on objects, hand and task, and take long to build.
+    """
+    if len(objects) < LEAST_OBJECTS:
+        return build()
+    path = cache_folder("banks") / f"{_key(hand, task, objects, seed)}.safetensors"
+    if (message := read_kept(path)) and message.arrays.keys() == set(SHARED):
+        return jax.device_put(ConstraintBank(**message.arrays))
+    bank = build()
+    keep(path, Message({name: np.asarray(getattr(bank, name)) for name in SHARED}), MOST_FILES)
+    return bank
+
+
+def _key(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> str:
+    """File name from everything that a bank depends on, including the code and the device's arithmetic."""
+    code = source_digest(congrasp.common)
+    settings = {name: value for name, value in dataclasses.asdict(task).items() if not name.startswith(_IRRELEVANT)}
+    device = jax.local_devices()[0].device_kind
+    digests = [store.digest(obj) for obj in objects]
+    text = json.dumps([code, jax.__version__, device, hand.reference, settings, seed, digests])
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+DISTANCE = (0.15, 0.25)
+CONE = np.deg2rad(15.0)
+AMPLITUDE = (0.01, 0.05)
+ROTATION = np.deg2rad(30.0)
+_REPLAY_DT = 0.0025
+_REPLAY_SECONDS = 0.5
+_SETTLE_SECONDS = 0.25
+
+
+@functools.partial(jax.jit, static_argnames=("hand", "waypoints"))
+def make_trajectories(
+    hand: Hand, position: Array, quaternion: Array, key: Array, *, waypoints: int
+) -> tuple[Array, Array]:
+    """Generates one trajectory for each reference pose, backwards from it (paper, section Hand Morphology).
+
+    From the final pose the wrist moves out by 15-25 cm within 15 degrees of the heading, with a lateral sinusoid of 1-5
+    cm and up to 30 degrees of rotation. The wrist's PD controller then follows the path, and its motion is resampled to
+    K waypoints.
+
+    Args:
+      hand: its heading axis and wrist gains are used.
+      position: (M, 3) final wrist positions in the object frame.
+      quaternion: (M, 4) final wrist orientations.
+      key: random key of the paths.
+      waypoints: number K of waypoints.
+
+    Returns:
+      Positions (M, K, 3) and quaternions (M, K, 4, continuous in sign), from the far end to the pose.
+    """
+    count = position.shape[0]
+    uniform_key, normal_key = jax.random.split(key)
+    random = jax.random.uniform(uniform_key, (4, count, 1))
+    tilt, distance, amplitude, turn = (
+        low + (high - low) * share
+        for (low, high), share in zip(((0.0, CONE), DISTANCE, AMPLITUDE, (0.0, ROTATION)), random, strict=True)
+    )
+    aside, sideways, axis = jax.random.normal(normal_key, (3, count, 3))
+    heading = rotations.rotate(quaternion, jnp.broadcast_to(jnp.array(grasp_frame(hand).heading), (count, 3)))
+    outward = -(jnp.cos(tilt) * heading + jnp.sin(tilt) * _perpendicular(aside, heading))
+    lateral = _perpendicular(sideways, outward)
+    axis = axis / jnp.linalg.norm(axis, axis=-1, keepdims=True)
+
+    steps = int((_REPLAY_SECONDS + _SETTLE_SECONDS) / _REPLAY_DT)
+    s = jnp.clip(jnp.arange(steps) * _REPLAY_DT / _REPLAY_SECONDS, 0.0, 1.0)[:, None, None]  # 0: far, 1: at the pose
+    slides = (1 - s) * distance * outward + jnp.sin(jnp.pi * s) * amplitude * lateral
+    reached = _replay(hand, jnp.concatenate([slides, (1 - s) * turn * axis], -1))
+
+    moved = jnp.linalg.norm(jnp.diff(reached[..., :3], axis=0), axis=-1)
+    length = jnp.concatenate([jnp.zeros((1, count)), jnp.cumsum(moved, 0)])
+    wanted = jnp.linspace(0.0, 1.0, waypoints)[:, None] * length[-1]
+    when = jax.vmap(jnp.interp, (1, 1, None), 1)(wanted, length, jnp.arange(float(steps)))
+    before = jnp.clip(when.astype(jnp.int32), 0, steps - 2)
+    share = (when - before)[..., None]
+    columns = jnp.arange(count)
+    joints = (1 - share) * reached[before, columns] + share * reached[before + 1, columns]  # (K, M, 6)
+    joints = jnp.swapaxes(joints, 0, 1)
+    turns = rotations.from_rotation_vector(joints[..., 3:])
+    return (
+        position[:, None] + joints[..., :3],
+        rotations.multiply(turns, jnp.broadcast_to(quaternion[:, None], turns.shape)),
+    )
+
+
+def _replay(hand: Hand, target: Array) -> Array:
+    """Motion of the wrist's PD controller for targets (T, M, 6): each axis is a damped mass, semi-implicit Euler."""
+    gains = hand.wrist
+    mass, inertia = hand.wrist_inertia.tolist()
+    kp = jnp.array([gains.slide_kp] * 3 + [gains.hinge_kp] * 3)
+    kv = jnp.array([gains.slide_kv] * 3 + [gains.hinge_kv] * 3)
+    limit = jnp.array([gains.slide_limit] * 3 + [gains.hinge_limit] * 3)
+    weight = jnp.array([mass] * 3 + [inertia] * 3)
+
+    def step(state: tuple[Array, Array], goal: Array) -> tuple[tuple[Array, Array], Array]:
+        """Simulates one step of the wrist's servos."""
+        x, v = state
+        force = jnp.clip(kp * (goal - x), -limit, limit)
+        v = (v + _REPLAY_DT * force / weight) / (1 + _REPLAY_DT * kv / weight)
+        return (x + _REPLAY_DT * v, v), x
+
+    return jax.lax.scan(step, (target[0], jnp.zeros_like(target[0])), target)[1]
+
+
+def _perpendicular(vector: Array, axis: Array) -> Array:
+    """Normalised components of vectors (M, 3) orthogonal to unit axes (M, 3)."""
+    part = vector - jnp.sum(vector * axis, -1, keepdims=True) * axis
+    return part / jnp.linalg.norm(part, axis=-1, keepdims=True)

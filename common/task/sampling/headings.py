@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from congrasp.common.errors import TooWideError
-from congrasp.common.hands.outline import CENTER, Outline, depth_below
+from congrasp.common.hands.closure import CENTER, Outline, depth_below
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 

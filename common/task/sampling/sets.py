@@ -7,9 +7,9 @@ from typing import Any, Literal
 import numpy as np
 
 from congrasp.common.config import Split
-from congrasp.common.described import check_arrays
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name, read_file
+from congrasp.common.io.npz import check_arrays
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.task.normals import estimated_normals

@@ -19,8 +19,8 @@ from congrasp.actors import stress as protocols
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import kinematics
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.hands.measures import tip_forces
 from congrasp.common.hands.mjcf import overlapping
+from congrasp.common.hands.motors import tip_forces
 from congrasp.common.hands.spec import Hand, chain_of
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
@@ -81,7 +81,7 @@ def check_hand(hand: Hand, task: TaskConfig, threads: int) -> Checked:
 
     Args:
       hand: the hand.
-      task: the full task for it (`services.train.recipe`), whose physics is used.
+      task: the full task for it (`services.train.presets`), whose physics is used.
       threads: threads of the physics.
     """
     found = [_palm(hand), *_joints(hand), _opening(hand), _strength(hand)]

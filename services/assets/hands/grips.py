@@ -24,7 +24,7 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.families import draft
-from congrasp.common.objects.plain import plain_object
+from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import Array

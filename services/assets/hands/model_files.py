@@ -14,9 +14,8 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.files import TAKEN_JOINTS, faults, hand_from_text, hand_text
 from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.hands.measures import fitting_scale
 from congrasp.common.hands.meshes import MAX_DISTANCE, Meshes, load_meshes, save_meshes
-from congrasp.common.hands.motors import motor_limits
+from congrasp.common.hands.motors import fitting_scale, motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from congrasp.services.assets.hands.actuators import Drive
 from congrasp.services.assets.hands.compile import LEAST, confined, robot_spec

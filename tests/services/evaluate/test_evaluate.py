@@ -20,7 +20,7 @@ from congrasp.services.evaluate.heading_rules import heading_rules
 from congrasp.services.evaluate.paper import CENTER_GROUP
 from congrasp.services.evaluate.pictures import failure_sheets
 from congrasp.services.evaluate.tables import Center, Load
-from congrasp.services.train.student import TRACKERS
+from congrasp.services.train.presets import TRACKERS
 from tests import task
 
 EPISODES = task.BATCH

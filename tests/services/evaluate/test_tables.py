@@ -18,7 +18,7 @@ from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.plan import protocol
 from congrasp.services.evaluate.plots import draw_noise
 from congrasp.services.evaluate.tables import MASSES, NOISE, PEERS, SENSING, Load, Noise, payload
-from congrasp.services.train.student import TRACKERS
+from congrasp.services.train.presets import TRACKERS
 from tests import draws, task
 from tests.task import HAND, OBJECTS
 

@@ -36,7 +36,7 @@ from congrasp.services.export.motion_file import (
 )
 from congrasp.services.export.unwrap import unwrapped
 from congrasp.services.record.channels import Entry
-from congrasp.services.record.entries import Converter
+from congrasp.services.record.recorder import Converter
 from congrasp.services.record.writer import LogWriter
 from tests.episodes import episode
 from tests.motion_readers import FROM_Y_UP, READERS, error_mm, read_glb

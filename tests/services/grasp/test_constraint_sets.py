@@ -8,7 +8,7 @@ from PIL import Image
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.outline import outline
+from congrasp.common.hands.closure import outline
 from congrasp.common.objects import store
 from congrasp.common.task.sampling import sets as stored_sets
 from congrasp.common.task.sampling import write_sets
@@ -75,7 +75,7 @@ def test_files_come_back_whole_and_others_are_refused(constraint_sets, file, tmp
 
 
 def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("congrasp.services.viz.constraint_sheet._SIZE", (48, 36))
+    monkeypatch.setattr("congrasp.services.viz.object_sheet._SIZE", (48, 36))
     picture = tmp_path / "sheet.png"
     assert load("constraints")(["show", str(file), "--png", str(picture)])() == 0
     words = capsys.readouterr().out

@@ -14,9 +14,8 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.budget import LogBudget
-from congrasp.services.record.entries import Converter
 from congrasp.services.record.live import LiveServer
+from congrasp.services.record.recorder import Converter, LogBudget
 from tests.episodes import episode
 
 KEYS = Keys("r")

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
-from congrasp.services.client.guard import Guard
+from congrasp.services.client.guard import Guard, Ticker
 from congrasp.services.client.limits import JointLimits
 from congrasp.services.client.policy import Answer
-from congrasp.services.client.ticker import Ticker
 
 FINGERS = 2
 OPEN = np.array([0.3, -0.3])

@@ -16,8 +16,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.services.client.episode import EpisodePolicy
 from congrasp.services.client.policy import Policy
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.serve.inference import Inference, PolicyFunction
-from congrasp.services.serve.local import LocalPolicy, load_policy
+from congrasp.services.serve.inference import Inference, LocalPolicy, PolicyFunction, load_policy
 from congrasp.services.serve.server import PolicyServer, follow_file
 from congrasp.services.train.command import untrained
 from tests import task

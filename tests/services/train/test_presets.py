@@ -7,9 +7,11 @@ import pytest
 from congrasp.common.config import run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.motors import fitting_scale, tip_forces
 from congrasp.common.objects import procedural
 from congrasp.services.cli.train import defaults
-from congrasp.services.train.presets import PRESETS, easier, get_preset, with_hand
+from congrasp.services.train.presets import PRESETS, Rules, easier, get_preset, recipe, rules, with_hand
 
 
 def test_an_unknown_preset_lists_those_that_exist():
@@ -23,7 +25,7 @@ def test_a_preset_travels_and_its_batch_can_be_cut(name):
     assert config.name == (name if name != "full" else "human") and run_config_from_json(to_json(config)) == config
     get_hand(config.task.hand)
     procedural.family_turns(1, 0, config.objects.families)  # a CongraspError where one is unknown
-    transitions = config.environments * config.rollout_steps * config.ppo.rollouts_per_update
+    transitions = config.environments * config.rollout_steps * config.rollouts_per_update
     assert transitions % config.ppo.minibatches == 0
 
 
@@ -50,3 +52,62 @@ def test_what_was_made_easier_is_said_and_nothing_else():
     human = get_preset("human")
     task = dataclasses.replace(human.task, p_trajectory=0.0)
     assert easier(dataclasses.replace(human, task=task)) == ["no episode has another constraint (wrist trajectory)"]
+
+
+RULES = {
+    # By hand: k = s^2 5/G is 1, 1.96 x 5/4 = 2.45 and 1.21.
+    "human": Rules(5.0, 12.0, 0.15, 0.30, 0.60),
+    "allegro": Rules(12.0, 29.0, 0.20, 0.40, 0.80),
+    "sharpa": Rules(6.0, 15.0, 0.16, 0.32, 0.64),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_the_hands_of_the_package_have_what_the_rules_give(name):
+    hand = get_hand(name)
+    assert rules(hand) == RULES[name]
+    assert fitting_scale(grasp_frame(hand).opening) == hand.object_scale
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_hands_differ_in_what_has_a_rule_and_in_nothing_else(name):
+    own, human = recipe(get_hand(name)), recipe(get_hand("human"))
+    ruled = dataclasses.asdict(rules(get_hand(name)))
+    share = ruled.pop("p_affordance")
+    weights = dataclasses.replace(human.curriculum.reward, **ruled)
+    assert own.curriculum == dataclasses.replace(human.curriculum, reward=weights)
+    assert own.task.reward == dataclasses.replace(human.task.reward, force_max=ruled["force_max"])
+    task = dataclasses.replace(human.task, hand=name, reward=own.task.reward, **{"p_affordance": share})
+    assert own == dataclasses.replace(human, name=name, task=task, curriculum=own.curriculum)
+
+
+def test_a_fingertip_presses_with_the_torque_of_the_weakest_joint_over_its_lever():
+    # Allegro's straight finger: the second joint is 119 mm from the tip, its 0.7 N.m make 5.9 N there, less than the
+    # next ones' on shorter levers; the thumb's first joint is 151 mm from its tip and makes 4.6 N.
+    allegro = get_hand("allegro")
+    assert tip_forces(allegro) == pytest.approx([0.7 / 0.151, *3 * [0.7 / 0.119]], rel=0.01)
+    links = tuple(
+        dataclasses.replace(
+            link, joints=tuple(dataclasses.replace(joint, torque_limit=2 * joint.torque_limit) for joint in link.joints)
+        )
+        for link in allegro.links
+    )
+    assert tip_forces(dataclasses.replace(allegro, links=links)) == pytest.approx(2 * tip_forces(allegro))
+
+
+def test_weaker_hands_train_more_on_parts_and_strong_ones_as_the_human_hand():
+    allegro = get_hand("allegro")
+
+    def with_torque(factor):
+        links = tuple(
+            dataclasses.replace(
+                link, joints=tuple(dataclasses.replace(j, torque_limit=factor * j.torque_limit) for j in link.joints)
+            )
+            for link in allegro.links
+        )
+        return rules(dataclasses.replace(allegro, links=links))
+
+    found = [with_torque(factor) for factor in (0.5, 1, 4, 20)]
+    assert [one.p_affordance for one in found] == sorted((one.p_affordance for one in found), reverse=True)
+    assert found[0].p_affordance == 0.8 and found[-1].p_affordance == 0.6
+    assert len({one.force_max for one in found}) == 1

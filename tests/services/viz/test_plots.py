@@ -15,8 +15,7 @@ from congrasp.common.task.metrics import episode_fields
 from congrasp.services.cli.plot import plot
 from congrasp.services.record.channels import JsonChannels, nest
 from congrasp.services.record.writer import LogWriter
-from congrasp.services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth
-from congrasp.services.viz.titles import titled
+from congrasp.services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth, titled
 
 METRICS = {
     "episode/return": 3.0,

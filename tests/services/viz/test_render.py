@@ -22,7 +22,6 @@ from congrasp.services.record.channels import Entry, opaque_channel
 from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.record.writer import LogWriter
-from congrasp.services.viz.episode import TOUCHING, episode_shapes
 from congrasp.services.viz.hand_sheets import hand_sheet
 from congrasp.services.viz.raster import render_scene, visible
 from congrasp.services.viz.render import (
@@ -38,7 +37,7 @@ from congrasp.services.viz.scene import Camera, Shape, between
 from congrasp.services.viz.shapes import arrow, beads, capsule_shapes, fit, skin_colours
 from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
 from congrasp.services.viz.triangles import cut, smooth_corners
-from congrasp.services.viz.views import View, camera_of, view_of, views
+from congrasp.services.viz.views import TOUCHING, View, camera_of, episode_shapes, view_of, views
 from tests.cluster import ROOT
 from tests.episodes import CONTROL_DT, episode, older
 

@@ -12,8 +12,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import widest_gap
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
-from congrasp.common.objects.plain import plain_object
-from congrasp.common.objects.procedural import generate
+from congrasp.common.objects.procedural import generate, plain_object
 from congrasp.common.objects.spec import Piece
 from congrasp.services.assets.captures.extract import LATER, Surface, _opposed
 from congrasp.services.assets.captures.refuse import DEEPEST, check_reference, depth, width

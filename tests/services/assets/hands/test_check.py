@@ -15,8 +15,8 @@ from congrasp.services.assets.hands import check, servos
 from congrasp.services.assets.hands.check import check_hand
 from congrasp.services.assets.hands.model_files import propose
 from congrasp.services.cli import main
-from congrasp.services.train.recipe import recipe
-from congrasp.services.viz import check_sheet
+from congrasp.services.train.presets import recipe
+from congrasp.services.viz import hand_sheets
 
 CLAW = propose(pathlib.Path(__file__).parents[3] / "hands" / "claw.urdf").hand
 HANDS = {"claw": CLAW, **{name: get_hand(name) for name in ("human", "allegro", "sharpa")}}
@@ -132,7 +132,7 @@ def test_exit_codes_of_the_command(monkeypatch, tmp_path, capsys):
     assert (tmp_path / "claw.png").stat().st_size > 20_000
     failed = made._replace(findings=[made.findings[0]._replace(verdict="failed", remedy="another palm")])
     monkeypatch.setattr(check, "check_hand", lambda hand, task, threads: failed)
-    monkeypatch.setattr(check_sheet, "check_sheet", lambda hand, grips: np.zeros((4, 4, 3), np.uint8))  # drawn above
+    monkeypatch.setattr(hand_sheets, "check_sheet", lambda hand, grips: np.zeros((4, 4, 3), np.uint8))  # drawn above
     assert main.run(["hands", "check", str(file), "--png", str(tmp_path / "claw.png")]) == 1
     assert "-> another palm" in capsys.readouterr().out
     with pytest.raises(CongraspError, match="no hand 'paw'"):

@@ -20,7 +20,7 @@ from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.hands.skin import skin_of, skin_of_meshes
 from congrasp.common.hands.spec import chain_of
 from congrasp.common.objects.distance import distance_field
-from congrasp.common.objects.plain import plain_object
+from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import Piece
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig

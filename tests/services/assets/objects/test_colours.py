@@ -19,9 +19,9 @@ from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.sources import find_sources
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.record.scene import check_episode
-from congrasp.services.viz.episode import _object
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.scene import Camera
+from congrasp.services.viz.views import _object
 from tests.episodes import episode
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)

@@ -1,8 +1,14 @@
-"""Weak scaling: trained steps per second of 1, 2, … learner ranks, each a separate process with a separate GPU."""
+"""Benchmarks of a training: seconds to its first update by stage, and weak scaling over learner ranks.
 
+Weak scaling is the trained steps per second of 1, 2, … ranks, each a separate process with a separate GPU.
+"""
+
+import collections
 import dataclasses
 import json
 import math
+import multiprocessing
+import os
 import pathlib
 import platform
 import shutil
@@ -10,6 +16,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
 from typing import Any
 
 import jax
@@ -18,9 +25,12 @@ from rich.table import Table
 
 from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.stages import imported, since_start, stages
 from congrasp.learner.run_directory import create_run
 from congrasp.services.train.launch import Launch, Plan, engine_of, leave_gpus_to
+from congrasp.services.train.learn import until_first_update
 from congrasp.services.train.processes import train
 
 _WARM_UPDATES = 5
@@ -178,7 +188,7 @@ def _measure(
 
 def _print(console: Console, config: RunConfig, stages: Sequence[Stage]) -> None:
     """Prints the table of the completed stages."""
-    steps = config.environments * config.rollout_steps * config.ppo.rollouts_per_update
+    steps = config.environments * config.rollout_steps * config.rollouts_per_update
     table = Table(title=f"{config.environments} environments, {steps} steps an update of each rank, '{config.physics}'")
     for column in ("ranks", "steps/s", "efficiency", "wait, s", "update, s", "updates", "start, s"):
         table.add_column(column, justify="right")
@@ -193,3 +203,86 @@ def _print(console: Console, config: RunConfig, stages: Sequence[Stage]) -> None
             f"{stage.start_seconds:.0f}",
         )
     console.print(table)
+
+
+_STOPPED_SECONDS = 30.0
+_EVENTS = {
+    "/jax/core/compile/jaxpr_trace_duration": "tracing",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lowering",
+    "/jax/core/compile/backend_compile_duration": "compiling or reading",
+}
+
+
+def bench_startup(config: RunConfig, physics: PhysicsName, deadline: float) -> None:
+    """Prints the stages of two starts of a training in one process, the second with the caches of the first.
+
+    Args:
+      config: configuration of the run.
+      physics: engine.
+      deadline: deadline of one start, s.
+
+    Raises:
+      CongraspError: a start missed the deadline, or its process ended.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        caches = {"XDG_CACHE_HOME": folder, "JAX_COMPILATION_CACHE_DIR": f"{folder}/jax"}
+        starts = {name: _start(config, physics, caches, deadline) for name in ("empty caches", "warm")}
+    names = list(dict.fromkeys(name for found in starts.values() for name in found))
+    table = Table(title=f"{config.name}: {config.environments} environments, {config.objects.count} objects, {physics}")
+    table.add_column("seconds")
+    for name in starts:
+        table.add_column(name, justify="right")
+    for name in names:
+        table.add_row(name, *(found.get(name, "") for found in starts.values()))
+    console = Console()
+    console.print(table)
+    console.print(
+        "Stages of different threads overlap. Warp's kernels are in a separate cache, which is used unchanged; "
+        "'congrasp warmup' fills it."
+    )
+
+
+def _start(config: RunConfig, physics: PhysicsName, caches: dict[str, str], deadline: float) -> dict[str, str]:
+    """The rows of one start, in a separate process."""
+    here, there = multiprocessing.Pipe()
+    before = {name: os.environ.get(name) for name in caches}
+    os.environ.update(caches)
+    process = multiprocessing.get_context("spawn").Process(target=_first_update, args=(config, physics, there))
+    process.start()
+    for name, value in before.items():
+        os.environ.pop(name) if value is None else os.environ.update({name: value})
+    try:
+        there.close()
+        if not here.poll(deadline):
+            raise CongraspError(f"There was no first update in {deadline:.0f} s.", "Set a longer --deadline.")
+        rows: dict[str, str] = json.loads(here.recv_bytes())
+        process.join(_STOPPED_SECONDS)
+    except EOFError:
+        raise CongraspError("The training ended before its first update.", "See its output above.") from None
+    finally:
+        process.kill()
+    return rows
+
+
+def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) -> None:
+    """Trains until the first update, and sends the stages of the start."""
+    imported()
+    seconds, programs = collections.defaultdict[str, float](float), collections.Counter[str]()
+
+    def timed(event: str, duration_secs: float, **about: str | int) -> None:
+        if event in _EVENTS:
+            seconds[_EVENTS[event]] += duration_secs
+            if event.endswith("backend_compile_duration"):
+                programs[str(about.get("fun_name"))] += 1
+
+    jax.monitoring.register_event_duration_secs_listener(timed)
+
+    def report() -> None:
+        rows = {one.name: f"{one.ended - one.began:.2f} (at {one.began:.1f})" for one in stages()}
+        rows |= {f"{name}, all threads": f"{total:.2f}" for name, total in seconds.items()}
+        rows["compiled programs"] = str(programs.total())
+        rows["of these more than once"] = ", ".join(f"{name} {n}" for name, n in programs.items() if n > 1)
+        rows["in all, from the start of the process"] = f"{since_start():.2f}"
+        results.send_bytes(json.dumps(rows).encode())
+
+    until_first_update(config, physics, threading.Event(), report)

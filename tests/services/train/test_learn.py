@@ -2,6 +2,7 @@
 
 import pathlib
 import struct
+import threading
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,8 +14,9 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.reader import read_metrics
-from congrasp.services.train import metric_writers
-from congrasp.services.train.metric_writers import recorded
+from congrasp.services.train import learn
+from congrasp.services.train import learn as training
+from congrasp.services.train.learn import recorded
 from tests.episodes import episode
 
 
@@ -76,7 +78,37 @@ def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(tmp_path, mon
     def refuse(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(metric_writers._TensorBoard, "write", refuse)
+    monkeypatch.setattr(learn._TensorBoard, "write", refuse)
     publish(tmp_path, ["tensorboard"], range(4))
     assert len(read_metrics(tmp_path / "logs")["learner/0/kl"][0]) == 4
     assert capsys.readouterr().err.count("tensorboard receives no more metrics") == 1
+
+
+def test_it_ends_with_the_first_update_and_leaves_no_run_behind(monkeypatch):
+    seen, events = {}, []
+
+    def learn(run_dir, config, *, wire, inside, stop, resume, on_update, grace):
+        seen.update(run_dir=run_dir, config=config, inside=inside, stop=stop)
+        assert pathlib.Path(run_dir, "config.json").exists()
+        for update in range(2):
+            events.append(f"update {update}")
+            on_update({})
+
+    monkeypatch.setattr(training, "learn", learn)
+    stop = threading.Event()
+    training.until_first_update(RunConfig(), "native", stop, lambda: events.append("reported"))
+    assert events == ["update 0", "reported", "update 1"]
+    assert stop.is_set() and seen["stop"] is stop
+    assert seen["inside"] == "native" and seen["config"].updates == 1
+    assert not seen["run_dir"].exists()
+
+
+def test_nothing_is_reported_of_a_start_that_was_stopped(monkeypatch):
+    def learn(run_dir, config, *, stop, on_update, **rest):
+        stop.set()
+        on_update({})
+
+    reported = []
+    monkeypatch.setattr(training, "learn", learn)
+    training.until_first_update(RunConfig(), "native", threading.Event(), lambda: reported.append(1))
+    assert not reported
