@@ -34,7 +34,7 @@ _SCRIPTS = {
     """,
     "evaluate": """
         from congrasp.services.cli.main import run
-        code = run("evaluate --table objects --episodes 64 --physics native".split())
+        code = run("evaluate --table objects --episodes 2 --physics native".split())
         print("RESULT", 2 - code)
     """,
     "thread": """

@@ -102,7 +102,7 @@ def interior(triangles: np.ndarray, count: int) -> np.ndarray:
     """Evenly distributed points (`count`, 3) inside of the outward triangles (F, 3, 3) of a closed mesh."""
     corners = triangles.reshape(-1, 3)
     low, spacing = corners.min(0), float(np.ptp(corners, axis=0).max()) / _RAYS
-    first, last = [], []
+    first, last = list[np.ndarray](), list[np.ndarray]()
     for axis in range(3):
         order = [(axis + 1) % 3, (axis + 2) % 3, axis]
         shift = np.array([*_OFF_GRID[order[:2]], 0.0])
