@@ -88,29 +88,34 @@ def measure(
 ) -> dict[str, float]:
     """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is not counted.
 
-    With `states` > 1 each query holds that many, and each state counts as an answer.
+    With `states` > 1 each query holds that many, and each state counts as an answer. The rate begins when all clients
+    have had their first answer.
     """
     share = max(1, repeat // concurrency)
 
-    def ask(_: int) -> tuple[list[float], int, int]:
+    def connected(_: int) -> PolicyClient:
+        client = stack.enter_context(PolicyClient(connect, name, hand=episode.hand, timeout=timeout, certs=certs))
+        client.reset(episode.request)
+        client.act(episode.state)
+        return client
+
+    def ask(client: PolicyClient) -> tuple[list[float], int, int]:
         times, failed, overloaded, state = [], 0, 0, episode.state
-        with PolicyClient(connect, name, hand=episode.hand, timeout=timeout, certs=certs) as client:
-            client.reset(episode.request)
-            client.act(state)
-            for _ in range(share):
-                try:
-                    answer = client.act(state) if states == 1 else client.act_each([state] * states)[0]
-                    times.append(answer.round_trip_ms)
-                except OverloadedError:
-                    overloaded += 1
-                except TransportError:
-                    failed += 1
+        for _ in range(share):
+            try:
+                answer = client.act(state) if states == 1 else client.act_each([state] * states)[0]
+                times.append(answer.round_trip_ms)
+            except OverloadedError:
+                overloaded += 1
+            except TransportError:
+                failed += 1
         return times, failed, overloaded
 
-    began = time.perf_counter()
-    with concurrent.futures.ThreadPoolExecutor(concurrency) as pool:
-        results = list(pool.map(ask, range(concurrency)))
-    spent = time.perf_counter() - began
+    with contextlib.ExitStack() as stack, concurrent.futures.ThreadPoolExecutor(concurrency) as pool:
+        clients = list(pool.map(connected, range(concurrency)))
+        began = time.perf_counter()
+        results = list(pool.map(ask, clients))
+        spent = time.perf_counter() - began
     times = np.concatenate([np.array(part) for part, _, _ in results])
     return {
         "p50_ms": float(np.percentile(times, 50)) if len(times) else float("nan"),

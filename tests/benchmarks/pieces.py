@@ -15,7 +15,7 @@ from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.objects.fidelity import fidelity
+from congrasp.services.assets.objects.fidelity import enclosed, fidelity
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.pieces import merge, simplify
 
@@ -33,7 +33,8 @@ def coarser(obj: GraspObject, max_pieces: int, max_vertices: int) -> GraspObject
     """The object with its mesh pieces joined to at most `max_pieces` of at most `max_vertices` vertices."""
     vertices = [np.asarray(piece.vertices) + piece.pos for piece in obj.pieces]
     triangles = obj.visual_vertices[obj.visual_faces].astype(float)
-    joined = merge(vertices, max_pieces, triangles, obj.mass / 500.0)
+    volume = None if obj.volume_error is None else enclosed(triangles).volume
+    joined = merge(vertices, max_pieces, triangles, volume)
     pieces = tuple(Piece("mesh", (0.0, 0.0, 0.0), vertices=simplify(piece, max_vertices)) for piece in joined)
     return dataclasses.replace(obj, pieces=pieces)
 

@@ -27,6 +27,16 @@ _SCRIPTS = {
         print("RESULT", envs.num_envs)
         envs.close()
     """,
+    "grasp": """
+        import congrasp
+        found = congrasp.grasp("mug:7", heading=(0, 0, -1), attempts=2)
+        print("RESULT", found.attempts)
+    """,
+    "evaluate": """
+        from congrasp.services.cli.main import run
+        code = run("evaluate --table objects --episodes 2 --physics native".split())
+        print("RESULT", 2 - code)
+    """,
     "thread": """
         import threading
         from congrasp.common.objects.procedural import generate_many
@@ -78,19 +88,29 @@ def test_an_error_of_a_call_is_raised_as_by_map():
 @pytest.mark.parametrize(
     ("kind", "by"),
     [
-        pytest.param("make_vec", "file", marks=pytest.mark.slow),  # compiles
+        *(
+            pytest.param(kind, by, marks=pytest.mark.slow)
+            for kind, by in (  # compile
+                ("make_vec", "file"),
+                ("grasp", "file"),
+                ("grasp", "stdin"),
+                ("evaluate", "stdin"),
+            )
+        ),
         ("thread", "file"),
         ("thread", "stdin"),
+        ("thread", "interpreter"),
         ("a class of the script", "file"),
     ],
 )
 def test_a_script_without_a_guard_runs_once(kind, by, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(f'print("started", __name__)\n{_dedented(_SCRIPTS[kind])}')
-    command = [sys.executable, script] if by == "file" else [sys.executable, "-"]
+    command = [sys.executable, {"file": script, "stdin": "-", "interpreter": "-i"}[by]]
     with script.open() as stdin:
-        done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, cwd=_ROOT, timeout=300)
-    assert done.stdout.split("\n") == ["started __main__", f"RESULT {64 if kind == 'thread' else 2}", ""], done.stderr
+        done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, cwd=_ROOT, timeout=600)
+    lines = [line for line in done.stdout.splitlines() if line.startswith(("started", "RESULT"))]
+    assert lines == ["started __main__", f"RESULT {64 if kind == 'thread' else 2}"], done.stderr
     assert done.returncode == 0 and "Traceback" not in done.stderr
 
 

@@ -318,9 +318,10 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     compiler = extension.find("compiler")
     compiler = ET.SubElement(extension, "compiler") if compiler is None else compiler
     compiler.attrib |= {"strippath": "false", "discardvisual": "false", "balanceinertia": "true", "meshdir": ""}
-    names = Counter(link.get("name") for link in robot.findall("link"))
-    if repeated := [name for name, count in names.items() if count > 1]:
-        raise _Known(f"several links are called '{repeated[0]}'. Rename all but one")
+    for kind in ("link", "joint"):  # of joints, MuJoCo would leave all but one without a name
+        names = Counter(element.get("name") for element in robot.findall(kind))
+        if repeated := [name for name, count in names.items() if count > 1]:
+            raise _Known(f"several {kind}s are called '{repeated[0]}'. Rename all but one")
     _check_joints(robot, notes)
     assets, lacking = dict[str, bytes](), dict[str, None]()
     for link in robot.iter("link"):

@@ -13,10 +13,8 @@ from congrasp.common.objects import shapes
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.fidelity import Fidelity, fidelity
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.pieces import SQUEEZE, merge, simplify, squeeze
+from congrasp.services.assets.objects.pieces import merge, simplify
 from congrasp.services.assets.objects.sources import Source
-
-_TOO_LARGE = 0.01  # share of the volume; pieces of thin walls fill the inside of bends
 
 
 class Collision(NamedTuple):
@@ -90,8 +88,7 @@ def _merged(
     notes: list[str],
 ) -> Collision:
     """The given pieces (V, 3), fewer where there are too many; the volume is that of the mesh if it is closed."""
-    enclosed = sum(shapes.hull_of(piece).volume for piece in given) if volume is None else volume
-    found = merge(list(given), options.max_pieces, triangles, enclosed)
+    found = merge(list(given), options.max_pieces, triangles, volume)
     if len(found) < len(given):
         notes.append(f"its {len(given)} convex pieces were merged into {len(found)} (--max-pieces)")
     return _fitted(triangles, found, [0] * len(found), closed=volume is not None)
@@ -137,13 +134,6 @@ def _cut(
 
 
 def _fitted(triangles: np.ndarray, found: list[np.ndarray], owners: list[int], closed: bool) -> Collision:
-    """Pieces (V, 3) of few vertices, thinner where their union is larger than the mesh (F, 3, 3)."""
+    """Pieces (V, 3) of few vertices, and their errors."""
     hulls = [simplify(piece) for piece in found]
-    errors = fidelity(triangles, hulls, closed)
-    if errors.volume is None or errors.volume < _TOO_LARGE:
-        return Collision(hulls, owners, errors)
-    thinner = [squeeze(hull, 1 / (1 + errors.volume)) for hull in hulls]
-    better = fidelity(triangles, thinner, closed)
-    if better.surface <= errors.surface + SQUEEZE:
-        return Collision(thinner, owners, better)
-    return Collision(hulls, owners, errors)
+    return Collision(hulls, owners, fidelity(triangles, hulls, closed))

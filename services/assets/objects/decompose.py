@@ -138,8 +138,7 @@ def _child(method: str, mesh: str, result: str, max_pieces: str, limit: str) -> 
         rows = np.insert(faces, 0, 3, axis=1).astype(np.uint32)  # the number of corners comes first, as in VTK
         found = [piece[0] for piece in vhacdx.compute_vhacd(vertices, rows, maxConvexHulls=int(max_pieces))]
     solid = [hull for hull in (solid_hull(np.asarray(piece, np.float64)) for piece in found) if hull is not None]
-    volume = volume or sum(hull.volume for hull in solid)
-    np.savez(result, *merge([hull.points for hull in solid], int(max_pieces), vertices[faces], volume))
+    np.savez(result, *merge([hull.points for hull in solid], int(max_pieces), vertices[faces], volume or None))
 
 
 def _by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[np.ndarray]:

@@ -98,6 +98,29 @@ def _farthest(surface: _Surface, other: _Surface) -> float:
     return float(cKDTree(other.points[other.outer]).query(points[touched])[0].max(initial=0.0))
 
 
+def interior(triangles: np.ndarray, count: int) -> np.ndarray:
+    """Evenly distributed points (`count`, 3) inside of the outward triangles (F, 3, 3) of a closed mesh."""
+    corners = triangles.reshape(-1, 3)
+    low, spacing = corners.min(0), float(np.ptp(corners, axis=0).max()) / _RAYS
+    first, last = list[np.ndarray](), list[np.ndarray]()
+    for axis in range(3):
+        order = [(axis + 1) % 3, (axis + 2) % 3, axis]
+        shift = np.array([*_OFF_GRID[order[:2]], 0.0])
+        rays, place, owner, normal = _crossings((triangles[..., order] - low[order]) / spacing + shift)
+        for ends, side in zip(
+            (first, last), _intervals(rays, place, -np.sign(normal[owner, 2]), _SEAM / spacing), strict=False
+        ):
+            points = np.empty((len(side), 3))
+            points[:, order] = (np.column_stack([rays, place])[side] - shift) * spacing + low[order]
+            ends.append(points)
+    start, end = np.concatenate(first), np.concatenate(last)
+    along = np.cumsum(np.linalg.norm(end - start, axis=-1))
+    wanted = (np.arange(count) + 0.5) / count * along[-1]
+    chosen = np.searchsorted(along, wanted)
+    share = (along[chosen] - wanted) / np.linalg.norm(end - start, axis=-1)[chosen]
+    return end[chosen] - share[:, None] * (end - start)[chosen]
+
+
 class Enclosed(NamedTuple):
     """Measures of the space inside a closed mesh; bodies that overlap count once."""
 

@@ -35,7 +35,7 @@ from congrasp.services.assets.objects.sources import Source
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
-_CACHE_VERSION = 9
+_CACHE_VERSION = 10
 _DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 

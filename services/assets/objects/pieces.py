@@ -1,4 +1,8 @@
-"""Fewer and simpler convex pieces: joined where their hull stays close to the surface, thinned, with few vertices."""
+"""Fewer and simpler convex pieces: joined where that preserves the shape, as thin as their walls, with few vertices.
+
+The hull of a bent wall fills the inner side of the bend: at a bowl of 2 mm, half of the wall's volume. Such a piece is
+thinned about its middle to the volume of the mesh in it, which leaves half of the bend on either side.
+"""
 
 import heapq
 from typing import NamedTuple
@@ -8,18 +12,28 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_VERTICES
-from congrasp.services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME
+from congrasp.services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME, interior
 
 DEPTH = 1.5e-3
 """Largest depth of the surface in a hull, or distance of the hull from it, for joins below the limit of pieces, m."""
 GROWTH = 0.02
 """Share of the volume that joins may add below the limit of pieces."""
-SQUEEZE = 4e-4
-"""Largest displacement of a side of a piece inwards, m."""
 _SAMPLES, _PROBES = 6000, 100  # points on the whole surface, and on the hull of two pieces
 _NEAR = 5e-4  # m; pieces whose boxes are nearer than this are neighbours
 _ON = 1e-4  # m; points of a hull that are nearer to a piece than this belong to it
+_INNER = 30_000  # points inside of the mesh
+_FULL, _MOST = 0.02, 0.9  # hollow shares of its hull from which on a piece is thinned, and by which it is at most
 _LEAST = 1e-11  # m^3; smaller pieces are dropped
+
+
+class _Part(NamedTuple):
+    """A piece."""
+
+    vertices: np.ndarray
+    """(V, 3) before it was thinned, m."""
+    hull: ConvexHull
+    shift: float
+    """Largest displacement of a vertex by thinning, m."""
 
 
 class _Join(NamedTuple):
@@ -32,38 +46,56 @@ class _Join(NamedTuple):
     second: int
     depth: float
     growth: float
-    hull: ConvexHull
+    part: _Part
 
 
 class _Merger:
     """Pieces by number, the neighbours of each, and the possible joins."""
 
-    def __init__(self, pieces: list[np.ndarray], triangles: np.ndarray, volume: float):
+    def __init__(self, pieces: list[np.ndarray], triangles: np.ndarray, volume: float | None):
         """Takes the arguments of `merge`."""
         random = np.random.default_rng(0)
-        self._surface = shapes.on_triangles(triangles, random.random((_SAMPLES, 3)))[0]
+        self._surface = _sorted(shapes.on_triangles(triangles, random.random((_SAMPLES, 3)))[0])
         self._tree = cKDTree(self._surface)
         self._probes = random.random((_PROBES, 3))
-        self._volume = volume
-        self.hulls = dict(enumerate(hull for hull in map(solid_hull, pieces) if hull is not None))
-        self._count = len(self.hulls)
-        self._neighbors: dict[int, set[int]] = {i: set() for i in self.hulls}
+        hulls = [hull for hull in map(solid_hull, pieces) if hull is not None]
+        self._volume = sum(hull.volume for hull in hulls) if volume is None else volume
+        self._inner = None if volume is None else _sorted(interior(triangles, _INNER))
+        self.parts = {i: self._part(hull) for i, hull in enumerate(hulls)}
+        self._count = len(self.parts)
+        self._neighbors: dict[int, set[int]] = {i: set() for i in self.parts}
         self._joins: list[_Join] = []
-        for i in self.hulls:
+        for i in self.parts:
             for j in range(i):
-                if _touch(self.hulls[i], self.hulls[j]):
+                if _touch(self.parts[i].hull, self.parts[j].hull):
                     self._neighbors[i].add(j)
                     self._neighbors[j].add(i)
                     self._consider(i, j)
+
+    def _part(self, hull: ConvexHull) -> _Part:
+        """A piece of this hull, thinner along its shortest axis where the mesh does not fill it."""
+        vertices = hull.points[hull.vertices]
+        if self._inner is None:
+            return _Part(vertices, hull, 0.0)
+        inside = (_beyond(hull, _near(hull, self._inner)) < 0).sum()
+        hollow = 1 - inside * self._volume / len(self._inner) / hull.volume
+        if hollow < _FULL:
+            return _Part(vertices, hull, 0.0)
+        axis = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2][-1]
+        along = vertices @ axis
+        inwards = min(hollow, _MOST) * ((along.max() + along.min()) / 2 - along)
+        shift = np.abs(inwards).max()
+        inwards *= min(1.0, MOST_SURFACE / shift)
+        return _Part(vertices, shapes.hull_of(vertices + np.outer(inwards, axis)), min(shift, MOST_SURFACE))
 
     def reduce(self, max_pieces: int) -> None:
         """Makes joins, cheapest first, until none is left; below the limit of pieces only those within tolerances."""
         grown = 0.0
         while self._joins:
             join = heapq.heappop(self._joins)
-            if join.first not in self.hulls or join.second not in self.hulls:
+            if join.first not in self.parts or join.second not in self.parts:
                 continue
-            enough = len(self.hulls) <= max_pieces
+            enough = len(self.parts) <= max_pieces
             if enough and (join.depth > DEPTH or grown + join.growth > GROWTH * self._volume):
                 continue
             if not join.checked:
@@ -73,56 +105,55 @@ class _Merger:
             self._make(join)
 
     def _consider(self, i: int, j: int) -> None:
-        """Enters the join of two pieces, by the depth of the surface points in their hull."""
-        a, b = self.hulls[i], self.hulls[j]
-        hull = shapes.hull_of(np.concatenate([a.points[a.vertices], b.points[b.vertices]]))
-        boxed = ((self._surface > hull.min_bound) & (self._surface < hull.max_bound)).all(-1)
-        depth = max(0.0, -_beyond(hull, self._surface[boxed]).min(initial=0.0))
-        self._push(False, i, j, depth, max(0.0, hull.volume - a.volume - b.volume), hull)
+        """Enters the join of two pieces, by the depth of the surface points in it, or of its sides in a bent wall."""
+        a, b = self.parts[i], self.parts[j]
+        part = self._part(shapes.hull_of(np.concatenate([a.vertices, b.vertices])))
+        depth = max(part.shift, -_beyond(part.hull, _near(part.hull, self._surface)).min(initial=0.0))
+        self._push(False, i, j, depth, max(0.0, part.hull.volume - a.hull.volume - b.hull.volume), part)
 
     def _check(self, join: _Join) -> None:
         """Enters a join again, with the distance of its hull from the surface outside of the neighbouring pieces."""
-        points, _, _ = shapes.on_triangles(join.hull.points[join.hull.simplices], self._probes)
+        points, _, _ = shapes.on_triangles(join.part.hull.points[join.part.hull.simplices], self._probes)
         i, j = join.first, join.second
         for k in {i, j} | self._neighbors[i] | self._neighbors[j]:
-            points = points[_beyond(self.hulls[k], points) > _ON]
+            points = points[_beyond(self.parts[k].hull, points) > _ON]
         stands_out = self._tree.query(points)[0].max(initial=0.0)
-        self._push(True, i, j, max(join.depth, stands_out), join.growth, join.hull)
+        self._push(True, i, j, max(join.depth, stands_out), join.growth, join.part)
 
-    def _push(self, checked: bool, i: int, j: int, depth: float, growth: float, hull: ConvexHull) -> None:
+    def _push(self, checked: bool, i: int, j: int, depth: float, growth: float, part: _Part) -> None:
         """Enters a join under its cost."""
         cost = depth / MOST_SURFACE + growth / (MOST_VOLUME * self._volume)
-        heapq.heappush(self._joins, _Join(cost, checked, i, j, depth, growth, hull))
+        heapq.heappush(self._joins, _Join(cost, checked, i, j, depth, growth, part))
 
     def _make(self, join: _Join) -> None:
-        """Replaces two pieces by their hull."""
+        """Replaces two pieces by their join."""
         i, j, new = join.first, join.second, self._count
         self._count += 1
-        del self.hulls[i], self.hulls[j]
-        self.hulls[new] = join.hull
+        del self.parts[i], self.parts[j]
+        self.parts[new] = join.part
         self._neighbors[new] = (self._neighbors.pop(i) | self._neighbors.pop(j)) - {i, j}
         for k in self._neighbors[new]:
             self._neighbors[k] = self._neighbors[k] - {i, j} | {new}
             self._consider(new, k)
 
 
-def merge(pieces: list[np.ndarray], max_pieces: int, triangles: np.ndarray, volume: float) -> list[np.ndarray]:
+def merge(pieces: list[np.ndarray], max_pieces: int, triangles: np.ndarray, volume: float | None) -> list[np.ndarray]:
     """Joins neighbouring convex pieces until `max_pieces` are left, and then while the shape is preserved.
 
-    The cost of a join is the volume that its hull adds and its deviation from the surface, each as a share of the
-    tolerance (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of the deepest surface point in the
-    hull, or the distance of its farthest point from the surface, by samples. Pieces that do not touch are never joined,
-    so that more than `max_pieces` remain if there are more separate bodies.
+    The cost of a join is the volume that it adds and its deviation from the surface, each as a share of the tolerance
+    (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of the deepest surface point in the piece, the
+    way that thinning moves its sides, or the distance of its farthest point from the surface, by samples. Pieces that
+    do not touch are never joined, so that more than `max_pieces` remain if there are more separate bodies.
 
     Args:
       pieces: vertices (V, 3) of each, m.
       max_pieces: largest number of pieces.
       triangles: (F, 3, 3) corners of the surface that they approximate, m.
-      volume: volume of the object, m^3.
+      volume: volume of the object, m^3; None for an open surface, whose pieces stay as thick as they are.
     """
     merger = _Merger(pieces, triangles, volume)
     merger.reduce(max_pieces)
-    return [hull.points[hull.vertices] for hull in merger.hulls.values()]
+    return [part.hull.points[part.hull.vertices] for part in merger.parts.values()]
 
 
 def deepest(hull: ConvexHull, triangles: np.ndarray) -> float:
@@ -167,23 +198,21 @@ def simplify(vertices: np.ndarray, max_vertices: int = MAX_MESH_VERTICES) -> np.
     return center + (kept - center) * share ** (-1 / 3)
 
 
-def squeeze(vertices: np.ndarray, factor: float) -> np.ndarray:
-    """A piece (V, 3) made thinner by a factor, each side by at most `SQUEEZE`.
-
-    Hulls of bent walls fill the inner side of the bend; thinner ones have the right mean thickness.
-    """
-    middle = vertices.mean(0)
-    axis = np.linalg.svd(vertices - middle, full_matrices=False)[2][-1]
-    along = (vertices - middle) @ axis
-    center = (along.max() + along.min()) / 2
-    shift = (along - center) * max(1 - factor, 0.0)
-    thick = np.abs(shift).max()
-    return vertices - np.outer(shift * min(1.0, SQUEEZE / max(thick, 1e-12)), axis)
-
-
 def _touch(a: ConvexHull, b: ConvexHull) -> bool:
     """True if the boxes around two hulls touch."""
     return bool((a.min_bound < b.max_bound + _NEAR).all() and (b.min_bound < a.max_bound + _NEAR).all())
+
+
+def _sorted(points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) in the order of their first coordinate."""
+    return points[np.argsort(points[:, 0])]
+
+
+def _near(hull: ConvexHull, points: np.ndarray) -> np.ndarray:
+    """Those of sorted points (N, 3) that are in the box around a hull."""
+    start, end = np.searchsorted(points[:, 0], [hull.min_bound[0], hull.max_bound[0]])
+    some = points[start:end]
+    return some[((some > hull.min_bound) & (some < hull.max_bound)).all(-1)]
 
 
 def _beyond(hull: ConvexHull, points: np.ndarray) -> np.ndarray:

@@ -190,12 +190,12 @@ def test_coarse_pieces_are_replaced(tmp_path, options):
     assert abs(obj.volume_error) < 0.05
     np.testing.assert_allclose(sum(shapes.volume(piece) for piece in obj.pieces), mesh.volume, rtol=0.02)
     # The middle of the hull's longest side is 3 cm from either leg; the hull fills 36 cm^3 beside the 56 of the mesh,
-    # less what thinning takes: 2 * 0.4 mm of 20.
+    # less what thinning takes: 2 * 3 mm of 20.
     said = re.search(
         r"cut from its mesh, for its own 1 are coarser: .*most ([0-9.]+) mm off .* ([0-9.]+)% too large", obj.notes[-1]
     )
     assert abs(float(said[1]) - 30) < 0.3
-    assert abs(float(said[2]) - 100 * (92 / 56 * 0.96 - 1)) < 2
+    assert abs(float(said[2]) - 100 * (92 / 56 * 0.7 - 1)) < 2
 
 
 def test_close_pieces_are_kept(tmp_path, options, monkeypatch):
@@ -280,6 +280,18 @@ def test_scanned_objects_come_within_the_budget_and_rest(shared_objects, options
     settled = settle(obj, obj.rest_poses[0], 5.0)
     assert settled.speed < 0.01
     assert settled.moved < 0.01
+
+
+@pytest.mark.slow
+def test_a_bowl_is_as_thin_as_its_wall(tmp_path, options):
+    """A hemisphere of 12 cm with a wall of 2 mm: the hulls of its pieces alone would be half as large again."""
+    turn = np.linspace(-np.pi / 2, 0, 13)
+    outside, inside = (r * np.column_stack([np.cos(turn), np.sin(turn)]) for r in (0.06, 0.058))
+    outside[0, 0] = inside[0, 0] = 0.0
+    trimesh.creation.revolve(np.concatenate([outside, inside[::-1]]), sections=48).export(tmp_path / "bowl.stl")
+    (obj,) = objects_of(tmp_path / "bowl.stl", options)
+    assert obj.shape_reliable and abs(obj.volume_error) < 0.1
+    assert obj.surface_error < 4e-3
 
 
 def test_every_scanned_folder_is_found_as_one_decomposed_object(shared_objects):
