@@ -35,6 +35,21 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 _MOST_MEMORY = 4 << 30  # bytes of a worker
 
 
+_LONGEST = (
+    *("actors/test_physics_warp", "services/evaluate/test_evaluate", "services/grasp/test_grasp", "e2e/test_faults"),
+    *("e2e/test_train", "services/evaluate/test_shipped", "e2e/test_security", "services/assets/test_cases"),
+    *("services/serve/test_robot_loop", "services/assets/objects/test_import", "services/test_cli"),
+    *("actors/test_rollout", "services/dataset/test_dataset", "actors/test_initial", "test_congrasp"),
+)
+"""Modules of over half a minute."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest modules come first, so that at the end no worker runs one while the others wait."""
+    place = {str(ROOT / "tests" / f"{name}.py"): i for i, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: place.get(str(item.path), len(place)))
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _bounded_memory():
     """Compiled programs stay for the modules that follow, until they fill the memory."""
