@@ -63,6 +63,8 @@ $(VENV)/.$(EXTRA): pyproject.toml constraints.txt
 	@echo "Installing congrasp[$(EXTRA)] into $(VENV): some minutes the first time (dev: about 3 GB)"
 	$(PIP) install --quiet --upgrade --constraint constraints.txt pip
 	$(PIP) install --quiet --no-compile --constraint constraints.txt --editable '.[$(EXTRA)]'
+	@# pip would compile on one core
+	@$(VENV)/bin/python -m compileall -q -j 0 -x '/(tests?|OpenGL)/' $(VENV)/lib >/dev/null 2>&1 || true
 	@touch $@
 
 clean:
