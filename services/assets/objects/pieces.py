@@ -22,7 +22,7 @@ _SAMPLES, _PROBES = 6000, 100  # points on the whole surface, and on the hull of
 _NEAR = 5e-4  # m; pieces whose boxes are nearer than this are neighbours
 _ON = 1e-4  # m; points of a hull that are nearer to a piece than this belong to it
 _INNER = 30_000  # points inside of the mesh
-_FULL, _MOST = 0.02, 0.9  # hollow shares of its hull from which on a piece is thinned, and by which it is at most
+_FULL, _MOST = 0.03, 0.9  # hollow shares of its hull from which on a piece is thinned, and by which it is at most
 _LEAST = 1e-11  # m^3; smaller pieces are dropped
 
 
