@@ -151,6 +151,7 @@ class PageServer:
             ) from None
         self.routes, self._server.page = routes, self
         self.host, self.port = host, int(self._server.server_address[1])
+        self._named = set(names)
         self._names = {*_LOOPBACK, *names} if host in _LOOPBACK else None
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True, name="page")
         self._thread.start()
@@ -179,8 +180,13 @@ class PageServer:
         if not host or (self._names is not None and not {host, name} & self._names):
             shown = ascii(name)[:60]
             return f"The page is not offered as {shown}. Open {self.url} or start it with --allow-host {shown}."
-        if origin not in (None, f"http://{host}", f"https://{host}") or site not in (None, "none", "same-origin"):
-            return f"Another site sent this request. Open the page itself, at {self.url}."
+        sender = re.sub(r"^https?://|:\d*$", "", origin or "").strip("[]")
+        # A proxy may put this server's address as Host, and leave the browser's Origin.
+        ours = origin in (None, f"http://{host}", f"https://{host}") or sender in self._named
+        if not ours or site not in (None, "none", "same-origin"):
+            shown = ascii(sender)[:60]
+            proxy = f" If that is a proxy of yours, start it with --allow-host {shown}." if sender else ""
+            return f"Another site sent this request. Open the page itself, at {self.url}.{proxy}"
         return ""
 
 

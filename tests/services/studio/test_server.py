@@ -174,6 +174,12 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
     try:
         assert code(Host="localhost:9000", Origin="http://localhost:9000", Sec_Fetch_Site="same-origin") == 200
         assert code(Host="hub.example.org", Origin="https://hub.example.org") == 200
+        # nginx puts the address behind it as Host and leaves the browser's Origin.
+        own = f"127.0.0.1:{server.port}"
+        assert code(Host=own, Origin="https://hub.example.org") == 200
+        refused = page.ask("GET", "/", Host=own, Origin="https://other.example")
+        assert refused[0] == 403 and "--allow-host 'other.example'" in json.loads(refused[1])["error"]
+        assert code(Host=own, Origin="https://hub.example.org", Sec_Fetch_Site="cross-site") == 403
         assert code(Host="localhost:9000", Origin="http://localhost:9001") == 403
         assert code(Host="hub.example.org", Origin="https://evil.example") == 403
         refused = page.ask("GET", "/", Host="other.example.org")
