@@ -1,4 +1,5 @@
-# quickstart: set up and train a small policy.  test, test-all, coverage, lint: check the code.  docs: build the site.  bench: install its peers, print the benchmark tables.
+# quickstart: set up and train a small policy.  test, test-all, coverage, lint: check the code.  newest: test with the newest
+# versions that pyproject.toml admits.  docs: build the site.  bench: install its peers, print the benchmark tables.
 # Everything runs in .venv, which the first target makes; another interpreter: make quickstart PYTHON=python3.12
 
 FAST := tests/test_architecture.py $(addprefix tests/common/,$(addsuffix .py,test_rotations test_motors test_priority \
@@ -8,6 +9,7 @@ supported := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do $$p -c '$(supported)' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
 EXTRA ?= dev
+CONSTRAINTS ?= constraints.txt
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
 CACHE := $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/congrasp
 
@@ -16,7 +18,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CACHE)/jax
 # Modules are compiled when they are first imported: an environment that forbids it would pay in every process again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: quickstart test test-all check coverage lint docs bench install clean
+.PHONY: quickstart test test-all newest check coverage lint docs bench install clean
 .DEFAULT_GOAL := quickstart
 
 # What the first minutes need; the other targets add the development dependencies.
@@ -28,6 +30,9 @@ quickstart:
 test test-all: install
 	@tests/install_browser.sh $(VENV)/bin/python
 	JAX_PLATFORMS=cpu $(VENV)/bin/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not gpu$(if $(filter test,$@), and not slow)" $(ARGS)
+
+newest:
+	$(MAKE) test VENV=.venv-newest CONSTRAINTS=/dev/null
 
 # Without processes, engines and pictures: about a minute.
 check: lint
@@ -61,8 +66,8 @@ $(VENV)/.$(EXTRA): pyproject.toml constraints.txt
 	@test -x $(VENV)/bin/python || { echo "Making $(VENV) with $(PYTHON)"; $(PYTHON) -m venv $(VENV); } || \
 	  { echo "Python's venv module does not work here. On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 2; }
 	@echo "Installing congrasp[$(EXTRA)] into $(VENV): some minutes the first time (dev: about 3 GB)"
-	$(PIP) install --quiet --upgrade --constraint constraints.txt pip
-	$(PIP) install --quiet --no-compile --constraint constraints.txt --editable '.[$(EXTRA)]'
+	$(PIP) install --quiet --upgrade --constraint $(CONSTRAINTS) pip
+	$(PIP) install --quiet --no-compile --constraint $(CONSTRAINTS) --editable '.[$(EXTRA)]'
 	@# pip would compile on one core
 	@$(VENV)/bin/python -m compileall -q -j 0 -x '/(tests?|OpenGL)/' $(VENV)/lib >/dev/null 2>&1 || true
 	@touch $@
