@@ -318,6 +318,8 @@ class _Learner:
         assert messages is not None, "an available batch cannot disappear"
         mine = summary(messages, self._hub.lag)
         batch = collate([message.arrays for message in messages], self._form.arrays)
+        lags = [self._hub.lag(int(message.meta["version"])) for message in messages]
+        batch["lag"] = np.repeat(np.array(lags, np.int32), self._form.worlds)
         try:
             with self._ranks.watchdog(), stage("first update"):
                 self._state, metrics = self._algorithm.update(self._state, batch, self._ranks.mesh)

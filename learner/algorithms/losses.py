@@ -34,6 +34,8 @@ class Sample(NamedTuple):
     """(M,) normalised."""
     target: Array
     """(M,) normalised return."""
+    stale: Array
+    """(M,) bool, True where the behaviour policy is of an earlier version than the proximal one."""
     privileged: Array | None = None
     """(M, P) normalised privileged inputs of the critic, if it has any."""
 
@@ -56,6 +58,12 @@ class Terms(NamedTuple):
     """Mean KL(proximal || current), nats."""
     clip_fraction: Array
     """Share of the samples whose ratio lies outside the clip range."""
+    clip_fraction_rising: Array
+    """Share of the samples with a positive advantage and a ratio above the range: the clip holds their probability."""
+    clip_fraction_falling: Array
+    """Share of the samples with a negative advantage and a ratio below the range."""
+    clip_fraction_stale: Array
+    """Share outside the range among the stale samples; 0 without any."""
 
 
 def importance_weight(log_proximal: Array, log_behaviour: Array, maximum: Array | float) -> Array:
@@ -76,13 +84,18 @@ def objective(
     """Scalar to minimise and its terms: surrogate + c_v (V - target)^2 - c_e entropy, means over the minibatch."""
     mean, log_std = network.policy(params, layout, sample.observation, exact=False)
     log_ratio = network.log_probability(mean, log_std, sample.action) - sample.log_proximal
+    ratio, clip = jnp.exp(log_ratio), coefficients.clip
+    outside = jnp.abs(ratio - 1.0) > clip
     error = network.value(params, layout, sample.observation, sample.privileged) - sample.target
     terms = Terms(
         policy_loss=jnp.mean(surrogate(log_ratio, sample.advantage, sample.weight, coefficients.clip)),
         value_loss=jnp.mean(error * error),
         entropy=network.entropy(log_std),
         kl=jnp.mean(network.kl_divergence(sample.mean_proximal, log_std_proximal, mean, log_std)),
-        clip_fraction=jnp.mean((jnp.abs(jnp.exp(log_ratio) - 1.0) > coefficients.clip).astype(jnp.float32)),
+        clip_fraction=jnp.mean(outside),
+        clip_fraction_rising=jnp.mean((sample.advantage > 0.0) & (ratio > 1.0 + clip)),
+        clip_fraction_falling=jnp.mean((sample.advantage < 0.0) & (ratio < 1.0 - clip)),
+        clip_fraction_stale=jnp.sum(outside & sample.stale) / jnp.maximum(jnp.sum(sample.stale), 1),
     )
     total = terms.policy_loss + coefficients.value * terms.value_loss - coefficients.entropy * terms.entropy
     return total, terms

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh, PartitionSpec
 
@@ -31,9 +32,9 @@ from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
 from congrasp.learner.algorithms import gae, losses
 from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
 from congrasp.learner.batch import partition_specs
-from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
+from congrasp.learner.distributed.collectives import AXIS, REPLICATED, Collectives, shard, shard_map, unreplicate
 
-_SPECS = partition_specs(RECORDABLE)
+_SPECS = {**partition_specs(RECORDABLE), "lag": PartitionSpec(AXIS)}
 _CHECKED_INPUTS = tuple(name for name, spec in {**RECORDED, **PRIVILEGED}.items() if spec.dtypes != ("bool",))
 _CHECKED = (
     *_CHECKED_INPUTS,
@@ -129,7 +130,9 @@ class PPO:
                 f"A batch of {batch['reward'].size} transitions cannot be split into {config.minibatches} minibatches.",
                 "Use fewer minibatches, more environments or longer rollouts.",
             )
-        arrays = shard({name: batch[name] for name in self.batch_schema}, mesh, _specs(self.batch_schema))
+        lag = batch.get("lag", np.zeros(batch["reward"].shape[1], np.int32))
+        arrays = {**{name: batch[name] for name in self.batch_schema}, "lag": lag}
+        arrays = shard(arrays, mesh, _specs(arrays))
         moments = {name: _observed(arrays[name], mesh=mesh) for name in _NORMALISED if name in arrays}
         frozen = {name: _first(getattr(state, name), found, mesh) for name, found in moments.items()}
         given = _Given(
@@ -282,6 +285,7 @@ def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: L
         weight=jnp.where(hyper["decoupled"], weight, 1.0),
         advantage=(advantage - collectives.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
         target=(returns - given.returns.shift) * given.returns.scale,
+        stale=jnp.broadcast_to(batch["lag"] > 0, reward.shape),
         privileged=batch.get("privileged"),
     )
     return _Evaluation(
@@ -341,7 +345,11 @@ def _batch_metrics(given: _Given, evaluation: _Evaluation, collectives: Collecti
     variance = collectives.variance(evaluation.returns)
     residual = collectives.variance(evaluation.returns - evaluation.value)
     truncated = evaluation.log_weight > jnp.log(given.hyper["importance_max"])
+    fresh = ~evaluation.samples.stale
+    gap, share = collectives.mean((jnp.mean(jnp.abs(evaluation.log_weight) * fresh), jnp.mean(fresh)))
     return {
+        # Actor and learner evaluate the same version in different programs: this is rounding, not lag.
+        "log_probability_gap": gap / jnp.maximum(share, 1e-9),
         "importance_max": collectives.max(jnp.max(evaluation.weight)),
         "explained_variance": 1.0 - residual / (variance + 1e-8),
         "advantage_std": evaluation.advantage_std,

@@ -56,6 +56,7 @@ def case():
         weight=losses.importance_weight(log_proximal, log_proximal, 4.0),
         advantage=rng.normal(size=64).astype(np.float32),
         target=rng.normal(size=64).astype(np.float32),
+        stale=np.arange(64) >= 48,
     )
     return params, log_std, sample
 
@@ -86,6 +87,22 @@ def test_fresh_data_reduce_it_to_plain_ppo(case):
     assert 0.0 < terms.clip_fraction < 1.0
     np.testing.assert_allclose(loss, expected, rtol=1e-6)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), gradient, expected_gradient)
+
+
+def test_the_clip_is_counted_by_the_end_it_holds_and_by_staleness(case):
+    """Ratios of 1.5 and .5 lie outside 1 +- .2, and 1 within; of the sixteen stale samples eight lie outside."""
+    params, log_std, sample = case
+    ratio = np.ones(64, np.float32)
+    ratio[:8], ratio[8:12], ratio[48:56] = 1.5, 0.5, 0.5
+    advantage = np.where(np.arange(64) < 48, 1.0, -1.0).astype(np.float32)
+    mean, log_std_now = network.policy(params, LAYOUT, sample.observation, exact=False)
+    now = network.log_probability(mean, log_std_now, sample.action)
+    moved = sample._replace(log_proximal=now - jnp.log(ratio), advantage=advantage)
+    _, terms = objective(params, LAYOUT, log_std, moved, losses.Coefficients(0.2, 0.0, 0.0))
+    assert terms.clip_fraction == 20 / 64
+    assert terms.clip_fraction_rising == 8 / 64  # the four below the range have a positive advantage: nothing holds them
+    assert terms.clip_fraction_falling == 8 / 64
+    assert terms.clip_fraction_stale == 8 / 16
 
 
 def test_stale_data_do_not_use_up_the_trust_region(case):

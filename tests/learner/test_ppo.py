@@ -99,6 +99,17 @@ def test_moving_the_value_statistics_does_not_move_the_values():
     np.testing.assert_allclose(values(after), before, rtol=1e-4, atol=1e-4)
 
 
+def test_rounding_between_actor_and_learner_is_told_apart_from_lag():
+    """Rollouts of the same version that report log probabilities .01 off show as a gap of .01, older ones not at all."""
+    state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 1))  # the first update normalises by its own batch
+    batch = rollout(toy.bundle_of(state), 0)
+    batch["log_probability"] = batch["log_probability"] + np.where(np.arange(64) < 32, 0.01, 0.5).astype(np.float32)
+    batch["lag"] = (np.arange(64) >= 32).astype(np.int32)
+    _, metrics = step(state, batch)
+    assert metrics["log_probability_gap"] == pytest.approx(0.01, rel=1e-2)
+    assert metrics["behaviour_kl"] == pytest.approx(0.255, rel=1e-3)
+
+
 def test_truncated_ends_have_the_td_errors_of_both_rules():
     """With a critic of zeros but for its bias, V = 0.7 everywhere."""
     state = fresh()
