@@ -100,7 +100,7 @@ def test_the_clip_is_counted_by_the_end_it_holds_and_by_staleness(case):
     moved = sample._replace(log_proximal=now - jnp.log(ratio), advantage=advantage)
     _, terms = objective(params, LAYOUT, log_std, moved, losses.Coefficients(0.2, 0.0, 0.0))
     assert terms.clip_fraction == 20 / 64
-    assert terms.clip_fraction_rising == 8 / 64  # the four below the range have a positive advantage: nothing holds them
+    assert terms.clip_fraction_rising == 8 / 64  # nothing holds the four below: their advantage is positive
     assert terms.clip_fraction_falling == 8 / 64
     assert terms.clip_fraction_stale == 8 / 16
 

@@ -100,7 +100,7 @@ def test_moving_the_value_statistics_does_not_move_the_values():
 
 
 def test_rounding_between_actor_and_learner_is_told_apart_from_lag():
-    """Rollouts of the same version that report log probabilities .01 off show as a gap of .01, older ones not at all."""
+    """Rollouts of the same version with log probabilities .01 off show as a gap of .01, older ones not at all."""
     state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 1))  # the first update normalises by its own batch
     batch = rollout(toy.bundle_of(state), 0)
     batch["log_probability"] = batch["log_probability"] + np.where(np.arange(64) < 32, 0.01, 0.5).astype(np.float32)
