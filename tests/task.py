@@ -39,7 +39,7 @@ CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
 
 @functools.cache
 def bank() -> ConstraintBank:
-    """The constraint bank of `OBJECTS`; on disk, as those of large pools are, for the other workers and the next run."""
+    """The constraint bank of `OBJECTS`; kept on disk like those of large pools, for the other workers."""
     folder = os.path.join(tempfile.gettempdir(), "congrasp-tests-banks")
     with mock.patch.dict(os.environ, XDG_CACHE_HOME=folder), mock.patch.object(build, "LEAST_OBJECTS", 1):
         return build.build_bank(HAND, TASK, OBJECTS, 0)

@@ -96,7 +96,9 @@ def lying(bank):
 def _grasps(angle: float, count: int = 4) -> Grasps:
     """Grasps of the graspable region of the second object from straight above, of which `count` were found."""
     second, above = jnp.ones(4, int), jnp.array([[0.0, 0.0, 0.2]] * 4)
-    return Grasps(jnp.arange(4) < count, second, second, jnp.full((4, F), angle), above, jnp.stack([_pointing(-1.0)] * 4))
+    return Grasps(
+        jnp.arange(4) < count, second, second, jnp.full((4, F), angle), above, jnp.stack([_pointing(-1.0)] * 4)
+    )
 
 
 def test_a_grasp_replaces_one_reference_of_its_object_and_region(lying):
