@@ -38,7 +38,6 @@ from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.hub.admission import Admission, Ranges
-from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
@@ -49,9 +48,8 @@ from congrasp.services.record.writer import LogWriter
 from congrasp.services.serve.requests import Layout
 from congrasp.services.serve.server import PolicyServer
 from congrasp.services.train.command import untrained
-from tests.cluster import bundle
 from tests.episodes import episode
-from tests.rollouts import random_arrays
+from tests.rollouts import bundle, learner_hub, rollout
 from tests.services.test_hostile_files import constraint_set
 from tests.services.test_hostile_inputs import BVH
 
@@ -163,14 +161,14 @@ def memory():
 def requests():
     """A valid message for every key that is asked, and for every one that is published under."""
     who = {"actor": "NAME", "incarnation": "01"}
-    rollout = {**who, "sequence": 0, "version": 0, "run_id": "e", "schema": "s", "steps": 6, "ticket": "t"}
-    named = {**random_arrays(FORM), "episode/success": np.ones(1, np.float32)}
+    made = rollout(0.5, FORM, **who, sequence=0, run_id="e", ticket="t")
+    named = {**made.arrays, "episode/success": np.ones(1, np.float32)}
     asked = {
         KEYS.config: Message(),
         KEYS.status: Message(),
         KEYS.weights: Message(meta={"newer_than": 3, "session_id": "x"}),
         KEYS.ticket("NAME"): Message(meta={**who, "ticket": "t", "give_back": False}),
-        KEYS.rollout("NAME"): Message({name: np.clip(a, -1, 1) for name, a in named.items()}, rollout),
+        KEYS.rollout("NAME"): Message(named, made.meta),
         KEYS.act: Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY),
         KEYS.health: Message(),
     }
@@ -201,11 +199,9 @@ def served(endpoint, folder):
 
     ranges = Ranges(np.full(32, 1.0), 10.0, 100.0, {"episode/success": (0.0, 1.0)})
     with ZenohTransport(listen=[endpoint]) as transport:
-        hub = LearnerHub(
-            transport, run="chaos", config_json="{}", run_id="e", schema="s", form=FORM,
-            staleness=StalenessManager(1, 2, ticket_seconds=1.0), admission=Admission(lambda: ranges),
-        )  # fmt: skip
-        hub.publish_weights(bundle(0, "e"), 0)
+        staleness = StalenessManager(1, 2, ticket_seconds=1.0)
+        hub = learner_hub(transport, "chaos", form=FORM, staleness=staleness, admission=Admission(lambda: ranges))
+        hub.publish_weights(bundle(0), 0)
         transport.serve(KEYS.act, act, workers=2, depth=64)
         transport.serve(KEYS.health, lambda key, request: Message(meta={"ready": True}))
         with Recorder(transport, "chaos", folder, warn=lambda text: None) as recorder:
@@ -244,7 +240,7 @@ def test_mutated_messages_at_every_key(tmp_path):
         assert memory() - first < GROWTH, f"grew by {(memory() - first) >> 20} MiB in {sent} messages"
         # An honest one is served as ever.
         hub.next_batch(2, 0.0)
-        hub.publish_weights(bundle(1, "e"), 1)
+        hub.publish_weights(bundle(1), 1)
         fine = Message(meta={"actor": "77777.a", "incarnation": "1", "ticket": "t"})
         assert raw.query(KEYS.ticket("77777.a"), fine, timeout=10.0).meta["version"] == 1
         raw.query(KEYS.act, Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY), timeout=10.0)
