@@ -6,6 +6,7 @@ file.
 """
 
 import contextlib
+import dataclasses
 import itertools
 import json
 import os
@@ -16,8 +17,6 @@ import subprocess
 import sys
 import time
 
-import numpy as np
-
 from congrasp.actors.process.link import ActorLink, RunFinished
 from congrasp.common.errors import TransportError
 from congrasp.common.io.journal import AUDIT, Journal
@@ -25,36 +24,21 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.wire.codec import Message
-from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
 from congrasp.services.cli.audit import FAULTS
 from congrasp.services.cli.audit import compare as audit
+from tests.rollouts import FORM, bundle, learner_hub, rollout
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-KEYS, RUN_ID = Keys("chaos"), "e"
-T, B, D, A = 20, 16, 32, 4
+KEYS = Keys("chaos")
 BATCH = 2
 _PATIENCE = 240.0  # seconds, on a machine that does much else
 
 
-def bundle(version, run_id):
-    arrays = {f"{kind}/{name}": np.zeros(shape) for kind, shape in (("observation", D), ("value", ()))
-              for name in ("mean", "m2")}  # fmt: skip
-    arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": np.zeros(1000, np.float32)}
-    meta = {"version": version, "run_id": run_id, "schema": "s", "hand": "human", "layout": [], "action_size": A}
-    return Message(arrays, {**meta, "format": 1})
-
-
-def rollout(steps, value, version):
-    """All values are the same, so that a corrupted one shows."""
-    arrays = RolloutForm(steps, B, D, A, half=True).zeros()
-    for array in arrays.values():
-        if array.dtype != bool:
-            array.fill(value)
-    return Message(arrays, {"version": version, "schema": "s", "steps": steps * B})
+def form_of(steps):
+    return dataclasses.replace(FORM, steps=steps)
 
 
 class SlowLog(WriteAheadLog):
@@ -72,7 +56,7 @@ class SlowLog(WriteAheadLog):
 # --- the two roles ---
 
 
-def run_learner(folder, endpoint, *, steps=T, every=1, pause=0.0, disk=0.0):
+def run_learner(folder, endpoint, *, steps=FORM.steps, every=1, pause=0.0, disk=0.0):
     """Consumes batches and checkpoints after `every` updates, until it is told to stop (SIGTERM) or killed.
 
     Its disk takes `disk` seconds for a rollout.
@@ -86,14 +70,12 @@ def run_learner(folder, endpoint, *, steps=T, every=1, pause=0.0, disk=0.0):
     stopped = []
     signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
     with urls.listen(endpoint, "learner") as transport:
-        hub = LearnerHub(
-            transport, run="chaos", config_json="{}", run_id=RUN_ID, schema="s",
-            form=RolloutForm(steps, B, D, A, half=True), staleness=StalenessManager(1, BATCH),
-            durable=saved["durable"], audit=AuditLog(folder, "0"),
-            log=SlowLog(folder / FOLDER / "0", 1, seconds=disk),
+        hub = learner_hub(
+            transport, "chaos", form=form_of(steps), staleness=StalenessManager(1, BATCH), durable=saved["durable"],
+            audit=AuditLog(folder, "0"), log=SlowLog(folder / FOLDER / "0", 1, seconds=disk),
         )  # fmt: skip
         save(published, version)
-        hub.publish_weights(bundle(version, RUN_ID), version)
+        hub.publish_weights(bundle(version), version)
         print("ready", flush=True)
         updates = 0
         while not stopped:
@@ -108,7 +90,7 @@ def run_learner(folder, endpoint, *, steps=T, every=1, pause=0.0, disk=0.0):
             time.sleep(pause)
             version, updates = version + 1, updates + 1
             save(published, version)
-            hub.publish_weights(bundle(version, RUN_ID), version)
+            hub.publish_weights(bundle(version), version)
             if updates % every == 0:
                 durable = hub.durable()
                 save(path, {"durable": durable, "history": history, "version": version})
@@ -125,7 +107,7 @@ def save(path, content):
     os.replace(temporary, path)
 
 
-def run_actor(folder, endpoint, *, name, steps=T, pause=0.0, request_timeout=3.0):
+def run_actor(folder, endpoint, *, name, steps=FORM.steps, pause=0.0, request_timeout=3.0):
     """Makes rollouts until the run is finished; writes each outcome down."""
     journal = Journal(folder / AUDIT / f"{name}.jsonl")
     with (
@@ -148,7 +130,7 @@ def work(link, steps, pause, log):
         version = pulled.meta["version"] if pulled else version
         time.sleep(pause)
         entry = {"incarnation": link.incarnation, "sequence": sequence}
-        link.upload(rollout(steps, sequence % 1000, version), ticket).add_done_callback(
+        link.upload(rollout(sequence % 1000, form_of(steps), version=version), ticket).add_done_callback(
             lambda f, entry=entry: log.write(json.dumps({**entry, "outcome": outcome_of(f)}) + "\n")
         )
 

@@ -1,51 +1,39 @@
-"""Small valid messages for tests of the wire."""
+"""A learner's end, and small valid messages for it."""
+
+from typing import Any
 
 import numpy as np
 
+from congrasp.common.transport.base import Transport
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.schema import RolloutForm
+from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.staleness import StalenessManager
 
-OBSERVATION, ACTION, SCHEMA = 7, 3, "schema"
-FORM = RolloutForm(steps=4, worlds=2, observation=OBSERVATION, action=ACTION, half=True)
-
-
-def random_arrays(form: RolloutForm, seed: int = 0) -> dict[str, np.ndarray]:
-    """The arrays of a rollout with normal values; no episode ends."""
-    rng = np.random.default_rng(seed)
-    return {
-        name: zeros if zeros.dtype == bool else rng.normal(size=zeros.shape).astype(zeros.dtype)
-        for name, zeros in form.zeros().items()
-    }
+FORM = RolloutForm(steps=20, worlds=16, observation=32, action=4, half=True)
+RUN_ID, SCHEMA = "e", "s"
 
 
-def rollout(
-    actor: str = "a", incarnation: str = "1", sequence: int = 0, version: int = 0, run_id: str = "e"
-) -> Message:
-    """A rollout in which one episode ended."""
-    arrays = {**random_arrays(FORM, sequence), "episode/success": np.ones(1, np.float32)}
-    meta = {
-        "actor": actor,
-        "incarnation": incarnation,
-        "sequence": sequence,
-        "version": version,
-        "run_id": run_id,
-        "schema": SCHEMA,
-        "steps": FORM.steps * FORM.worlds,
-    }
-    return Message(arrays, meta)
+def rollout(value: float = 0.0, form: RolloutForm = FORM, **meta: Any) -> Message:
+    """A rollout whose numbers are all the same, so that a corrupted one shows."""
+    arrays = form.zeros()
+    for array in arrays.values():
+        if array.dtype != bool:
+            array.fill(value)
+    return Message(arrays, {"version": 0, "schema": SCHEMA, "steps": form.steps * form.worlds, **meta})
 
 
-def bundle(version: int, run_id: str = "e") -> Message:
-    """A policy bundle with one array."""
-    meta = {
-        "version": version,
-        "run_id": run_id,
-        "schema": SCHEMA,
-        "hand": "human",
-        "layout": [],
-        "action_size": ACTION,
-        "network": {},
-        "task": {},
-        "format": 1,
-    }
-    return Message({"actor/w": np.full(3, version, np.float32)}, meta)
+def bundle(version: int, run_id: str = RUN_ID, form: RolloutForm = FORM, parameters: int = 1000) -> Message:
+    """A policy whose parameters are its version."""
+    shapes = {"observation": (form.observation,), "value": ()}
+    arrays = {f"{kind}/{name}": np.zeros(shape) for kind, shape in shapes.items() for name in ("mean", "m2")}
+    arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(())}
+    arrays["actor/w"] = np.full(parameters, version, np.float32)
+    meta = {"version": version, "run_id": run_id, "schema": SCHEMA, "hand": "human", "layout": [], "format": 1}
+    return Message(arrays, {**meta, "action_size": form.action})
+
+
+def learner_hub(transport: Transport, run: str, **options: Any) -> LearnerHub:
+    """The learner's end of a run; options are those of `LearnerHub`."""
+    defaults = {"config_json": "{}", "run_id": RUN_ID, "schema": SCHEMA, "form": FORM}
+    return LearnerHub(transport, run=run, **{**defaults, "staleness": StalenessManager(1, 2), **options})

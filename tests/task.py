@@ -4,8 +4,11 @@ Modules that share hand, task, policy and batch share compiled programs, in one 
 """
 
 import functools
+import os
+import tempfile
 from collections.abc import Sequence
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +25,8 @@ from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.sampling import build
 from congrasp.common.task.sampling.bank import ConstraintBank
-from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.types import Array
 from congrasp.services.train.command import untrained
 
@@ -36,8 +39,16 @@ CONFIG = RunConfig(task=TASK, network=NetworkConfig(hidden=(16,), encoder=4))
 
 @functools.cache
 def bank() -> ConstraintBank:
-    """The constraint bank of `OBJECTS`."""
-    return build_bank(HAND, TASK, OBJECTS, 0)
+    """The constraint bank of `OBJECTS`; kept on disk like those of large pools, for the other workers."""
+    folder = os.path.join(tempfile.gettempdir(), "congrasp-tests-banks")
+    with mock.patch.dict(os.environ, XDG_CACHE_HOME=folder), mock.patch.object(build, "LEAST_OBJECTS", 1):
+        return build.build_bank(HAND, TASK, OBJECTS, 0)
+
+
+def bank_of(index: int, points: int) -> ConstraintBank:
+    """The constraint bank of one of `OBJECTS`, with its first surface points."""
+    own = jax.tree.map(lambda rows: rows[index : index + 1], bank())
+    return own._replace(**{name: getattr(own, name)[:, :points] for name in ("points", "avoid", "normals")})
 
 
 @functools.cache

@@ -86,68 +86,47 @@ def test_an_object_that_cannot_be_approached_is_named():
         build_bank(HAND, TASK, [lifted], 0)
 
 
-def test_a_grasp_replaces_one_reference_of_its_object_and_region(bank):
-    found = jnp.array([True, False])
-    grasps = Grasps(
-        found,
-        jnp.array([1, 0]),
-        jnp.array([1, 0]),
-        jnp.full((2, F), 0.123),
-        jnp.array([[0.0, 0.0, 0.2]] * 2),
-        jnp.stack([_pointing(-1.0)] * 2),
-    )
-    # A grasp from straight above is possible where the object is not turned.
+@pytest.fixture(scope="module")
+def lying(bank):
+    """The bank with objects in no pose that forbids a grasp from straight above."""
     flat = bank._replace(rest=bank.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
-    used = flat._replace(pose_valid=jnp.ones_like(flat.pose_valid).at[1, 1, :, 7].set(False))
-    new = renew(HAND, TASK, used, grasps, jax.random.key(1))
+    return flat._replace(pose_valid=jnp.ones_like(flat.pose_valid))
+
+
+def _grasps(angle: float, count: int = 4) -> Grasps:
+    """Grasps of the graspable region of the second object from straight above, of which `count` were found."""
+    second, above = jnp.ones(4, int), jnp.array([[0.0, 0.0, 0.2]] * 4)
+    return Grasps(
+        jnp.arange(4) < count, second, second, jnp.full((4, F), angle), above, jnp.stack([_pointing(-1.0)] * 4)
+    )
+
+
+def test_a_grasp_replaces_one_reference_of_its_object_and_region(lying):
+    grasp, key = _grasps(0.123, 1), jax.random.key(1)
+    used = lying._replace(pose_valid=lying.pose_valid.at[1, 1, :, 7].set(False))
+    new = renew(HAND, TASK, used, grasp, key)
     assert np.flatnonzero((new.pose_q != used.pose_q).any(-1)[1, 1]).tolist() == [7]  # where there was none to use
-    flat = flat._replace(pose_valid=jnp.ones_like(flat.pose_valid))
-    new = renew(HAND, TASK, flat, grasps, jax.random.key(1))
-    changed = np.asarray((new.pose_q != flat.pose_q).any(-1))
+    new = renew(HAND, TASK, lying, grasp, key)
+    changed = np.asarray((new.pose_q != lying.pose_q).any(-1))
     assert changed[1, 1].sum() == 1 and changed.sum() == 1
     (slot,) = np.flatnonzero(changed[1, 1])
     np.testing.assert_allclose(new.pose_q[1, 1, slot], 0.123)
     np.testing.assert_allclose(new.trajectory_position[1, 1, slot, -1], [0, 0, 0.2], atol=2e-3)
     others = np.delete(np.arange(POSES), slot)
-    np.testing.assert_array_equal(new.trajectory_position[1, 1, others], flat.trajectory_position[1, 1, others])
-    np.testing.assert_array_equal(new.pose_valid[0], flat.pose_valid[0])
-    nothing = renew(HAND, TASK, flat, grasps._replace(found=jnp.zeros(2, bool)), jax.random.key(1))
-    jax.tree.map(np.testing.assert_array_equal, nothing, flat)
+    np.testing.assert_array_equal(new.trajectory_position[1, 1, others], lying.trajectory_position[1, 1, others])
+    np.testing.assert_array_equal(new.pose_valid[0], lying.pose_valid[0])
+    nothing = renew(HAND, TASK, lying, _grasps(0.123, 0), key)
+    jax.tree.map(np.testing.assert_array_equal, nothing, lying)
 
 
-def test_half_of_the_references_stay_as_the_closing_hand_gave_them(bank):
-    many = 64
-    grasps = Grasps(
-        jnp.ones(many, bool),
-        jnp.ones(many, int),
-        jnp.ones(many, int),
-        jnp.full((many, F), 0.123),
-        jnp.array([[0.0, 0.0, 0.2]] * many),
-        jnp.stack([_pointing(-1.0)] * many),
-    )
-    flat = bank._replace(rest=bank.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
-    flat = flat._replace(pose_valid=jnp.ones_like(flat.pose_valid))
-    new = renew(HAND, TASK, flat, grasps, jax.random.key(1))
-    changed = np.asarray((new.pose_q != flat.pose_q).any(-1))[1, 1]
-    np.testing.assert_array_equal(changed, np.arange(POSES) < POSES // 2)
-    assert np.asarray(new.grasps).tolist() == [[0, 0], [0, many]]
-
-
-def test_own_references_are_of_all_ages_of_the_policy(bank):
+def test_half_of_the_references_become_own_ones_of_all_ages_of_the_policy(lying):
     """Of 64 generations of 4 grasps for 10 places, the last half is expected in half of the places."""
-    flat = bank._replace(rest=bank.rest.at[:, :].set(jnp.array([0, 0, 0.3, 1.0, 0, 0, 0])))
-    now = flat._replace(pose_valid=jnp.ones_like(flat.pose_valid))
-    each = np.ones(4, int)
+    now = lying
     for age in range(64):
-        grasps = Grasps(
-            jnp.ones(4, bool),
-            jnp.array(each),
-            jnp.array(each),
-            jnp.full((4, F), age / 100),
-            jnp.array([[0.0, 0.0, 0.2]] * 4),
-            jnp.stack([_pointing(-1.0)] * 4),
-        )
-        now = renew(HAND, TASK, now, grasps, jax.random.key(age))
+        now = renew(HAND, TASK, now, _grasps(age / 100), jax.random.key(age))
+    changed = np.asarray((now.pose_q != lying.pose_q).any(-1))[1, 1]
+    np.testing.assert_array_equal(changed, np.arange(POSES) < POSES // 2)
+    assert np.asarray(now.grasps).tolist() == [[0, 0], [0, 256]]
     ages = np.asarray(now.pose_q)[1, 1, : POSES // 2, 0] * 100
     assert np.ptp(ages) > 24 and 1 <= (ages < 32).sum() <= 9
 

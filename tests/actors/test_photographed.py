@@ -13,7 +13,6 @@ from congrasp.common import rotations
 from congrasp.common.task import observation, privileged
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.control import decode
-from congrasp.common.task.sampling.build import build_bank
 from tests import task as suite
 from tests.scenes import evaluated
 from tests.task import HAND
@@ -33,7 +32,7 @@ def running():
 
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
     worker = RolloutWorker(
-        HAND, TASK, physics, build_bank(HAND, TASK, OBJECTS, 0), suite.commanded, batch=BATCH, seed=0,
+        HAND, TASK, physics, suite.bank_of(1, TASK.surface_points), suite.commanded, batch=BATCH, seed=0,
         half_precision=False, traced="all", taught=True, privileged=OBJECTS,
     )  # fmt: skip
     return worker, worker.collect(suite.command(fingers=0.8), 18)

@@ -82,6 +82,7 @@ def _agrees_with_native(objects: Sequence[GraspObject], start: ResetState) -> No
 
 
 @pytest.mark.timeout(900)
+@pytest.mark.slow
 def test_primitives_and_meshes_of_one_pool_agree_with_native(start):
     _agrees_with_native(OBJECTS, start)
 
@@ -216,6 +217,7 @@ def test_other_objects_need_no_compiling_and_environments_under_way_keep_theirs(
     native.close()
 
 
+@pytest.mark.slow
 def test_a_compiled_loop_is_the_same_as_single_steps(start):
     """Resets in a branch, two loops after one another, and states that are used twice."""
     warp = warp_engine(OBJECTS)

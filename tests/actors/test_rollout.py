@@ -15,11 +15,9 @@ from congrasp.actors.rollout import finished_episodes
 from congrasp.actors.worker import RolloutWorker
 from congrasp.common import chance, rotations
 from congrasp.common.hands.kinematics import capsules, grasp_frame, keypoints, link_transforms
-from congrasp.common.objects import procedural
 from congrasp.common.task.constraints import blocks
 from congrasp.common.task.geometry import hand_center
 from congrasp.common.task.observation import layout
-from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.types import CONTACTS_PER_LINK, Action
 from tests import task as suite
 from tests.task import BATCH, HAND, TASK
@@ -116,8 +114,7 @@ def test_rollouts_go_through_whole_episodes_and_on():
 
 
 def _replaced_objects_rest_where_they_were_placed(worker):
-    others = procedural.generate_many(4, 50, ("can", "dish", "wrench", "piggy"))
-    bank = build_bank(HAND, TASK, others, 1)
+    others, bank = suite.OBJECTS[::-1], jax.tree.map(lambda rows: rows[::-1], suite.bank())
     worker.replace_objects(others, bank)
     worker.restart()
     index = np.asarray(worker.state.reset_state.object_index)

@@ -13,7 +13,6 @@ from congrasp.common.hands.motors import motor_positions
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import observation, privileged
 from congrasp.common.task.config import SensingConfig, TaskConfig
-from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.teaching import extra
 from tests import task as suite
 from tests.scenes import evaluated
@@ -36,7 +35,7 @@ def late():
     The wrist follows its guidance while the fingers close.
     """
     physics = NativePhysics(HAND, TASK, OBJECTS, 1)
-    bank = build_bank(HAND, TASK, OBJECTS, 0)
+    bank = suite.bank_of(1, TASK.surface_points)
     running = RolloutWorker(
         HAND, TASK, physics, bank, suite.commanded, batch=BATCH, seed=0, half_precision=False, traced="all",
         taught=True, privileged=OBJECTS,

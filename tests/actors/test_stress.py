@@ -227,7 +227,8 @@ def test_pushes_reach_the_object_through_the_environment():
     np.testing.assert_allclose(way[-1, :, 1], 0.0, atol=5e-3)
 
 
-def test_what_follows_the_hold_changes_no_metric_and_measures_no_action():
+def test_what_follows_the_hold_changes_no_metric_and_measures_no_action(monkeypatch):
+    monkeypatch.setattr(protocols, "PUSH_SECONDS", 0.05)
     steps, after = TASK.approach_steps + TASK.hold_steps, protocols.stress_steps(TASK)
     plain = suite.worker(renewed=False)
     conditions, acts = suite.episodes(BATCH), suite.command(fingers=0.5)

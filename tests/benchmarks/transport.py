@@ -35,10 +35,11 @@ from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
+from tests.rollouts import SCHEMA, bundle, learner_hub
 
 _FORM = RolloutForm(steps=20, worlds=340, observation=534, action=26, half=True)
 """Of the human hand's rollouts; these have 8.0 MB."""
-_RUN, _RUN_ID, _SCHEMA = "bench", "id", "schema"
+_RUN = "bench"
 _BATCH = 4
 _WARM_UP = 1.0  # seconds that are not counted
 _START = 30.0  # seconds that processes may take to start
@@ -92,13 +93,13 @@ def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]
 
     Versions that an actor never held, since a newer one was there, count from their own publication as well.
     """
-    parameters = np.random.default_rng(0).normal(size=int(megabytes * 250_000)).astype(np.float32)
+    parameters = int(megabytes * 250_000)
     with tempfile.TemporaryDirectory() as name, _learner(folder := pathlib.Path(name)) as (hub, endpoint):
         published: list[float] = []
 
         def publish() -> None:
             published.append(time.monotonic())
-            hub.publish_weights(_bundle(len(published) - 1, parameters), len(published) - 1)
+            hub.publish_weights(bundle(len(published) - 1, form=_FORM, parameters=parameters), len(published) - 1)
 
         publish()
         with _processes(actors, _pull, endpoint, folder):
@@ -126,12 +127,9 @@ def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tup
     endpoint = local_url()
     ranges = Ranges(np.full(_FORM.observation, 100.0), 100.0, 100.0, {})
     with urls.listen(endpoint, "learner") as transport:
-        hub = LearnerHub(
+        hub = learner_hub(
             transport,
-            run=_RUN,
-            config_json="{}",
-            run_id=_RUN_ID,
-            schema=_SCHEMA,
+            _RUN,
             form=_FORM,
             staleness=StalenessManager(1, _BATCH),
             audit=AuditLog(folder, "0"),
@@ -142,30 +140,21 @@ def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tup
         hub.close()
 
 
-def _bundle(version: int, parameters: np.ndarray) -> Message:
-    """Weights that pass the checks."""
-    sizes = {"observation": (_FORM.observation,), "value": ()}
-    arrays: dict[str, Any] = {f"{kind}/{m}": np.zeros(size) for kind, size in sizes.items() for m in ("mean", "m2")}
-    arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": parameters}
-    meta = {"version": version, "run_id": _RUN_ID, "schema": _SCHEMA, "hand": "human", "layout": [], "format": 1}
-    return Message(arrays, {**meta, "action_size": _FORM.action})
-
-
 def _rollout() -> Message:
     """A rollout that passes the checks."""
     rng = np.random.default_rng(0)
     arrays = {name: rng.normal(size=zeros.shape).astype(zeros.dtype) for name, zeros in _FORM.zeros().items()}
-    return Message(arrays, {"version": 0, "schema": _SCHEMA, "steps": _FORM.steps * _FORM.worlds})
+    return Message(arrays, {"version": 0, "schema": SCHEMA, "steps": _FORM.steps * _FORM.worlds})
 
 
 def _through_the_hub(senders: int, seconds: float, *, write_ahead: bool = False) -> float:
     """MB/s through the learner's hub; with `write_ahead` there is a checkpoint (of nothing) after each update."""
-    size, weights = len(encode(_rollout())), np.zeros(1000, np.float32)
+    size = len(encode(_rollout()))
     with (
         tempfile.TemporaryDirectory() as name,
         _learner(folder := pathlib.Path(name), write_ahead=write_ahead) as (hub, endpoint),
     ):
-        hub.publish_weights(_bundle(0, weights), 0)
+        hub.publish_weights(bundle(0, form=_FORM), 0)
         version = 0
 
         def receive() -> int:
@@ -174,7 +163,7 @@ def _through_the_hub(senders: int, seconds: float, *, write_ahead: bool = False)
             if batch is None:
                 return 0
             version += 1
-            hub.publish_weights(_bundle(version, weights), version)
+            hub.publish_weights(bundle(version, form=_FORM), version)
             if write_ahead:
                 hub.durable()
                 hub.note_saved()

@@ -24,6 +24,7 @@ from congrasp.common.task.observation import fields, layout
 from congrasp.common.task.reward import keypoint_weights, reward_terms, terms
 from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.types import Surface
+from congrasp.services.grasp.parse import read_request
 from tests.scenes import HAND, L, active, evaluated, scene, scene_of
 
 FINGERS = get_constraint("fingers")
@@ -207,6 +208,11 @@ def test_words():
     parsed = FINGERS.parse({"fingers": ("index", "thumb")}, HAND, BOX)
     np.testing.assert_array_equal(parsed["allowed"], PINCH[0])
     assert parsed["allowed"].dtype == bool
+    for written in (("thumb", "index"), "thumb index", "thumb, index", "thumb,index", ["thumb", "index"]):
+        np.testing.assert_array_equal(
+            read_request(BOX, HAND, 15, fingers=written).given("fingers", "allowed"), PINCH[0]
+        )
+    assert read_request(BOX, HAND, 15).given("fingers", "allowed") is None
     assert FINGERS.parse({"fingers": ()}, HAND, BOX) is None and FINGERS.parse({"fingers": ""}, HAND, BOX) is None
     with pytest.raises(CongraspError, match=r"has no finger 'pinky'.*Known: thumb, index, middle, ring, little"):
         FINGERS.parse({"fingers": ("thumb", "pinky")}, HAND, BOX)

@@ -18,11 +18,9 @@ from congrasp.common.transport.keys import FLOWS, Keys, flow
 from congrasp.common.transport.ports import free_port, local_url, rank_url, reachable_url
 from congrasp.common.transport.security import RIGHTS, Credentials
 from congrasp.common.wire.codec import Message
-from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub.hub import LearnerHub
-from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.ops.certificates import create_authority, issue
-from tests.cluster import ROOT, A, B, D, T, bundle, rollout
+from tests.conftest import ROOT
+from tests.rollouts import bundle, learner_hub, rollout
 from tests.waits import eventually
 
 KEYS = Keys("test")
@@ -126,7 +124,7 @@ def work(url):
         assert link.config(10).schema == "s"
         ticket = link.acquire_ticket(5)
         version = link.weights(-1).meta["version"]
-        assert link.upload(rollout(T, 3.0, version), ticket).result(10) == "accepted"
+        assert link.upload(rollout(3.0, version=version), ticket).result(10) == "accepted"
 
 
 def in_thread(url):
@@ -147,11 +145,8 @@ def in_process(url):
 def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_path):
     url = {"memory": f"memory/{tmp_path}", "socket": f"socket/{tmp_path}/s", "tcp": local_url()}[scheme]
     with urls.listen(url, "learner") as transport:
-        hub = LearnerHub(
-            transport, run="test", config_json="{}", run_id="e", schema="s",
-            form=RolloutForm(T, B, D, A, half=True), staleness=StalenessManager(1, 1),
-        )  # fmt: skip
-        hub.publish_weights(bundle(0, "e"), 0)
+        hub = learner_hub(transport, "test")
+        hub.publish_weights(bundle(0), 0)
         actor = start(url)
         (message,) = eventually(lambda: hub.next_batch(1, 0.5))
         assert (message.arrays["reward"] == 3.0).all() and message.meta["actor"] == "a"

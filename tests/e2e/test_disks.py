@@ -20,7 +20,8 @@ from congrasp.services.cli.audit import compare as audit
 from congrasp.services.ops.status import ask
 from congrasp.services.record.reader import read_metrics
 from congrasp.services.record.recorder import Recorder
-from tests.learner.test_process import CONFIG, MadeUpActor
+from tests.learner.made_up_actor import MadeUpActor
+from tests.learner.test_process import CONFIG
 from tests.waits import eventually
 
 

@@ -6,6 +6,7 @@ Each takes half of `CONGRASP_FUZZ_SECONDS`, 4 by default, from the seed `CONGRAS
 """
 
 import contextlib
+import io
 import json
 import logging
 import os
@@ -14,35 +15,42 @@ import pickle
 import random
 import threading
 import time
+import zlib
 
 import numpy as np
 import pytest
 import trimesh
 
-from congrasp.common.config import RunConfig, run_config_from_json, to_json
+from congrasp.common.config import NetworkConfig, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_text, read_hand
 from congrasp.common.io.journal import Journal, read_journal
 from congrasp.common.io.pickles import read_pickle
+from congrasp.common.objects import store
+from congrasp.common.objects.procedural import generate
+from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.sampling import sets as stored_sets
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
-from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.hub.admission import Admission, Ranges
-from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.assets.objects.mesh_files import read_mesh
+from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.grasp.wrist_paths import read_bvh, read_wrist_path
 from congrasp.services.record.reader import read_episodes, read_metrics
 from congrasp.services.record.recorder import Converter, Recorder
 from congrasp.services.record.writer import LogWriter
 from congrasp.services.serve.requests import Layout
 from congrasp.services.serve.server import PolicyServer
-from tests.cluster import bundle
+from congrasp.services.train.command import untrained
 from tests.episodes import episode
-from tests.rollouts import random_arrays
+from tests.rollouts import bundle, learner_hub, rollout
+from tests.services.test_hostile_files import constraint_set
 from tests.services.test_hostile_inputs import BVH
 
 SECONDS = float(os.environ.get("CONGRASP_FUZZ_SECONDS", "4")) / 2
@@ -153,14 +161,14 @@ def memory():
 def requests():
     """A valid message for every key that is asked, and for every one that is published under."""
     who = {"actor": "NAME", "incarnation": "01"}
-    rollout = {**who, "sequence": 0, "version": 0, "run_id": "e", "schema": "s", "steps": 6, "ticket": "t"}
-    named = {**random_arrays(FORM), "episode/success": np.ones(1, np.float32)}
+    made = rollout(0.5, FORM, **who, sequence=0, run_id="e", ticket="t")
+    named = {**made.arrays, "episode/success": np.ones(1, np.float32)}
     asked = {
         KEYS.config: Message(),
         KEYS.status: Message(),
         KEYS.weights: Message(meta={"newer_than": 3, "session_id": "x"}),
         KEYS.ticket("NAME"): Message(meta={**who, "ticket": "t", "give_back": False}),
-        KEYS.rollout("NAME"): Message({name: np.clip(a, -1, 1) for name, a in named.items()}, rollout),
+        KEYS.rollout("NAME"): Message(named, made.meta),
         KEYS.act: Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY),
         KEYS.health: Message(),
     }
@@ -191,11 +199,9 @@ def served(endpoint, folder):
 
     ranges = Ranges(np.full(32, 1.0), 10.0, 100.0, {"episode/success": (0.0, 1.0)})
     with ZenohTransport(listen=[endpoint]) as transport:
-        hub = LearnerHub(
-            transport, run="chaos", config_json="{}", run_id="e", schema="s", form=FORM,
-            staleness=StalenessManager(1, 2, ticket_seconds=1.0), admission=Admission(lambda: ranges),
-        )  # fmt: skip
-        hub.publish_weights(bundle(0, "e"), 0)
+        staleness = StalenessManager(1, 2, ticket_seconds=1.0)
+        hub = learner_hub(transport, "chaos", form=FORM, staleness=staleness, admission=Admission(lambda: ranges))
+        hub.publish_weights(bundle(0), 0)
         transport.serve(KEYS.act, act, workers=2, depth=64)
         transport.serve(KEYS.health, lambda key, request: Message(meta={"ready": True}))
         with Recorder(transport, "chaos", folder, warn=lambda text: None) as recorder:
@@ -234,7 +240,7 @@ def test_mutated_messages_at_every_key(tmp_path):
         assert memory() - first < GROWTH, f"grew by {(memory() - first) >> 20} MiB in {sent} messages"
         # An honest one is served as ever.
         hub.next_batch(2, 0.0)
-        hub.publish_weights(bundle(1, "e"), 1)
+        hub.publish_weights(bundle(1), 1)
         fine = Message(meta={"actor": "77777.a", "incarnation": "1", "ticket": "t"})
         assert raw.query(KEYS.ticket("77777.a"), fine, timeout=10.0).meta["version"] == 1
         raw.query(KEYS.act, Message({"packed": np.zeros((2, LAYOUT.size), np.float32)}, QUERY), timeout=10.0)
@@ -242,11 +248,47 @@ def test_mutated_messages_at_every_key(tmp_path):
     print(f"{sent} messages, {recorder.messages} log messages recorded, {recorder.damaged} left out")
 
 
-# --- files that `services/test_hostile_files.py` leaves out ---
+# --- files ---
+
+SEALED = {"object": store.load, "set": stored_sets.load, "policy": bundles.load}
+"""Loaders of messages with a checksum."""
+
+
+def resealed(data):
+    """The message with the checksum of its damaged data, as one who means harm would write it."""
+    with contextlib.suppress(ValueError, KeyError, TypeError):
+        length = int.from_bytes(data[:8], "little")
+        header, section = json.loads(data[8 : 8 + length]), data[8 + length :]
+        header = {"__metadata__": {"checksum": "00000000", "meta": header.pop("__metadata__")["meta"]}, **header}
+        text = json.dumps(header, separators=(",", ":")).encode()
+        text = text.replace(b"00000000", b"%08x" % zlib.crc32(text, zlib.crc32(section)), 1)
+        return len(text).to_bytes(8, "little") + text + section
+    return data
+
+
+def odd_file(rng, name, data):
+    """A file with something odd in it, whose checksum is mostly right."""
+    if rng.random() < 0.5:
+        changed = odd_bytes(rng, data)
+        return resealed(changed) if name in SEALED else changed
+    if name in ("config", "hand"):
+        return json.dumps(odd_tree(rng, json.loads(data))).encode()
+    if name == "motion":
+        arrays = dict(np.load(io.BytesIO(data)))
+        np.savez(made := io.BytesIO(), **{**arrays, "meta": json.dumps(odd_tree(rng, json.loads(str(arrays["meta"]))))})
+        return made.getvalue()
+    return mutated(rng, decode(data)) if name in SEALED else odd_bytes(rng, data)
 
 
 def _files(folder):
     """A valid file for every loader, and the loader."""
+    store.save(generate(0, "box"), folder / "object")
+    (folder / "set").write_bytes(encode(constraint_set()))
+    network = NetworkConfig(hidden=(2,), encoder=2)
+    task = TaskConfig(surface_points=4, trajectory_points=2)
+    bundles.save(untrained(RunConfig(task=task, network=network)), folder / "policy")
+    (folder / "hand").write_text(hand_text(get_hand("human")))
+    save_motion(folder / "motion", motion_of_episode(episode()))
     (folder / "config").write_text(to_json(RunConfig()))
     (folder / "x.bvh").write_text(BVH)
     (folder / "x.csv").write_text("x,y,z,w,x,y,z\n" + "0,0,0,1,0,0,0\n" * 3)
@@ -265,6 +307,9 @@ def _files(folder):
     for suffix in ("stl", "obj", "ply", "glb"):
         mesh.export(folder / f"x.{suffix}")
     everything = {
+        **SEALED,
+        "hand": read_hand,
+        "motion": load_motion,
         "config": lambda path: run_config_from_json(path.read_bytes()),
         "x.bvh": lambda path: read_bvh(path, "RightHand"),
         "x.csv": read_wrist_path,
@@ -283,13 +328,12 @@ def test_mutated_files_at_every_loader(tmp_path):
     valid = {path: path.read_bytes() for path in loaders}
     for path, load in loaders.items():
         load(path)
+    often = [0.1 if path.name == "pickle" else 1.0 for path in loaders]  # a process reads each pickle
     began, first, count, refused = time.monotonic(), 0, 0, 0
     with no_tracebacks():
-        while (now := time.monotonic()) < began + SECONDS:
-            path = rng.choice(list(loaders))
-            data = odd_bytes(rng, valid[path])
-            if path.name == "config" and rng.random() < 0.5:
-                data = json.dumps(odd_tree(rng, json.loads(valid[path]))).encode()
+        while (now := time.monotonic()) < began + SECONDS or count < 50 * len(loaders):
+            (path,) = rng.choices(list(loaders), often)
+            data = odd_file(rng, path.name, valid[path])
             path.write_bytes(data)
             try:
                 loaders[path](path)

@@ -16,11 +16,8 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.ports import local_url, shifted
 from congrasp.common.wire.codec import Message, encode
-from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub.hub import LearnerHub
-from congrasp.learner.hub.staleness import StalenessManager
 from tests.benchmarks.attackers import attacked, throttled
-from tests.cluster import A, B, D, T, bundle, rollout
+from tests.rollouts import bundle, learner_hub, rollout
 
 KEYS = Keys("r")
 ANSWER = Message({"q_target": np.zeros(5_000, np.float32)})
@@ -40,18 +37,10 @@ def learner(parameters):
     """A hub with weights of so many float32."""
     endpoint = local_url()
     with urls.listen(endpoint, "learner") as transport:
-        hub = LearnerHub(
-            transport, run="r", config_json="{}", run_id="e", schema="s",
-            form=RolloutForm(T, B, D, A, half=True), staleness=StalenessManager(1, 2),
-        )  # fmt: skip
-        hub.publish = lambda version: hub.publish_weights(_weights(version, parameters), version)
+        hub = learner_hub(transport, "r")
+        hub.publish = lambda version: hub.publish_weights(bundle(version, parameters=parameters), version)
         hub.publish(0)
         yield endpoint, hub
-
-
-def _weights(version, parameters):
-    made = bundle(version, "e")
-    return Message({**made.arrays, "actor/w": np.full(parameters, version, np.float32)}, made.meta)
 
 
 def _updates(link, hub, count):
@@ -60,7 +49,7 @@ def _updates(link, hub, count):
     for _ in range(count):
         for _ in range(2):
             ticket = link.acquire_ticket(20)
-            assert link.upload(rollout(T, 0, version), ticket).result(20) == "accepted"
+            assert link.upload(rollout(version=version), ticket).result(20) == "accepted"
         assert hub.next_batch(2, 5)
         version += 1
         hub.publish(version)
@@ -162,6 +151,6 @@ def test_rollouts_that_no_actor_makes_are_refused_before_they_are_in_memory(tmp_
         taken = []
         transport.serve(KEYS.rollouts, lambda key, message: taken.append(key) or Message())
         with urls.connect(endpoint, "actor") as actor, attacked("huge", shifted(endpoint, 1), "r", key):
-            send = lambda: actor.query(KEYS.rollout("a"), rollout(T, 0, 0), timeout=5)  # noqa: E731
+            send = lambda: actor.query(KEYS.rollout("a"), rollout(), timeout=5)  # noqa: E731
             assert _grown(send) < 100e6
     assert set(taken) == {KEYS.rollout("a")}

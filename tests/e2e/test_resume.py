@@ -19,6 +19,7 @@ from congrasp.learner.hub.used_rollouts import journal_path, replay
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run, open_run
 from tests.conftest import ROOT
+from tests.learner.made_up_actor import random_steps
 from tests.learner.test_process import CONFIG
 
 UPDATES, EVERY, KILLED_AFTER = 8, 3, 5
@@ -29,25 +30,14 @@ STEPS, WORLDS, BATCH = RUN.rollout_steps, RUN.environments, RUN.rollouts_per_upd
 
 def rollout(number, bundle):
     """The same whatever policy is asked for it."""
-    rng = np.random.default_rng(number)
-    size = sum(width for _, width in bundle.meta["layout"])
-    # Within what every entry of a task can be.
-    observation = rng.uniform(-1.0, 1.0, (STEPS + 1, WORLDS, size)).astype(np.float16)
-    privileged = sum(width for _, width in bundle.meta["privileged"])
-    inputs = rng.uniform(0.0, 1.0, (STEPS + 1, WORLDS, privileged)).astype(np.float16)
-    arrays = {
-        "observation": observation[:-1],
-        "privileged": inputs[:-1],
-        "last_privileged": inputs[-1],
-        "last_observation": observation[-1],
-        "action": rng.normal(size=(STEPS, WORLDS, bundle.meta["action_size"])).astype(np.float32),
+    rng, meta = np.random.default_rng(number), bundle.meta
+    sizes = (sum(width for _, width in meta[name]) for name in ("layout", "privileged"))
+    arrays = random_steps(rng, STEPS, WORLDS, *sizes) | {
+        "action": rng.normal(size=(STEPS, WORLDS, meta["action_size"])).astype(np.float32),
         "log_probability": rng.normal(-40.0, 1.0, size=(STEPS, WORLDS)).astype(np.float32),
-        "reward": rng.normal(size=(STEPS, WORLDS)).astype(np.float32),
-        "terminal": (terminal := rng.random((STEPS, WORLDS)) < 0.3),
-        "truncated": terminal & (rng.random((STEPS, WORLDS)) < 0.5),
     }
     who = {"actor": "a", "incarnation": "01", "sequence": number, "ticket": ""}
-    return Message(arrays, {**who, **{name: bundle.meta[name] for name in ("version", "run_id", "schema")}, "steps": 8})
+    return Message(arrays, {**who, **{name: meta[name] for name in ("version", "run_id", "schema")}, "steps": 8})
 
 
 def feed(hub, ended):

@@ -20,12 +20,10 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.security import RIGHTS, Credentials
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, encode
-from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.hub.hub import LearnerHub
-from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.certificates import create_authority, issue, revoke
-from tests.cluster import A, B, D, T, bundle, rollout
+from tests.rollouts import bundle, learner_hub, rollout
 from tests.waits import eventually
 
 KEYS = Keys("safe")
@@ -79,11 +77,8 @@ def listening(certs):
     with contextlib.ExitStack() as stack:
         learner, server = (Credentials(certs / f"{role}.0", role) for role in ("learner", "server"))
         transport = stack.enter_context(ZenohTransport(listen=[endpoint], credentials=learner, revocation_seconds=0.1))
-        hub = LearnerHub(
-            transport, run="safe", config_json="{}", run_id="e", schema="s",
-            form=RolloutForm(T, B, D, A, half=True), staleness=StalenessManager(1, 2),
-        )  # fmt: skip
-        hub.publish_weights(bundle(0, "e"), 0)
+        hub = learner_hub(transport, "safe")
+        hub.publish_weights(bundle(0), 0)
         serving = stack.enter_context(ZenohTransport(listen=[policy], credentials=server, flows=("policy",)))
         for key in (below(KEYS.act), KEYS.health):
             serving.serve(key, lambda key, request: Message(meta={"ready": True, "served": key}))
@@ -139,9 +134,9 @@ def test_with_the_right_certificates_a_run_works_from_end_to_end(fresh):
         assert link.weights(-1).meta["version"] == 0
         for _ in range(2):
             ticket = link.acquire_ticket(5)
-            assert link.upload(rollout(T, 0, 0), ticket).result(10) == "accepted"
+            assert link.upload(rollout(), ticket).result(10) == "accepted"
         assert len(fresh.hub.next_batch(2, 5)) == 2
-        fresh.hub.publish_weights(bundle(1, "e"), 1)
+        fresh.hub.publish_weights(bundle(1), 1)
         # The announcement arrives by itself: without one, a link that holds the newest version asks for nothing.
         eventually(lambda: (new := link.weights(0)) and new.meta["version"] == 1)
         key = KEYS.log("metrics", "actor", ME)
@@ -165,7 +160,7 @@ def test_an_actor_whose_certificate_came_later_works_at_once(run):
     link = ActorLink(run.connect(made.name), "safe", "77.x", request_timeout=5.0)
     with link:
         link.config(10)
-        assert link.upload(rollout(T, 0, 0), link.acquire_ticket(5)).result(10) == "accepted"
+        assert link.upload(rollout(), link.acquire_ticket(5)).result(10) == "accepted"
 
 
 def test_an_actor_finds_a_learner_that_comes_back_and_its_rules_hold(certs):
@@ -268,8 +263,7 @@ def test_actors_do_not_speak_for_or_listen_to_one_another(fresh):
     # Only its own tokens come back to it.
     assert {key.split("/")[-1] for key in seen} <= {"66"}
     # Its key is its own, but the message says another's name.
-    forged = Message(rollout(T, 0, 0).arrays, {**rollout(T, 0, 0).meta, "actor": OTHER, "incarnation": "01",
-                     "sequence": 0, "run_id": "e", "ticket": "t"})  # fmt: skip
+    forged = rollout(actor=OTHER, incarnation="01", sequence=0, run_id="e", ticket="t")
     reply = actor.query(KEYS.rollout(ME), forged, timeout=5).meta
     assert reply["outcome"] == "refused" and "came under the key" in reply["why"]
     assert fresh.hub.status()["counters"]["accepted"] == 0
@@ -426,7 +420,7 @@ def test_who_is_revoked_is_out_and_the_others_stay(fresh):
             eventually(lambda: OTHER not in {role["id"] for role in fresh.hub.status()["roles"]})
             eventually(lambda: ME in {role["id"] for role in fresh.hub.status()["roles"]})
             ticket = eventually(lambda: link.acquire_ticket(5))
-            assert link.upload(rollout(T, 0, 0), ticket).result(20) == "accepted"
+            assert link.upload(rollout(), ticket).result(20) == "accepted"
             thief.publish(KEYS.log("event", "actor", OTHER), Message())
             eventually(lambda: actor.publish(KEYS.log("event", "actor", ME), Message()) or logs.receive(0.3))
             assert answers(thief, KEYS.ticket(OTHER)) is None and out()

@@ -14,6 +14,22 @@ from congrasp.common.wire.codec import Message
 _PATIENCE = 300.0  # a learner may compile before it answers
 
 
+def random_steps(rng, steps: int, worlds: int, observation: int, privileged: int) -> dict[str, np.ndarray]:
+    """All that is recorded of a rollout but the actions, with values that every entry of a task can have."""
+    seen = rng.uniform(-1.0, 1.0, (steps + 1, worlds, observation)).astype(np.float16)
+    inputs = rng.uniform(0.0, 1.0, (steps + 1, worlds, privileged)).astype(np.float16)
+    terminal = rng.random((steps, worlds)) < 0.3
+    return {
+        "observation": seen[:-1],
+        "last_observation": seen[-1],
+        "privileged": inputs[:-1],
+        "last_privileged": inputs[-1],
+        "reward": rng.normal(size=(steps, worlds)).astype(np.float32),
+        "terminal": terminal,
+        "truncated": terminal & (rng.random((steps, worlds)) < 0.5),
+    }
+
+
 class MadeUpActor(threading.Thread):
     """Sends rollouts of random observations until the run `t` ends; keeps the versions that it acted with."""
 
@@ -22,51 +38,41 @@ class MadeUpActor(threading.Thread):
     ):
         super().__init__(daemon=True)
         self.versions: list[int] = []
-        self.ended = ""
-        self.stop = threading.Event()
-        self._transport, self._actor, self.reward, self._links, self._seed = transport, name, reward, links, seed
-        self._journal = journal
+        self.outcomes, self.names, self.ended = [], (), ""
+        """Futures of the uploads, names of the arrays that the learner takes, and how the run ended."""
+        self.stop, self.rng, self.reward = threading.Event(), np.random.default_rng(seed), reward
+        self._transport, self._actor, self._links, self._journal = transport, name, links, journal
         self.start()
 
     def run(self) -> None:
         with ActorLink(self._transport, "t", self._actor, patience=_PATIENCE, journal=self._journal) as link:
             try:
-                self._act(link, link.config(_PATIENCE).arrays)
+                self.names = link.config(_PATIENCE).arrays
+                self._act(link)
             except (RunFinished, TransportError) as error:
                 self.ended = str(error)
 
-    def _act(self, link: ActorLink, names: tuple[str, ...]) -> None:
-        rng, bundle = np.random.default_rng(self._seed), None
+    def _act(self, link: ActorLink) -> None:
+        bundle = None
         while not self.stop.is_set():
             ticket = link.acquire_ticket(0.5)
             newer = link.weights(-1 if bundle is None else bundle.version)
             bundle = bundle if newer is None else PolicyBundle.from_message(newer)
             if ticket is None or bundle is None:
                 continue
-            shape = (5, 2, sum(size for _, size in bundle.spec.layout))
-            observation = rng.uniform(-1.0, 1.0, shape).astype(np.float16)  # what every entry of a task can be
-            action, log_probability = bundles.sample_action(
-                bundle.spec.layout,
-                bundle.inference_parameters,
-                observation[:-1],
-                jax.random.PRNGKey(len(self.versions)),
-            )
-            inputs = rng.uniform(0.0, 1.0, (5, 2, bundle.spec.privileged_size)).astype(np.float16)
-            recorded = {
-                "privileged": inputs[:-1],
-                "last_privileged": inputs[-1],
-                "observation": observation[:-1],
-                "last_observation": observation[-1],
-                "action": np.asarray(action),
-                "log_probability": np.asarray(log_probability),
-                "reward": self.reward * rng.normal(size=(4, 2)).astype(np.float32),
-                "terminal": (terminal := rng.random((4, 2)) < 0.3),
-                "truncated": terminal & (rng.random((4, 2)) < 0.5),
-            }
-            arrays = {name: recorded[name] for name in names} | {
-                "episode/success": np.array([0.0, 1.0, 1.0, 1.0], np.float32),
-                "episode/links_at_removal": np.full(4, self._links, np.float32),
-            }
-            meta = {"version": bundle.version, "schema": bundle.spec.schema, "steps": 8}
-            link.upload(Message(arrays, meta), ticket)
+            arrays = self.rollout(bundle, jax.random.PRNGKey(len(self.versions)))
+            meta = {"version": bundle.version, "schema": bundle.spec.schema, "steps": arrays["reward"].size}
+            self.outcomes.append(link.upload(Message(arrays, meta), ticket))
             self.versions.append(bundle.version)
+
+    def rollout(self, bundle: PolicyBundle, key: jax.Array) -> dict[str, np.ndarray]:
+        """Arrays of a rollout of 4 steps in 2 worlds."""
+        spec = bundle.spec
+        recorded = random_steps(self.rng, 4, 2, sum(size for _, size in spec.layout), spec.privileged_size)
+        act = bundles.sample_action(spec.layout, bundle.inference_parameters, recorded["observation"], key)
+        recorded["action"], recorded["log_probability"] = map(np.asarray, act)
+        recorded["reward"] *= self.reward
+        return {name: recorded[name] for name in self.names} | {
+            "episode/success": np.array([0.0, 1.0, 1.0, 1.0], np.float32),
+            "episode/links_at_removal": np.full(4, self._links, np.float32),
+        }

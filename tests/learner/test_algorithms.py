@@ -6,13 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from congrasp.actors.process.link import ActorLink, RunFinished
 from congrasp.common.config import PPOConfig, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
-from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
-from congrasp.common.wire.codec import Message
 from congrasp.learner.algorithms import ALGORITHMS, make_algorithm
 from congrasp.learner.batch import collate, partition_specs
 from congrasp.learner.hub.admission import Ranges
@@ -20,6 +17,7 @@ from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run
 from tests.learner import toy
 from tests.learner.a2c import A2C, SCHEMA
+from tests.learner.made_up_actor import MadeUpActor
 
 WORLDS, UPDATES = 64, 150
 CONFIG = RunConfig(
@@ -36,40 +34,17 @@ CONFIG = RunConfig(
 )
 
 
-class ToyActor(threading.Thread):
-    """Sends rollouts of the toy task with the arrays that the learner asks for, until the run is finished."""
+class ToyActor(MadeUpActor):
+    """Sends rollouts of the toy task with the arrays that the learner takes; the first has one more."""
 
-    def __init__(self, transport):
-        super().__init__(daemon=True)
-        self.names, self.outcomes, self._transport = (), [], transport
-        self.start()
+    def rollout(self, bundle, key):
+        keys = iter(jax.random.split(key, toy.STEPS))
 
-    def run(self):
-        with ActorLink(self._transport, "t", "a", patience=60.0) as link:
-            self.names = link.config(60.0).arrays
-            try:
-                self._act(link, np.random.default_rng(0))
-            except RunFinished:
-                link.flush(5.0)
+        def act(observation):
+            return bundles.sample_action(toy.LAYOUT, bundle.inference_parameters, observation, next(keys))
 
-    def _act(self, link, rng):
-        bundle, keys = None, jax.random.PRNGKey(0)
-        while True:
-            ticket = link.acquire_ticket(0.5)
-            newer = link.weights(-1 if bundle is None else bundle.version)
-            bundle = bundle if newer is None else PolicyBundle.from_message(newer)
-            if ticket is None or bundle is None:
-                continue
-
-            def act(observation, bundle=bundle):
-                nonlocal keys
-                keys, key = jax.random.split(keys)
-                return bundles.sample_action(toy.LAYOUT, bundle.inference_parameters, observation, key)
-
-            recorded = toy.episode(act, WORLDS, rng)
-            arrays = recorded if not self.outcomes else {name: recorded[name] for name in self.names}
-            meta = {"version": bundle.version, "schema": bundle.spec.schema, "steps": WORLDS * toy.STEPS}
-            self.outcomes.append(link.upload(Message(arrays, meta), ticket))
+        recorded = toy.episode(act, WORLDS, self.rng)
+        return recorded if not self.outcomes else {name: recorded[name] for name in self.names}
 
 
 def test_an_algorithm_from_outside_learns_in_the_real_learner(tmp_path, monkeypatch):

@@ -19,10 +19,10 @@ from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.hub import hub
 from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.deduplication import Sequences
-from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.rate_limit import RateLimit
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.write_ahead import PART, WriteAheadLog
+from tests import rollouts
 from tests.waits import eventually
 
 KEYS = Keys("test")
@@ -36,12 +36,7 @@ def rollout(sequence=0, version=0, **meta):
     return Message(arrays, {**header, "steps": T * B, **meta})
 
 
-def bundle(version, run_id="e"):
-    arrays = {f"{kind}/{name}": np.zeros(shape) for kind, shape in (("observation", D), ("value", ()))
-              for name in ("mean", "m2")}  # fmt: skip
-    arrays |= {"observation/count": np.zeros(()), "value/count": np.zeros(()), "actor/w": np.full(3, float(version))}
-    meta = {"version": version, "run_id": run_id, "schema": "s", "hand": "human", "layout": [], "action_size": A}
-    return Message(arrays, {**meta, "format": 1})
+bundle = functools.partial(rollouts.bundle, form=FORM)
 
 
 class Bench:
@@ -51,8 +46,7 @@ class Bench:
         shared = MemoryHub()
         self.server, self.peer = MemoryTransport(shared), MemoryTransport(shared)
         self.staleness = StalenessManager(max_staleness, batch)
-        defaults = {"run": "test", "config_json": "{}", "run_id": "e", "schema": "s", "form": FORM}
-        self.hub = LearnerHub(self.server, **{**defaults, **options}, staleness=self.staleness)
+        self.hub = rollouts.learner_hub(self.server, "test", form=FORM, staleness=self.staleness, **options)
         if version is not None:
             self.hub.publish_weights(bundle(version), version)
 

@@ -56,10 +56,10 @@ def loader() -> Callable:
 
 @pytest.fixture(scope="module")
 def short_protocol():
-    """Holds and pushes that last an eighth and a fifth of their time."""
+    """Holds and pushes that last an eighth and a twelfth of their time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "HOLD_SECONDS", 0.25)
-        patch.setattr(stress, "PUSH_SECONDS", 0.05)
+        patch.setattr(stress, "PUSH_SECONDS", 0.02)
         yield
 
 

@@ -10,8 +10,11 @@ import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.services.gym.vector_env import ACTION, GraspEnv, GraspVectorEnv
 
-# Episodes of five steps, which end within a test.
-SHORT = {"objects": 2, "physics": "native", "approach_steps": 3, "hold_steps": 2, "hold_steps_max": 2}
+# Episodes of five steps, which end within a test, of a task whose programs are small.
+SHORT = {
+    **{"objects": 2, "physics": "native", "approach_steps": 3, "hold_steps": 2, "hold_steps_max": 2},
+    **{"constraints": ("heading",), "surface_points": 64},
+}
 COUNT = 4
 
 

@@ -15,12 +15,10 @@ import pytest
 
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
-from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub.hub import LearnerHub
-from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.cli import doctor
 from congrasp.services.cli.doctor import doctor as command
 from congrasp.services.ops.certificates import create_authority, issue
+from tests.rollouts import learner_hub
 
 ALWAYS = ("python", "mujoco", "mujoco-mjx", "jax", "flax", "eclipse-zenoh", "gpu", "ports", "disk", "clock")
 
@@ -136,8 +134,7 @@ def test_certificates_are_looked_at(tmp_path):
 def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as server:
-        form, staleness = RolloutForm(4, 2, 7, 3, half=True), StalenessManager(1, 2)
-        hub = LearnerHub(server, run="r", config_json="{}", run_id="e", schema="s", form=form, staleness=staleness)
+        hub = learner_hub(server, "r")
         assert [finding.fine for finding in doctor._learner(endpoint, "r")] == [True, True]
         real = hub.status
         monkeypatch.setattr(hub, "status", lambda: real() | {"time": real()["time"] + 7.0})

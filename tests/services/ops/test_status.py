@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 from rich.console import Console
 
@@ -18,13 +17,11 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.schema import RolloutForm
-from congrasp.learner.hub.hub import LearnerHub
-from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.run_directory import POLICY_FILE, create_run, listening
 from congrasp.services.cli.status import status
 from congrasp.services.cli.view import _of_folder, view
 from congrasp.services.ops.status import ask, tables, warnings
-from tests.rollouts import ACTION, OBSERVATION, SCHEMA, bundle, rollout
+from tests.rollouts import bundle, learner_hub, rollout
 from tests.waits import eventually
 
 
@@ -33,22 +30,11 @@ def endpoint():
     """A run with one actor, which has sent one rollout."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as server:
-        hub = LearnerHub(
-            server,
-            run="r",
-            config_json="{}",
-            run_id="e",
-            schema=SCHEMA,
-            form=RolloutForm(4, 2, OBSERVATION, ACTION, half=True),
-            staleness=StalenessManager(1, 2),
-        )
-        weights = {"observation/mean": np.zeros(OBSERVATION), "observation/m2": np.zeros(OBSERVATION)}
-        weights |= dict.fromkeys(("observation/count", "value/mean", "value/m2", "value/count"), np.zeros(()))
-        message = bundle(0)
-        hub.publish_weights(type(message)({**message.arrays, **weights}, message.meta), 0)
+        form = RolloutForm(4, 2, 7, 3, half=True)
+        learner_hub(server, "r", form=form).publish_weights(bundle(0, form=form), 0)
         with ZenohTransport(connect=[endpoint]) as actor:
             actor.declare_alive(Keys("r").alive("actor", "worker-7", "1f"))
-            sent = rollout(actor="worker-7", incarnation="1f")
+            sent = rollout(0.5, form, actor="worker-7", incarnation="1f", sequence=0, run_id="e")
             assert actor.query(Keys("r").rollout("worker-7"), sent, timeout=5.0).meta["outcome"] == "accepted"
             yield endpoint
 

@@ -39,7 +39,7 @@ from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
 from congrasp.services.viz.triangles import cut, smooth_corners
 from congrasp.services.viz.views import TOUCHING, View, camera_of, episode_shapes, view_of, views
 from tests.cluster import ROOT
-from tests.episodes import CONTROL_DT, episode, older
+from tests.episodes import CONTROL_DT, episode
 
 WHITE, RED, BLUE = (0.9, 0.9, 0.9), (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
 FRONT = Camera(np.array([1.0, 0.0, 0.0]), np.zeros(3), 30.0)
@@ -273,14 +273,6 @@ def test_the_title_says_what_was_asked_and_how_it_went() -> None:
     title = episode_title(episode(mask=(1, 0, 0, 1), success=False))
     for words in ("human hand", "cylinder-0", "heading + affordance + trajectory", "no success", "return 12.5", "3"):
         assert words in title
-
-
-def test_an_older_recording_is_drawn_as_it_is_now() -> None:
-    made = episode(mask=(1, 1, 0, 1))
-    assert episode_title(older(made)) == episode_title(made)
-    for now, before in zip(episode_shapes(made, 11), episode_shapes(older(made), 11), strict=True):
-        for part, other in zip(vars(now).values(), vars(before).values(), strict=True):
-            np.testing.assert_equal(other, part)
 
 
 def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -> None:
