@@ -27,8 +27,8 @@ from congrasp.common.task.constraints.heading import ABOVE
 from congrasp.common.task.sampling import sets as constraint_sets
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import Surface, approach
+from congrasp.services.assets.captures.references import followed
 from congrasp.services.assets.captures.sequence import Dropped
-from congrasp.services.assets.captures.transfer import followed
 from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
 from congrasp.services.assets.objects.sizes import size_in_words
 from congrasp.services.export.motion_file import GraspMotion, load_motion

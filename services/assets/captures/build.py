@@ -33,16 +33,23 @@ from congrasp.common.task.sampling.headings import Headings
 from congrasp.common.task.sampling.write_sets import for_training, set_of
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
-from congrasp.services.assets.captures.objects import import_meshes
-from congrasp.services.assets.captures.refuse import check_reference
-from congrasp.services.assets.captures.separate import deepest, separated
+from congrasp.services.assets.captures.references import (
+    check_reference,
+    deepest,
+    demonstrated_headings,
+    separated,
+    transferred,
+)
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
-from congrasp.services.assets.captures.transfer import demonstrated_headings, transferred
 from congrasp.services.assets.objects.affordance import near_points, relabelled, two_parts
-from congrasp.services.assets.objects.meshes import UNLABELLED
+from congrasp.services.assets.objects.meshes import UNLABELLED, import_sources
+from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.sources import Source, find_sources
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
 _Shapes = dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
+_AXES = ImportOptions(unit="m", up="z")
+"""Captured poses refer to the axes of the mesh files."""
 _TOUCHED = 0.03
 """Radius around touched points that counts as touched, m."""
 IN_TABLE = 0.005
@@ -201,16 +208,28 @@ def _shapes(sequences: list[Sequence], progress: Callable[[str], None]) -> _Shap
     """Imports the sequences' meshes once each; returns objects and surfaces, or the reasons for failures."""
     names = {sequence.mesh: sequence.object_name for sequence in sequences}
     distinct = distinct_names(safe_name(name) for name in names.values())
-    shapes: _Shapes = {}
-    imported = import_meshes(dict(zip(names, distinct, strict=True)), lambda name: progress(f"Mesh of {name}"))
-    for mesh, obj in imported.items():
-        if isinstance(obj, CongraspError):
-            shapes[mesh] = obj
-        else:
+    shapes, sources = _Shapes(), dict[pathlib.Path, Source]()
+    for mesh, name in zip(names, distinct, strict=True):
+        try:
+            sources[mesh] = dataclasses.replace(_source(mesh), name=name)
+        except CongraspError as error:
+            shapes[mesh] = error
+    paths = list(sources)
+    for done, (i, obj) in enumerate(import_sources(list(sources.values()), _AXES), 1):
+        progress(f"Mesh of {sources[paths[i]].name} ({done} of {len(paths)})")
+        if not isinstance(obj, CongraspError):
             # Without labelled parts the whole surface is graspable.
             obj = dataclasses.replace(obj, graspable=np.ones_like(obj.graspable))
-            shapes[mesh] = obj, Surface(obj)
+        shapes[paths[i]] = obj if isinstance(obj, CongraspError) else (obj, Surface(obj))
     return shapes
+
+
+def _source(mesh: pathlib.Path) -> Source:
+    """Returns the files of the one object at a path."""
+    sources = find_sources(mesh)
+    if len(sources) > 1:
+        raise CongraspError(f"{mesh} holds {len(sources)} objects.", "Pass the folder of one, or its file.")
+    return sources[0]
 
 
 def _shape(sequence: Sequence, shapes: _Shapes) -> tuple[GraspObject, Surface]:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from congrasp.services.assets.captures.mano import MEAN_WRIST
+from congrasp.services.assets.captures.human import MEAN_WRIST
 from tests.mano_file import mano_pickle
 from tests.services.assets.captures import known, test_dexycb, test_grab, test_myohand, test_oakink
 

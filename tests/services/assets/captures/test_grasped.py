@@ -15,7 +15,7 @@ from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transfo
 from congrasp.common.objects.procedural import generate, plain_object
 from congrasp.common.objects.spec import Piece
 from congrasp.services.assets.captures.extract import LATER, Surface, _opposed
-from congrasp.services.assets.captures.refuse import DEEPEST, check_reference, depth, width
+from congrasp.services.assets.captures.references import DEEPEST, check_reference, depth, width
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.captures.oakink import read
-from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.assets.captures.sequence import Meshes
 from tests.services.assets.captures import known
 
 STAMP = "2021-09-26-19-59-58"
