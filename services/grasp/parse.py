@@ -165,7 +165,7 @@ def _part(text: str, name: str, target: Target) -> Part:
         raise CongraspError(f"{name}: there is no file {path}.", "Check the path.")
     try:
         geometry = load_geometry(path, "Export the part as PLY.")
-        up = "y" if obj.file_up == "y" else up_of(path)
+        up = "y" if obj.file_up == "y" else up_of(geometry)
     except CongraspError as error:
         raise CongraspError(f"{name}: {error}") from None
     geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry

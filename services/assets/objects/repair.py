@@ -42,6 +42,21 @@ def reduced(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[
     return np.asarray(small.vertices), np.asarray(small.faces)
 
 
+def merged(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> trimesh.Trimesh:
+    """A mesh (V, 3), (F, 3) with merged vertices and each proper triangle once; unmerged if only that leaves it closed.
+
+    The latter are bodies that touch along an edge.
+    """
+    apart = trimesh.Trimesh(vertices, faces, process=False)
+    mesh = apart.copy()
+    mesh.merge_vertices()
+    if len(mesh.faces):
+        mesh.update_faces(mesh.nondegenerate_faces())
+        mesh = without_repeats(mesh, notes)
+        mesh.remove_unreferenced_vertices()
+    return apart if apart.is_watertight and not mesh.is_watertight else mesh
+
+
 def with_few_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh with at most `MAX_FACES` triangles."""
     return mesh if len(mesh.faces) <= MAX_FACES else mesh.simplify_quadric_decimation(face_count=MAX_FACES)
