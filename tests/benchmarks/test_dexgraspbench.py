@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import keypoints, link_transforms
-from congrasp.common.hands.mjcf import add_hand
+from congrasp.common.hands.mjcf import add_hand, mujoco_link_poses
 from congrasp.common.hands.spec import Motor
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands import grips
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
 from tests.benchmarks.dexgraspbench import dexgraspbench, write_grasp
 from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, State, benchmark_grasp, read_grasps, squeezed

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.mano import MANO_FINGERS, TIP_VERTICES, ManoModel
+from congrasp.common.hands.mjcf import posed
 from congrasp.common.hands.spec import link_origin
 from congrasp.services.assets.captures.sequence import FINGERS
-from congrasp.services.assets.hands.kinematics import posed
 from congrasp.services.assets.objects.mesh_files import load_geometry
 
 TO_HUMAN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

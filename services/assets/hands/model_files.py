@@ -1,7 +1,7 @@
 """A hand from a URDF or MJCF file: its content is used, and missing values are proposed.
 
-MuJoCo reads the file in a confined process (`compile`). Bodies of the hand: `tree`. Capsules of links: `geometry`.
-Motors, couplings and tendons: `actuators`. Open and closed poses, from kinematics: `poses`.
+MuJoCo reads the file in a confined process (`compile`). Links of the hand and their capsules: `links`. Motors,
+couplings and tendons: `actuators`. Open and closed poses, from kinematics: `poses`.
 """
 
 import dataclasses
@@ -19,17 +19,21 @@ from congrasp.common.hands.motors import fitting_scale, motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from congrasp.services.assets.hands.actuators import Drive
 from congrasp.services.assets.hands.compile import LEAST, confined, robot_spec
-from congrasp.services.assets.hands.geometry import (
+from congrasp.services.assets.hands.links import (
+    Tree,
     bare,
+    body_name,
     far_end,
     fit_capsules,
+    hand_tree,
+    hinges,
+    identifier,
     inertia_box,
     link_mesh,
+    placed,
     solids_of,
-    surface,
 )
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
-from congrasp.services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
 from congrasp.services.assets.objects.sizes import METRES, length
 
 _LEVER = 0.02  # least distance of a joint from the tip that it moves, m
@@ -245,7 +249,7 @@ def _links(
     boxed: list[str] = []
     empty: list[str] = []
     for link, bodies in tree.groups.items():
-        points = [p for body in bodies for p in surface(model, data, body)]
+        points = [p for body in bodies for mesh in placed(model, data, body, colliding=True) for p in mesh.vertices]
         if points:
             sizes[names[link]] = float(np.ptp(points, axis=0).max())
         else:

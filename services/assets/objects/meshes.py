@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import QhullError, cKDTree
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import cache_folder
@@ -23,7 +23,6 @@ from congrasp.common.objects.surface import halves, sample_mesh
 from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
-from congrasp.services.assets.objects.collision import convex_pieces
 from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.fidelity import enclosed
 from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
@@ -31,13 +30,47 @@ from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.repair import encloses
 from congrasp.services.assets.objects.sizes import Up, metres_per_unit
-from congrasp.services.assets.objects.sources import Source
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
 _CACHE_VERSION = 10
 _DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshFile:
+    """One mesh of an object."""
+
+    path: pathlib.Path
+    role: Literal["visual", "piece", "part"]
+    part: str = ""
+    """Name of the part that it shows."""
+    graspable: bool = True
+    """True if that part may be grasped."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """The files of one object."""
+
+    name: str
+    path: pathlib.Path
+    visuals: tuple[MeshFile, ...]
+    """The surface; the part files if they form the surface together."""
+    pieces: tuple[MeshFile, ...] = ()
+    """Convex pieces, if it is already decomposed."""
+    parts: tuple[MeshFile, ...] = ()
+    """Meshes of the parts of the surface."""
+
+    @property
+    def parts_are_pieces(self) -> bool:
+        """True if the part files together are the object, so that no collision piece spans two of them."""
+        return bool(self.parts) and self.visuals == self.parts
+
+    def files(self) -> tuple[MeshFile, ...]:
+        """All files, without repetition."""
+        return tuple(dict.fromkeys(self.visuals + self.pieces + self.parts))
 
 
 def import_source(source: Source, options: ImportOptions) -> GraspObject:
@@ -132,9 +165,8 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     solid = enclosed(np.asarray(whole.triangles)) if closed else None
     if solid and solid.overlaps:
         notes.append("its bodies overlap: what lies in several of them weighs once")
-    hulls, owners, errors = convex_pieces(
-        source, meshes, np.asarray(whole.triangles), solid and solid.volume, [factor * x for x in given], options, notes
-    )
+    surfaces = decompose.Surfaces(meshes, np.asarray(whole.triangles), solid and solid.volume)
+    hulls, owners, errors = _cut(source, [factor * piece for piece in given], surfaces, options, notes)
     if options.material:
         found = weigh_parts(meshes, parts or meshes, options.material, [part.part for part in source.parts])
     else:
@@ -209,6 +241,22 @@ def _read(source: Source, up: Up, notes: list[str]) -> _Files:
     if not source.parts:
         visuals = [repair.closed(mesh, notes) for mesh in visuals]
     return _Files(given, visuals, parts, found, coloured)
+
+
+def _cut(
+    source: Source,
+    given: Sequence[np.ndarray],
+    surfaces: decompose.Surfaces,
+    options: ImportOptions,
+    notes: list[str],
+) -> decompose.Collision:
+    """Convex pieces of an object (`decompose.convex_pieces`)."""
+    try:
+        return decompose.convex_pieces(given, surfaces, options, notes, shown=bool(source.visuals))
+    except QhullError:
+        raise CongraspError(
+            f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
+        ) from None
 
 
 def _colours(

@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import link_origin
 from congrasp.common.wire.codec import decode
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record import scene
 from congrasp.services.record.channels import Entry
 from congrasp.services.record.goals import active_blocks, active_constraints

@@ -15,8 +15,8 @@ from congrasp.common.objects.spec import COLOUR_POINTS, Colours
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.meshes import import_source
+from congrasp.services.assets.objects.named import find_sources
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.sources import find_sources
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.record.scene import check_episode
 from congrasp.services.viz.raster import render_scene

@@ -14,9 +14,8 @@ from congrasp.common.objects.resting import settle
 from congrasp.common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES
 from congrasp.common.objects.store import digest
 from congrasp.services.assets.objects import decompose, meshes
-from congrasp.services.assets.objects.named import objects_of
+from congrasp.services.assets.objects.named import find_sources, objects_of
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.sources import find_sources
 
 SLOW = pytest.mark.slow
 SIDES = np.array([0.04, 0.06, 0.08])

@@ -1,15 +1,25 @@
-"""A link's geometry: capsules for its collision shapes, else visual shapes, else its inertia; and its visual mesh."""
+"""Links of a hand in a model: its palm, the branches from it, and their geometry.
 
-from typing import Literal
+A body without a hinge belongs to its parent, so that a model is a tree of links. The palm is the link with most
+branches; bodies before it (an arm, a wrist) are dropped, since the wrist is a virtual mount. A link has capsules for
+its collision shapes, else for its visual shapes, else for its inertia; and a visual mesh.
+"""
+
+import dataclasses
+import re
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 import trimesh
 
+from congrasp.common.errors import CongraspError
 from congrasp.common.hands.meshes import MAX_FACES
 from congrasp.common.hands.spec import Capsule, Solid, vector
 from congrasp.services.assets.hands.compile import LEAST
 
+_CALLED = ("palm", "hand")
+_FREE = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
 _KINDS: dict[mujoco.mjtGeom, Literal["box", "cylinder", "capsule", "ellipsoid"]] = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
     mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
@@ -22,15 +32,111 @@ _PLAUSIBLE = (0.002, 0.15)  # half extent of an inertia's box, m
 _BARE = 0.005  # radius of a link without any geometry, m
 
 
-def surface(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """Points on a body's collision geometry, or on its visual geometry if there is none."""
-    mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
-    solid = [g for g in mine if model.geom_contype[g] | model.geom_conaffinity[g]] or mine
-    found: list[np.ndarray] = []
-    for g in solid:
+@dataclasses.dataclass(frozen=True)
+class Tree:
+    """A hand's links, each named by the body that moves it."""
+
+    palm: int
+    groups: dict[int, list[int]]
+    """Bodies of each link, the palm's first."""
+    owner: dict[int, int]
+    """Link of each body."""
+    ends: tuple[int, ...]
+    """Last link of each finger."""
+
+
+def identifier(name: str, other: str) -> str:
+    """Returns a valid name for a hand file, or another if the file has none."""
+    return re.sub(r"\W+", "_", name).strip("_") or other
+
+
+def body_name(model: mujoco.MjModel, body: int) -> str:
+    """Returns a body's name as an identifier."""
+    return identifier(model.body(body).name, f"body_{body}")
+
+
+def hinges(model: mujoco.MjModel, body: int) -> list[int]:
+    """Indices of a body's joints."""
+    start, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+    return list(range(start, start + count))
+
+
+def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
+    """Returns the hand of a model.
+
+    Args:
+      model: model with a hand.
+      wanted: body of the palm, or empty.
+      notes: doubts are appended.
+
+    Raises:
+      CongraspError: there is no body of that name.
+    """
+    names = [model.body(i).name for i in range(model.nbody)]
+    if wanted and wanted not in names:
+        raise CongraspError(f"There is no body '{wanted}'.", f"Pass one of: {', '.join(filter(None, names))}.")
+    palm = names.index(wanted) if wanted else _palm(model, notes)
+    owner, groups = {palm: palm}, {palm: [palm]}
+    for body in range(palm + 1, model.nbody):
+        if int(model.body_parentid[body]) in owner:
+            owner[body] = max(palm, int(model.body_weldid[body]))
+            groups.setdefault(owner[body], []).append(body)
+    depth = {palm: 0}
+    root = {palm: palm}
+    for link in groups:
+        if link != palm:
+            above = owner[int(model.body_parentid[link])]
+            depth[link], root[link] = depth[above] + 1, link if above == palm else root[above]
+    last: dict[int, int] = {}  # where a finger branches again, the tip is on its longest branch
+    for link in groups:
+        if link != palm and depth[link] > depth.get(last.get(root[link], palm), 0):
+            last[root[link]] = link
+    return Tree(palm, groups, owner, tuple(last.values()))
+
+
+def _palm(model: mujoco.MjModel, notes: list[str]) -> int:
+    """Body with most branches; among several, one named as a palm, the last from the root."""
+    carrier = model.body_weldid  # for each body, the one whose joints move it
+    branches: dict[int, int] = {}
+    for body in np.flatnonzero(model.body_jntnum).tolist():
+        if not any(mujoco.mjtJoint(model.jnt_type[j]) in _FREE for j in hinges(model, body)):
+            parent = int(carrier[model.body_parentid[body]])
+            branches[parent] = branches.get(parent, 0) + 1
+    found = {link: _fork(model, link) for link, count in branches.items() if count > 1} or {0: 0}
+    most = max(branches.get(link, 0) for link in found)
+    best = [link for link in found if branches.get(link, 0) == most]
+    called = [link for link in best if any(word in model.body(found[link]).name.lower() for word in _CALLED)]
+    chosen = max(called or best)
+    others = [model.body(found[link]).name for link in best if link != chosen and link]
+    if others:
+        notes.append(f"the palm could also be {' or '.join(others)} (--palm)")
+    return found[chosen]
+
+
+def _fork(model: mujoco.MjModel, link: int) -> int:
+    """Body of a link whose bodies carry all of its branches: the world body may be a fixed mount below."""
+    moved = np.flatnonzero(model.body_jntnum)
+    carriers = [int(body) for body in model.body_parentid[moved] if model.body_weldid[body] == link]
+    if len(set(carriers)) == 1:
+        return carriers[0]
+    paths = []
+    for body in carriers:
+        path = [body]
+        while path[-1] != link:
+            path.append(int(model.body_parentid[path[-1]]))
+        paths.append(path)
+    return next(body for body in paths[0] if all(body in path for path in paths))
+
+
+def placed(model: mujoco.MjModel, data: mujoco.MjData, body: int, *, colliding: bool) -> list[trimesh.Trimesh]:
+    """Meshes of a body's geometry, m: of what collides, or of what does not; all of it if there is none of that."""
+    mine = np.flatnonzero(model.geom_bodyid == body)
+    collides = (model.geom_contype[mine] | model.geom_conaffinity[mine]) > 0
+    found = []
+    for g in (mine[collides == colliding] if (collides == colliding).any() else mine).tolist():
         if (mesh := geom_mesh(model, g)) is not None:
-            local = np.asarray(mesh.vertices)
-            found += list(local @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g])
+            mesh.vertices = mesh.vertices @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+            found.append(mesh)
     return found
 
 
@@ -78,23 +184,15 @@ def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
 
 def link_mesh(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> tuple[np.ndarray, np.ndarray] | None:
     """Visual mesh of bodies; None if there is none."""
-    parts = []
-    for body in bodies:
-        mine = [g for g in range(model.ngeom) if model.geom_bodyid[g] == body]
-        drawn = [g for g in mine if not model.geom_contype[g] | model.geom_conaffinity[g]] or mine
-        for g in drawn:
-            if (mesh := geom_mesh(model, g)) is not None:
-                placed = np.asarray(mesh.vertices) @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
-                parts.append(trimesh.Trimesh(placed, mesh.faces, process=False))
+    parts = [mesh for body in bodies for mesh in placed(model, data, body, colliding=False)]
     if not parts:
         return None
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
-    whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), faces)
+    joined: Any = trimesh.util.concatenate(parts)
+    whole = trimesh.Trimesh(joined.vertices, joined.faces)
     if len(whole.faces) > MAX_FACES:
         whole = whole.simplify_quadric_decimation(face_count=MAX_FACES)
     if not 0 < len(whole.faces) <= MAX_FACES:  # many separate parts cannot be simplified that far
-        whole = trimesh.Trimesh(np.concatenate([part.vertices for part in parts])).convex_hull
+        whole = joined.convex_hull
     return np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32)
 
 

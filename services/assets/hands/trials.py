@@ -1,5 +1,7 @@
-"""Scripted grips: a hand closes around a ball, a cylinder and a box without a policy, lifts them, and they are pushed.
+"""Trials of a hand without a policy: motors follow a step, the empty hand closes, objects are gripped, lifted, pushed.
 
+In free air, motors follow steps of their targets, and all close. In a grip, a hand closes around a ball, a cylinder or
+a box, and lifts it; then it is pushed.
 The hand is above: its heading axis points down, and the object is in the grasp frame, with the length of cylinder and
 box across the closing plane of the fingers. Each object is tried in parallel at several positions along the heading
 axis and with several forces. It is fixed until the fingers have closed and then released, without a table. The lift and
@@ -20,12 +22,13 @@ from congrasp.actors import stress as protocols
 from congrasp.actors.physics.engine import PhysicsState, ResetState
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.common import rotations
-from congrasp.common.hands.kinematics import grasp_frame
-from congrasp.common.hands.motors import motor_positions
+from congrasp.common.hands.kinematics import grasp_frame, link_transforms
+from congrasp.common.hands.motors import motor_limits, motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.families import draft
 from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import Array
 
@@ -42,6 +45,13 @@ _SPEED = 0.06
 """Greatest closing speed of motors, rad per control step."""
 _CLOSE, _HOLD = 100, 50
 """Durations in control steps."""
+
+
+STEP = 0.1
+"""Step of a target in a control step, rad."""
+_STEPS = 60
+_SETTLED = 10  # last control steps, in which a joint should be at rest
+_FAR = (0.0, 0.0, -5.0)  # distance at which the scene's object is out of reach, m
 
 
 class Grip(NamedTuple):
@@ -221,3 +231,71 @@ def _judged(
         )
         for i, index in enumerate(np.asarray(start.object_index))
     ]
+
+
+class Response(NamedTuple):
+    """Response of a motor to a step of its target."""
+
+    overshoot: float
+    """Overshoot as a share of the step."""
+    unrest: float
+    """Standard deviation of the motor's speed in the last tenth of a second, rad/s; zero for a slow one."""
+    error: float
+    """Final distance from the target, as a share of the step."""
+    diverged: bool
+    """True if the simulation diverged."""
+
+
+def responses(hand: Hand, task: TaskConfig, threads: int) -> list[Response]:
+    """Responses (M) of the motors to steps, in turn.
+
+    A step is `STEP` or half of the range, from the open pose towards the side with more room. The other motors stay,
+    and links do not collide.
+    """
+    task = dataclasses.replace(task, hand_self_collision=False, hand_table_collision=False)
+    (lower, upper), opened = motor_limits(hand), motor_positions(hand, hand.q_open)
+    size = np.minimum(STEP, (upper - lower) / 2)
+    way = np.where(upper - opened >= opened - lower, size, -size)
+    states = _states(hand, task, np.tile(opened + np.diag(way), (_STEPS, 1, 1)), threads)
+    each = np.arange(len(hand.motors))
+    gone = (motor_positions(hand, states.q)[:, each, each] - opened) / way  # (T, M) as shares of the step
+    speed = motor_positions(hand, states.q_velocity)[-_SETTLED:, each, each]
+    return [
+        Response(
+            float(max(gone[:, j].max() - 1, 0.0)),
+            float(speed[:, j].std()),
+            float(abs(gone[-1, j] - 1)),
+            bool(states.diverged[:, j].any()),
+        )
+        for j in each
+    ]
+
+
+def closed_overlap(hand: Hand, task: TaskConfig, threads: int) -> float:
+    """Greatest overlap in m of links after the empty hand has closed, as far as its contacts allow."""
+    share = np.minimum(np.arange(1, 2 * _STEPS + 1) / _STEPS, 1.0)[:, None, None]
+    opened, closed = (motor_positions(hand, q) for q in (hand.q_open, hand.q_closed))
+    states = _states(hand, task, opened + share * (closed - opened), threads)
+    return float(_overlap(hand, states.q[-1].astype(np.float32))[0])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _overlap(hand: Hand, q: Array) -> Array:
+    """Greatest overlap (B,) in m of two links at finger angles (B, F), compiled as one program."""
+    return plausibility.hand_hand(hand, link_transforms(hand, q))
+
+
+def _states(hand: Hand, task: TaskConfig, targets: np.ndarray, threads: int) -> PhysicsState:
+    """States, with leading axis T, for motor targets (T, B, M) from the open pose on."""
+    count = targets.shape[1]
+    start = _start(hand, np.zeros(count, int), np.zeros(count))._replace(object_position=np.tile(_FAR, (count, 1)))
+    physics, found = NativePhysics(hand, task, grip_objects(0.04)[:1], threads), []
+    try:
+        physics.start(start)
+        for target in targets:
+            command = np.concatenate([np.zeros((count, 6)), target], -1)
+            _, state = physics.step(physics, command, np.zeros(count, bool))
+            found.append(jax.tree.map(np.asarray, state))
+    finally:
+        physics.close()
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
