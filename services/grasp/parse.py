@@ -30,7 +30,7 @@ from congrasp.services.assets.captures.extract import Surface, approach
 from congrasp.services.assets.captures.references import followed
 from congrasp.services.assets.captures.sequence import Dropped
 from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
-from congrasp.services.assets.objects.sizes import size_in_words
+from congrasp.services.assets.objects.options import size_in_words
 from congrasp.services.export.motion_file import GraspMotion, load_motion
 from congrasp.services.grasp.wrist_paths import HUGE, read_csv, read_wrist_path
 from congrasp.services.record.goals import grasp_span

@@ -34,8 +34,11 @@ _BARE = 0.005  # radius of a link without any geometry, m
 
 @dataclasses.dataclass(frozen=True)
 class Tree:
-    """A hand's links, each named by the body that moves it."""
+    """A hand's links in a model, each named by the body that moves it."""
 
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    """The file's pose, in the palm's frame."""
     palm: int
     groups: dict[int, list[int]]
     """Bodies of each link, the palm's first."""
@@ -44,15 +47,22 @@ class Tree:
     ends: tuple[int, ...]
     """Last link of each finger."""
 
+    def name(self, link: int) -> str:
+        """Name of a link for a hand file."""
+        return "palm" if link == self.palm else identifier(self.model.body(link).name, f"body_{link}")
+
+    def above(self, link: int) -> int:
+        """The link that carries one other than the palm."""
+        return self.owner[int(self.model.body_parentid[link])]
+
+    def joints(self, link: int) -> list[int]:
+        """Indices of the joints between a link and the one above."""
+        return [] if link == self.palm else hinges(self.model, link)
+
 
 def identifier(name: str, other: str) -> str:
     """Returns a valid name for a hand file, or another if the file has none."""
     return re.sub(r"\W+", "_", name).strip("_") or other
-
-
-def body_name(model: mujoco.MjModel, body: int) -> str:
-    """Returns a body's name as an identifier."""
-    return identifier(model.body(body).name, f"body_{body}")
 
 
 def hinges(model: mujoco.MjModel, body: int) -> list[int]:
@@ -81,6 +91,9 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
         if int(model.body_parentid[body]) in owner:
             owner[body] = max(palm, int(model.body_weldid[body]))
             groups.setdefault(owner[body], []).append(body)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    _to_palm(data, palm)
     depth = {palm: 0}
     root = {palm: palm}
     for link in groups:
@@ -91,7 +104,17 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
     for link in groups:
         if link != palm and depth[link] > depth.get(last.get(root[link], palm), 0):
             last[root[link]] = link
-    return Tree(palm, groups, owner, tuple(last.values()))
+    return Tree(model, data, palm, groups, owner, tuple(last.values()))
+
+
+def _to_palm(data: mujoco.MjData, palm: int) -> None:
+    """Transforms positions and axes of the simulation from the world frame to the palm's frame."""
+    turn, origin = data.xmat[palm].reshape(3, 3).copy(), data.xpos[palm].copy()
+    for places in (data.xpos, data.xipos, data.xanchor, data.geom_xpos):
+        places[:] = (places - origin) @ turn
+    data.xaxis[:] = data.xaxis @ turn
+    for frames in (data.ximat, data.geom_xmat):
+        frames[:] = (turn.T @ frames.reshape(-1, 3, 3)).reshape(-1, 9)
 
 
 def _palm(model: mujoco.MjModel, notes: list[str]) -> int:
@@ -128,22 +151,23 @@ def _fork(model: mujoco.MjModel, link: int) -> int:
     return next(body for body in paths[0] if all(body in path for path in paths))
 
 
-def placed(model: mujoco.MjModel, data: mujoco.MjData, body: int, *, colliding: bool) -> list[trimesh.Trimesh]:
-    """Meshes of a body's geometry, m: of what collides, or of what does not; all of it if there is none of that."""
-    mine = np.flatnonzero(model.geom_bodyid == body)
-    collides = (model.geom_contype[mine] | model.geom_conaffinity[mine]) > 0
-    found = []
-    for g in (mine[collides == colliding] if (collides == colliding).any() else mine).tolist():
-        if (mesh := geom_mesh(model, g)) is not None:
-            mesh.vertices = mesh.vertices @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
-            found.append(mesh)
+def placed(tree: Tree, link: int, *, colliding: bool) -> list[trimesh.Trimesh]:
+    """Meshes of a link's geometry, m: of each body what collides or does not, or all of it if there is none of that."""
+    model, data, found = tree.model, tree.data, []
+    for body in tree.groups[link]:
+        mine = np.flatnonzero(model.geom_bodyid == body)
+        chosen = ((model.geom_contype[mine] | model.geom_conaffinity[mine]) > 0) == colliding
+        for g in (mine[chosen] if chosen.any() else mine).tolist():
+            if (mesh := geom_mesh(model, g)) is not None:
+                mesh.vertices = mesh.vertices @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]
+                found.append(mesh)
     return found
 
 
-def solids_of(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> tuple[Solid, ...]:
-    """Collision geometry of bodies; empty if there is none, or a mesh is among it."""
-    found = []
-    for g in np.flatnonzero(np.isin(model.geom_bodyid, bodies)):
+def solids_of(tree: Tree, link: int) -> tuple[Solid, ...]:
+    """Collision geometry of a link; empty if there is none, or a mesh is among it."""
+    model, data, found = tree.model, tree.data, []
+    for g in np.flatnonzero(np.isin(model.geom_bodyid, tree.groups[link])):
         if not model.geom_contype[g] | model.geom_conaffinity[g]:
             continue
         kind, size = _KINDS.get(mujoco.mjtGeom(model.geom_type[g])), model.geom_size[g].copy()
@@ -182,9 +206,9 @@ def geom_mesh(model: mujoco.MjModel, g: int) -> trimesh.Trimesh | None:
     return None
 
 
-def link_mesh(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Visual mesh of bodies; None if there is none."""
-    parts = [mesh for body in bodies for mesh in placed(model, data, body, colliding=False)]
+def link_mesh(tree: Tree, link: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Visual mesh of a link; None if there is none."""
+    parts = placed(tree, link, colliding=False)
     if not parts:
         return None
     joined: Any = trimesh.util.concatenate(parts)
@@ -196,16 +220,18 @@ def link_mesh(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> 
     return np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32)
 
 
-def inertia_box(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> list[np.ndarray]:
-    """Corners of the box with a body's mass and inertia, if the file has them and its size is that of a link."""
-    mass, (x, y, z) = model.body_mass[body], model.body_inertia[body]
-    if mass < 1e-4 or (mass, x, y, z) == (LEAST[0], *3 * (LEAST[1],)):
-        return []
-    half = np.sqrt(np.maximum(1.5 * np.array([y + z - x, x + z - y, x + y - z]) / mass, 0.0))
-    if half.max() > _PLAUSIBLE[1] or half.max() < _PLAUSIBLE[0]:
-        return []
-    corners = np.array(trimesh.creation.box(2 * np.maximum(half, _PLAUSIBLE[0])).vertices)
-    return list(corners @ data.ximat[body].reshape(3, 3).T + data.xipos[body])
+def inertia_boxes(tree: Tree, link: int) -> list[np.ndarray]:
+    """Corners of the boxes with the mass and inertia of a link's bodies, where the file has them and a link's size."""
+    model, data, found = tree.model, tree.data, []
+    for body in tree.groups[link]:
+        mass, (x, y, z) = model.body_mass[body], model.body_inertia[body]
+        if mass < 1e-4 or (mass, x, y, z) == (LEAST[0], *3 * (LEAST[1],)):
+            continue
+        half = np.sqrt(np.maximum(1.5 * np.array([y + z - x, x + z - y, x + y - z]) / mass, 0.0))
+        if _PLAUSIBLE[0] <= half.max() <= _PLAUSIBLE[1]:
+            corners = np.array(trimesh.creation.box(2 * np.maximum(half, _PLAUSIBLE[0])).vertices)
+            found += list(corners @ data.ximat[body].reshape(3, 3).T + data.xipos[body])
+    return found
 
 
 def bare(*centers: np.ndarray) -> list[np.ndarray]:

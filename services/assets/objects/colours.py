@@ -11,7 +11,7 @@ from trimesh.visual.color import uv_to_interpolated_color
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import COLOUR_POINTS, Colours
 from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
-from congrasp.services.assets.objects.sizes import Up
+from congrasp.services.assets.objects.options import Up
 
 _UNSAID = (102, 102, 102)  # default colour of a material in trimesh
 

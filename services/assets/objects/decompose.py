@@ -1,21 +1,12 @@
 """Convex pieces of an object: those of its folder, or a decomposition of its meshes if those are coarse.
 
 A convex mesh is its hull. Others are cut by CoACD under limits, by V-HACD if that fails, or else are their hull.
-The decomposers are native code that cannot be interrupted, so they run in a child process (`python -m
-congrasp.services.assets.objects.decompose`) with limits of memory and of processor time: the load of the machine
-affects the time, but not the result.
+The decomposers are native code, which runs in a confined process.
 """
 
 import contextlib
-import os
 import pathlib
-import resource
-import signal
-import subprocess
-import sys
 import tempfile
-import threading
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -25,11 +16,11 @@ from scipy.spatial import ConvexHull, QhullError
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import is_watertight
 
-import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_PIECES
 from congrasp.common.runtime.parallel import cores, memory
+from congrasp.services.assets.confined import call_confined
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.fidelity import Fidelity, enclosed, fidelity
 from congrasp.services.assets.objects.options import ImportOptions
@@ -43,7 +34,7 @@ LEAST_MEMORY = 2 << 30
 """Bytes of memory for which a child is started."""
 _MEMORY = 6 << 30  # bytes of address space of a child, where there is enough for one on every core
 _FINEST = 0.01  # the smallest threshold that CoACD takes, of half the longest side
-_ROOT = pathlib.Path(congrasp.__file__).parents[1]
+_MESH, _PIECES = "mesh.npz", "pieces.npz"
 
 
 class Surfaces(NamedTuple):
@@ -145,7 +136,7 @@ def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collis
 def _fitted(surfaces: Surfaces, found: list[np.ndarray], owners: list[int]) -> Collision:
     """Pieces (V, 3) of few vertices, and their errors."""
     hulls = [simplify(piece) for piece in found]
-    return Collision(hulls, owners, fidelity(surfaces.triangles, hulls, closed=surfaces.volume is not None))
+    return Collision(hulls, owners, fidelity(surfaces.triangles, hulls, surfaces.volume is not None))
 
 
 class Decomposition(NamedTuple):
@@ -198,45 +189,29 @@ def _in_child(
     method: str, vertices: np.ndarray, faces: np.ndarray, volume: float | None, max_pieces: int, limit: float
 ) -> tuple[list[np.ndarray], str]:
     """Returns the pieces, or none and the reason."""
-    with tempfile.TemporaryDirectory(prefix="congrasp-") as folder:
-        mesh, result = os.path.join(folder, "mesh.npz"), os.path.join(folder, "pieces.npz")
-        np.savez(mesh, vertices=vertices, faces=faces, volume=volume or 0.0)
-        path = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
-        command = [sys.executable, "-m", "congrasp.services.assets.objects.decompose"]
+    most = min(_MEMORY, max(LEAST_MEMORY, memory() // cores()))
+    with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
+        folder, options = pathlib.Path(name), {"method": method, "volume": volume, "max_pieces": max_pieces}
+        np.savez(folder / _MESH, vertices=vertices, faces=faces)
+        patience = STARVED * limit + STARVED
         try:
-            child = subprocess.run(
-                [*command, method, mesh, result, str(max_pieces), str(limit)],
-                timeout=STARVED * limit + STARVED,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
+            call_confined(write_pieces, folder, options, memory=most, seconds=limit, patience=patience)
+        except TimeoutError:
             raise CongraspError(
-                f"The machine is too busy: {method} got less than {limit:g} s of processor time in "
-                f"{STARVED * limit + STARVED:.0f} s.",
+                f"The machine is too busy: {method} got less than {limit:g} s of processor time in {patience:.0f} s.",
                 "Stop other programs and try again.",
             ) from None
-        if child.returncode == -signal.SIGPROF:
-            return [], f"took longer than {limit:g} s of processor time"
-        if child.returncode != 0 or not os.path.exists(result):
-            last = child.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {child.returncode}"]
-            return [], f"failed ({last[0]})"
-        with np.load(result) as arrays:
+        except ChildProcessError as error:
+            return [], str(error)
+        with np.load(folder / _PIECES) as arrays:
             pieces = list(arrays.values())
     return pieces, "" if pieces else "found no piece"
 
 
-def _child(method: str, mesh: str, result: str, max_pieces: str, limit: str) -> None:
-    """Decomposes one mesh file into another; ends at the limit, or when the parent is gone."""
-    signal.setitimer(signal.ITIMER_PROF, float(limit))  # of processor time; its signal ends the process
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    most = min(_MEMORY, max(LEAST_MEMORY, memory() // cores()))
-    resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
-    with np.load(mesh) as arrays:
-        vertices, faces, volume = arrays["vertices"], arrays["faces"], float(arrays["volume"])
+def write_pieces(folder: pathlib.Path, method: str, volume: float | None, max_pieces: int) -> None:
+    """Decomposes the mesh in a folder, in the confined process."""
+    with np.load(folder / _MESH) as arrays:
+        vertices, faces = arrays["vertices"], arrays["faces"]
     if method == "coacd":
         # A closed mesh may be of several bodies that intersect, which CoACD cuts forever.
         parts = repair.bodies(vertices, faces) if volume else [(vertices, faces)]
@@ -245,9 +220,9 @@ def _child(method: str, mesh: str, result: str, max_pieces: str, limit: str) -> 
         import vhacdx
 
         rows = np.insert(faces, 0, 3, axis=1).astype(np.uint32)  # the number of corners comes first, as in VTK
-        found = [piece[0] for piece in vhacdx.compute_vhacd(vertices, rows, maxConvexHulls=int(max_pieces))]
+        found = [piece[0] for piece in vhacdx.compute_vhacd(vertices, rows, maxConvexHulls=max_pieces)]
     solid = [hull for hull in (solid_hull(np.asarray(piece, np.float64)) for piece in found) if hull is not None]
-    np.savez(result, *merge([hull.points for hull in solid], int(max_pieces), vertices[faces], volume or None))
+    np.savez(folder / _PIECES, *merge([hull.points for hull in solid], max_pieces, vertices[faces], volume))
 
 
 def _by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[np.ndarray]:
@@ -273,14 +248,3 @@ def _by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[
 def _convex(hull: ConvexHull, triangles: np.ndarray, volume: float) -> bool:
     """True if the hull of a closed mesh (F, 3, 3) of this volume may stand for it."""
     return volume > (1 - GROWTH) * hull.volume and deepest(hull, triangles) < DEPTH
-
-
-def _end_with(parent: int) -> None:
-    """Ends this process after its parent, whose id is given."""
-    while os.getppid() == parent:
-        time.sleep(0.5)
-    os._exit(1)
-
-
-if __name__ == "__main__":
-    _child(*sys.argv[1:])

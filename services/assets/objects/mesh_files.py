@@ -19,7 +19,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.gltf import MAX_FACES, plain_glb
-from congrasp.services.assets.objects.sizes import Up
+from congrasp.services.assets.objects.options import Up
 
 SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CONVERT = "Convert it to STL, OBJ, PLY or GLB."

@@ -27,9 +27,8 @@ from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.fidelity import enclosed
 from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
 from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
-from congrasp.services.assets.objects.options import ImportOptions, check_options
+from congrasp.services.assets.objects.options import ImportOptions, Up, check_options, metres_per_unit
 from congrasp.services.assets.objects.repair import encloses
-from congrasp.services.assets.objects.sizes import Up, metres_per_unit
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -216,14 +215,6 @@ def test_pieces_are_kept_if_a_cut_is_no_closer(tmp_path, options, hull_alone):
     assert obj.notes[0].endswith("; pieces cut from its mesh are no closer")
 
 
-def test_coacd_cuts_an_ell_in_two():
-    mesh = ell()
-    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
-    assert result.method == "coacd"
-    assert 2 <= len(result.pieces) <= 3
-    np.testing.assert_allclose(sum(shapes.hull_of(piece).volume for piece in result.pieces), mesh.volume, rtol=0.05)
-
-
 def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
     mesh = ell()
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
@@ -291,20 +282,3 @@ def test_a_bowl_is_as_thin_as_its_wall(tmp_path, options):
     (obj,) = objects_of(tmp_path / "bowl.stl", options)
     assert obj.shape_reliable and abs(obj.volume_error) < 0.1
     assert obj.surface_error < 4e-3
-
-
-def test_every_scanned_folder_is_found_as_one_decomposed_object(shared_objects):
-    sources = find_sources(shared_objects)
-    assert [source.name for source in sources] == sorted(
-        path.name for path in shared_objects.iterdir() if path.is_dir()
-    )
-    assert len(sources) == 24
-    assert all(source.pieces and len(source.visuals) == 1 for source in sources)
-
-
-def test_a_copy_of_a_scanned_folder_needs_no_model_files(shared_objects, tmp_path, options, quick_import):
-    folder = tmp_path / "cubemedium"
-    folder.mkdir()
-    for file in (shared_objects / "cubemedium").glob("*.stl"):
-        shutil.copy(file, folder)
-    assert objects_of(folder, options)[0].name == "cubemedium"
