@@ -58,6 +58,9 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     name = file.stem
     _, robot, pose = frames_of(name, "the file", read_archive(file), {"time": (), "robot": (29,), "object": (7,)})
     present = np.isfinite(robot).all(-1) & np.isfinite(pose).all(-1) & is_unit(pose[:, 3:])
+    if not present.any():
+        reason = "no frame has finite joints and an object with a unit quaternion (w, x, y, z)"
+        raise Dropped(name, "frames missing", reason)
     robot, pose = known_frames(name, present, robot, pose)
     largest = float(np.abs(robot[:, 3:]).max())
     if largest > _LARGEST:

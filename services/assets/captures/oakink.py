@@ -86,7 +86,8 @@ def _sequence(
         raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
     pose, shape, wrist, place = (np.stack([(row or known)[i] for row in rows]) for i in range(4))
     if not is_unit(pose).all():
-        raise Dropped(name, "wrong layout", "a quaternion of 'hand_pose' is not of length one")
+        length = np.linalg.norm(pose, axis=-1).min()
+        raise Dropped(name, "wrong layout", f"a quaternion of 'hand_pose' has the length {length:.3g}")
     palm, fingers = (Rotation.from_quat(part, scalar_first=True) for part in (pose[:, 0], pose[:, 1:]))
     wrist_turn, joints = human.skeleton(model, shape[0]).posed(palm, fingers)
     turn = place[:, :3, :3]

@@ -130,14 +130,10 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
     Raises:
       CongraspError: the file has no coloured vertices, none of this colour, or shows another object.
     """
-    if not path.is_file():
-        raise CongraspError(f"There is no file {path}.", "Check the path.")
     mesh = load_geometry(path, "Export it as PLY with coloured vertices.")
     visual = getattr(mesh, "visual", None)
-    colours = getattr(visual, "vertex_colors", None) if getattr(visual, "kind", None) == "vertex" else None
-    if colours is None and isinstance(mesh, trimesh.PointCloud):
-        colours = mesh.colors if len(mesh.colors) else None
-    if colours is None:
+    colours = getattr(visual, "vertex_colors", ()) if getattr(visual, "kind", None) == "vertex" else ()
+    if not len(colours):
         raise CongraspError(f"{path} has no coloured vertices.", "Paint them and export as PLY with colours.")
     vertices = upright(np.asarray(mesh.vertices, float), obj.file_up) * obj.file_scale + obj.origin
     finite = np.isfinite(vertices).all(-1)

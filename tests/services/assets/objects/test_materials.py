@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects.materials import guessed_mass, materials_of, weigh
 from congrasp.services.assets.objects.named import ObjectAt, objects_of
@@ -89,14 +88,6 @@ def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer, quick_import):
         ("head=steel", "leaves out the part 'handle'. Add handle=NAME."),
     ],
 )
-def test_what_is_wrong_with_a_material_is_said_in_one_line(hammer, quick_import, material, words):
-    with pytest.raises(CongraspError) as error:
-        imported(hammer, material=material)
-    assert words in str(error.value) and "\n" not in str(error.value)
-    with pytest.raises(CongraspError, match="--material and --density"):
-        imported(hammer, material="wood", density=3.0)
-
-
 def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_mass():
     assert guessed_mass(1e-6, 6e-4) == pytest.approx(0.0024)  # a centimetre's cube, at 2,400 kg/m^3
     assert guessed_mass(2e-4, 0.02) == pytest.approx(0.1)  # 500 kg/m^3
