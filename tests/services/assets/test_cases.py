@@ -47,7 +47,7 @@ def prepared(name: str, folder: pathlib.Path) -> dict[str, Any]:
     case = json.loads((folder / "case.json").read_text())
     for file, how in case.get("files", {}).items():
         if "copy" in how:
-            (folder / file).parent.mkdir(exist_ok=True)
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(CASES / how["copy"], folder / file)
             continue
         text = how["text"] if "text" in how else (CASES / "_hand" / how["from"]).read_text()

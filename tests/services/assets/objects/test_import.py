@@ -94,41 +94,6 @@ def test_an_unexpected_error_reaches_the_caller(tmp_path, options, monkeypatch):
         list(meshes.import_sources(find_sources(tmp_path), options))
 
 
-def test_given_convex_pieces_are_used(tmp_path, options, quick_import):
-    folder = tmp_path / "ell"
-    folder.mkdir()
-    first, second = block((0.08, 0.02, 0.02)), block((0.02, 0.02, 0.06), (0.03, 0, 0.04))
-    trimesh.util.concatenate([first, second]).export(folder / "ell.stl")
-    first.export(folder / "contact0.stl")
-    second.export(folder / "contact1.stl")
-    first.export(folder / "ell_handle.stl")
-    second.export(folder / "ell_blade.stl")
-    (obj,) = objects_of(folder, options)
-    assert obj.part_names == ("blade", "handle")
-    assert obj.graspable.tolist() == [False, True]
-    volumes = sorted(shapes.volume(piece) for piece in obj.pieces)
-    np.testing.assert_allclose(volumes, [24e-6, 32e-6], rtol=1e-4)
-    assert [piece.part for piece in sorted(obj.pieces, key=shapes.volume)] == [0, 1]
-    (folder / "ell.stl").unlink()
-    with pytest.raises(CongraspError, match="not clear which mesh shows the whole"):
-        objects_of(folder, options)
-    (folder / "ell_handle.stl").unlink()
-    (folder / "ell_blade.stl").unlink()
-    (bare,) = objects_of(folder, options)
-    np.testing.assert_allclose(bare.mass, obj.mass, rtol=1e-4)
-
-
-def test_folders_of_meshes_and_of_folders(tmp_path):
-    for name in ("b", "a"):
-        block().export(tmp_path / f"{name}.stl")
-    assert [source.name for source in find_sources(tmp_path)] == ["a", "b"]
-    outer = tmp_path / "outer"
-    for name in ("y", "x 1"):
-        (outer / name).mkdir(parents=True)
-        block().export(outer / name / f"{name}.stl")
-    assert [source.name for source in find_sources(outer)] == ["x_1", "y"]
-
-
 @pytest.fixture
 def hull_alone(monkeypatch):
     """Every decomposition ends with the convex hull; halves are not cut again."""
