@@ -182,7 +182,7 @@ def _supported(start: bytes, size: int) -> str:
 
 
 def _foreign(text: bytes, data: bytes) -> tuple[str, str] | None:
-    """What a file with a beginning and a content is that is no mesh, and the remedy."""
+    """Kind of a file that is no mesh, by its beginning and its content, and the remedy; None if it is unknown."""
     inside, zipped, names = text.lower(), text.startswith(b"PK\3\4"), list[str]()
     if zipped:
         try:

@@ -5,13 +5,11 @@ import pathlib
 import numpy as np
 import pytest
 
-from congrasp.common.errors import CongraspError
 from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.mjcf import add_hand
 from congrasp.services.assets.hands.model_files import Choices, describe, propose
 from congrasp.services.cli import main
-from congrasp.services.viz.hand_sheets import hands_sheet, joints_sheet
 
 HANDS = pathlib.Path(__file__).parents[3] / "hands"
 ENDS = {"left_root": -0.96, "left_middle": -1.28, "opposing_root": 0.96, "opposing_middle": 1.28}
@@ -109,14 +107,3 @@ def test_the_commands_import_list_and_draw(tmp_path, capsys):
     assert main.run(["hands", "list"]) == 0
     said = capsys.readouterr().out
     assert all(name in said for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO"))
-    with pytest.raises(CongraspError, match="'allegro' is a hand of congrasp"):
-        main.run(["hands", "import", str(HANDS / "claw.urdf"), "--name", "allegro"])
-    with pytest.raises(CongraspError, match=r"does not end in \.json"):
-        main.run(["hands", "import", str(HANDS / "claw.urdf"), "--out", "a.txt"])
-
-
-def test_sheets_show_every_hand_and_every_joint(claw):
-    image = hands_sheet([claw.hand], size=(40, 40))
-    rows = joints_sheet(claw.hand, size=(40, 40))
-    assert image.shape[1] > 3 * 40 and rows.shape[0] > 2 * 40 and rows.shape[1] > 8 * 40
-    assert len(np.unique(rows.reshape(-1, 3), axis=0)) > 100
