@@ -80,14 +80,6 @@ def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer, quick_import):
     np.testing.assert_allclose(given.inertia / 0.5, obj.inertia / obj.mass)
 
 
-@pytest.mark.parametrize(
-    ("material", "words"),
-    [
-        ("adamantium", "--material is 'adamantium'. Materials: aluminium, "),
-        ("wood,shaft=steel", "names the part 'shaft'. The parts are: handle, head."),
-        ("head=steel", "leaves out the part 'handle'. Add handle=NAME."),
-    ],
-)
 def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_mass():
     assert guessed_mass(1e-6, 6e-4) == pytest.approx(0.0024)  # a centimetre's cube, at 2,400 kg/m^3
     assert guessed_mass(2e-4, 0.02) == pytest.approx(0.1)  # 500 kg/m^3
