@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import threading
 
 import numpy as np
 import pytest
@@ -78,7 +79,17 @@ def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import,
     assert digest(objects_of(path, options)[0]) == digest(larger)
 
 
-def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import):
+def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import, monkeypatch):
+    """Each of three imports waits for the others to begin."""
+    started, real = threading.Barrier(3), meshes._build
+
+    def build(*arguments):
+        started.wait(20)
+        return real(*arguments)
+
+    monkeypatch.setattr(meshes, "_build", build)
+    monkeypatch.setattr(meshes, "cores", lambda: 3)
+    monkeypatch.setattr(meshes, "memory", lambda: 1 << 40)
     for name, factor in (("a", 1.0), ("b", 1000.0), ("c", 0.5)):
         block(factor * SIDES).export(tmp_path / f"{name}.stl")
     found = dict(meshes.import_sources(find_sources(tmp_path), options))
