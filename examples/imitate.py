@@ -20,7 +20,7 @@ from congrasp.common.hands.mano import read_mano
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.build import Options, import_sets
-from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.assets.captures.sequence import Meshes
 from congrasp.services.viz.render import episode_strip
 from congrasp.services.viz.sheets import contact_sheet, save_png
 

@@ -9,10 +9,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import congrasp
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.spec import Hand, capsule_ends
 from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import GraspObject, Piece
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 
 FLOOR = 0.005
 """Height above the table from which a point belongs to the object, m."""

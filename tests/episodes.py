@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.wire.codec import Message
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 
 BLOCKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 """Blocks of the observation that a policy of the paper's constraints gates."""

@@ -67,6 +67,33 @@ def add_hand(
 
 
 @functools.cache
+def _alone(hand: Hand) -> mujoco.MjModel:
+    """A model of the hand only, with its wrist at the origin."""
+    spec = mujoco.MjSpec()
+    add_hand(spec, hand)
+    return spec.compile()
+
+
+def posed(hand: Hand, q: np.ndarray) -> mujoco.MjData:
+    """Bodies and joints of the hand at finger angles (F,) rad, with its wrist at the origin.
+
+    `kinematics.link_poses` computes the same for batches in JAX; this needs no JAX backend.
+    """
+    data = mujoco.MjData(_alone(hand))
+    for joint, angle in zip(hand.joints, q, strict=True):
+        data.joint(joint.name).qpos[0] = angle
+    mujoco.mj_kinematics(data.model, data)
+    return data
+
+
+def mujoco_link_poses(hand: Hand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (L, 3) and orientations (L, 4) of the links' frames in the wrist frame, at finger angles (F,) rad."""
+    data = posed(hand, q)
+    bodies = [data.body(link.name).id for link in hand.links]
+    return data.xpos[bodies], data.xquat[bodies]
+
+
+@functools.cache
 def overlapping(hand: Hand) -> tuple[tuple[str, str], ...]:
     """Pairs of links whose shapes overlap in the open pose or at zero; their contacts are excluded.
 

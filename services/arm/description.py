@@ -98,16 +98,17 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
     return Arm(name, spec, tuple(answer["joints"]), flange=answer["flange"], **arrays)
 
 
-def write_arm(path: pathlib.Path, folder: pathlib.Path, options: dict[str, Any]) -> dict[str, Any]:
+def write_arm(folder: pathlib.Path, path: str, flange: str, speed: str) -> dict[str, Any]:
     """Does the work of `load_arm` in the confined process: writes the bodies as MJCF, and arrays."""
-    spec, _ = robot_spec(path, [])
+    file = pathlib.Path(path)
+    spec, _ = robot_spec(file, [])
     for i, body in enumerate(spec.bodies):
         body.name = body.name or f"body_{i}"
     for i, joint in enumerate(spec.joints):
         joint.name = joint.name or f"joint_{i}"
-    with contextlib.chdir(path.parent):
+    with contextlib.chdir(file.parent):
         model = spec.compile()
-    body, position, quaternion = _flange(model, path, options["flange"])
+    body, position, quaternion = _flange(model, file, flange)
     carried = [i for i in _above(model, body) if model.body_jntnum[i]]
     joints = [int(model.body_jntadr[i]) + k for i in carried for k in range(model.body_jntnum[i])]
     if not joints or any(model.jnt_type[j] not in _KINDS for j in joints):
@@ -119,13 +120,12 @@ def write_arm(path: pathlib.Path, folder: pathlib.Path, options: dict[str, Any])
     limited = model.jnt_limited[joints].astype(bool)
     lower, upper = (np.where(limited, model.jnt_range[joints, k], end) for k, end in ((0, -np.inf), (1, np.inf)))
     postures = model.key_qpos[:, model.jnt_qposadr[joints]]
-    speed = _speeds(path, names, options["speed"])
     _strip(spec, model, body)
     np.savez(
         folder / _ARRAYS,
         lower=lower,
         upper=upper,
-        speed=speed,
+        speed=_speeds(file, names, speed),
         position=position,
         quaternion=quaternion,
         postures=postures,

@@ -155,7 +155,7 @@ def import_captures(
     from congrasp.common.hands import get_hand
     from congrasp.common.hands.mano import own_mano_model
     from congrasp.services.assets.captures.build import Options, import_sets
-    from congrasp.services.assets.captures.objects import Meshes
+    from congrasp.services.assets.captures.sequence import Meshes
     from congrasp.services.cli.console import bars
 
     if format not in IMPORTERS:

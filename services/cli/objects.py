@@ -67,7 +67,7 @@ def import_meshes(
     """
     from congrasp.common.objects.store import Catalogue
     from congrasp.services.assets.objects.meshes import import_sources
-    from congrasp.services.assets.objects.sources import distinct, find_sources
+    from congrasp.services.assets.objects.named import distinct, find_sources
     from congrasp.services.cli.console import bars, report_error, say
 
     if not paths:

@@ -18,8 +18,7 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.store import Catalogue
 from congrasp.services.assets.objects.materials import with_mass
 from congrasp.services.assets.objects.named import ObjectAt, objects_at
-from congrasp.services.assets.objects.options import ImportOptions, check_options
-from congrasp.services.assets.objects.sizes import size_in_words
+from congrasp.services.assets.objects.options import ImportOptions, check_options, size_in_words
 from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, key_of, save_grasp
 from congrasp.services.grasp.grasper import Grasper, Progress
 from congrasp.services.grasp.parse import numbered, read_request

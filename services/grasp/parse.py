@@ -27,10 +27,10 @@ from congrasp.common.task.constraints.heading import ABOVE
 from congrasp.common.task.sampling import sets as constraint_sets
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import Surface, approach
+from congrasp.services.assets.captures.references import followed
 from congrasp.services.assets.captures.sequence import Dropped
-from congrasp.services.assets.captures.transfer import followed
 from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
-from congrasp.services.assets.objects.sizes import size_in_words
+from congrasp.services.assets.objects.options import size_in_words
 from congrasp.services.export.motion_file import GraspMotion, load_motion
 from congrasp.services.grasp.wrist_paths import HUGE, read_csv, read_wrist_path
 from congrasp.services.record.goals import grasp_span
@@ -165,7 +165,7 @@ def _part(text: str, name: str, target: Target) -> Part:
         raise CongraspError(f"{name}: there is no file {path}.", "Check the path.")
     try:
         geometry = load_geometry(path, "Export the part as PLY.")
-        up = "y" if obj.file_up == "y" else up_of(path)
+        up = "y" if obj.file_up == "y" else up_of(geometry)
     except CongraspError as error:
         raise CongraspError(f"{name}: {error}") from None
     geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry

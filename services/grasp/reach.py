@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.spec import Hand, link_origin
 from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.wire.codec import Message
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.viz.shapes import upright
 
 SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.flesh import skeleton_of
-from congrasp.common.hands.mjcf import WRIST_JOINTS
+from congrasp.common.hands.mjcf import WRIST_JOINTS, mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand, Link, capsule_ends
 from congrasp.common.objects.painting import nearest
@@ -33,7 +33,6 @@ from congrasp.common.objects.store import LARGEST
 from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import EPISODE, validate
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
 from congrasp.services.record.goals import markers
 from congrasp.services.record.moved_arm import MovedArm, arm_of_episode

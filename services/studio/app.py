@@ -18,8 +18,7 @@ from congrasp.common.transport.security import check_exposure
 from congrasp.learner.run_directory import LOGS
 from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.named import objects_at, one_object
-from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.sizes import Unit
+from congrasp.services.assets.objects.options import ImportOptions, Unit
 from congrasp.services.ops.logs import log
 from congrasp.services.serve.server import follow_file, follow_run
 from congrasp.services.studio.catalogue import Catalogue

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import GraspObject
-from congrasp.services.assets.objects.sizes import UNIT_NAMES, guessed_unit, sizes_by_unit
+from congrasp.services.assets.objects.options import UNIT_NAMES, guessed_unit, sizes_by_unit
 from congrasp.services.studio.server import BadRequest, Picture
 from congrasp.services.viz.object_sheet import rest_picture
 from congrasp.services.viz.sheets import png_of

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.initial import initial_hand
 from congrasp.common.hands import known_hand
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.painting import painted
@@ -22,7 +23,6 @@ from congrasp.common.task.constraints.markers import Ghost, Marker
 from congrasp.common.task.reward import GRASP
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.grasp.grasper import surface_of
 from congrasp.services.record.goals import active_blocks, active_constraints, markers
 from congrasp.services.studio.state import Studio, tool_of

@@ -20,7 +20,7 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.materials import MATERIALS, with_mass
-from congrasp.services.assets.objects.sizes import METRES
+from congrasp.services.assets.objects.options import METRES
 from congrasp.services.ops.logs import log
 from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads
 from congrasp.services.studio.motions import DATA, DRAWN, Motions, data_file, drawing

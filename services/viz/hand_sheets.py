@@ -18,7 +18,7 @@ from congrasp.services.viz.shapes import arrow, beads, fit, object_shape, posed_
 from congrasp.services.viz.sheets import contact_sheet, stacked
 
 if TYPE_CHECKING:
-    from congrasp.services.assets.hands.grips import Grip
+    from congrasp.services.assets.hands.trials import Grip
 
 _VIEW = np.array([0.75, 0.65, 0.35])
 

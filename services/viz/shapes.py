@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import Hand, capsule_ends
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.record.moved_arm import MovedArm
 from congrasp.services.record.palette import MATERIALS as MATERIAL_COLOURS
 from congrasp.services.record.palette import OBJECT, SKIN, TABLE, Colour

@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import keypoints, link_transforms
-from congrasp.common.hands.mjcf import add_hand
+from congrasp.common.hands.mjcf import add_hand, mujoco_link_poses
 from congrasp.common.hands.spec import Motor
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.hands import grips
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.services.assets.hands import trials
 from congrasp.services.export.motion_file import GraspMotion, hand_arrays, motion_of_episode, save_motion
 from tests.benchmarks.dexgraspbench import dexgraspbench, write_grasp
 from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, State, benchmark_grasp, read_grasps, squeezed
@@ -313,8 +312,8 @@ def test_the_grasp_is_that_at_the_end_of_the_approach(motion):
 def test_a_firm_grip_survives_the_exam_and_an_open_hand_does_not(motion, monkeypatch):
     """A box that a scripted grip holds: squeezed it stays through the pushes, from afar nothing holds it."""
     for name, value in (("SIZES", (0.4,)), ("_PLACES", (0.5,)), ("_FIRMNESS", (0.8,))):
-        monkeypatch.setattr(grips, name, value)
-    grip = next(grip for grip in grips.grips(HAND, TaskConfig(), 1) if grip.obj.name == "box")
+        monkeypatch.setattr(trials, name, value)
+    grip = next(grip for grip in trials.grips(HAND, TaskConfig(), 1) if grip.obj.name == "box")
     still = Rotation.identity()
     q = grip.q.astype(float)
     closed = np.clip(q + 0.14 * np.sign(HAND.q_closed - HAND.q_open), HAND.lower, HAND.upper)

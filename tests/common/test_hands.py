@@ -14,12 +14,11 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand
 from congrasp.common.hands.kinematics import grasp_frame, link_poses
 from congrasp.common.hands.mano import VARIABLE
-from congrasp.common.hands.mjcf import add_hand, overlapping
+from congrasp.common.hands.mjcf import add_hand, mujoco_link_poses, overlapping
 from congrasp.common.hands.spec import link_origin
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import scale_objects
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from tests.mano_file import mano_pickle
 from tests.task import start_of
 

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.flesh import surface_net
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 
 HANDS = ("human", "allegro", "sharpa")
 

@@ -31,7 +31,7 @@ def quick_imports() -> Iterator[None]:
 
     Decomposition, errors and halves that a hand can hold take most of an import's time.
     """
-    from congrasp.services.assets.objects import collision, decompose, meshes
+    from congrasp.services.assets.objects import decompose, meshes
     from congrasp.services.assets.objects.fidelity import Fidelity
 
     def hull(vertices: np.ndarray, faces: np.ndarray, **options: object) -> decompose.Decomposition:
@@ -39,7 +39,7 @@ def quick_imports() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(decompose, "decompose", hull)
-        patch.setattr(collision, "fidelity", lambda *_: Fidelity(0.0, 0.0))
+        patch.setattr(decompose, "fidelity", lambda *_: Fidelity(0.0, 0.0))
         patch.setattr(meshes, "cut_to_hold", lambda obj: obj)
         yield
 

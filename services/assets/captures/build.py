@@ -3,8 +3,7 @@
 import collections
 import dataclasses
 import pathlib
-from collections.abc import Callable, Collection, Iterable, Iterator
-from collections.abc import Sequence as Items
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal
 
 import jax
@@ -33,16 +32,23 @@ from congrasp.common.task.sampling.headings import Headings
 from congrasp.common.task.sampling.write_sets import for_training, set_of
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
-from congrasp.services.assets.captures.objects import import_meshes
-from congrasp.services.assets.captures.refuse import check_reference
-from congrasp.services.assets.captures.separate import deepest, separated
+from congrasp.services.assets.captures.references import (
+    check_reference,
+    deepest,
+    demonstrated_headings,
+    separated,
+    transferred,
+)
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
-from congrasp.services.assets.captures.transfer import demonstrated_headings, transferred
 from congrasp.services.assets.objects.affordance import near_points, relabelled, two_parts
-from congrasp.services.assets.objects.meshes import UNLABELLED
+from congrasp.services.assets.objects.meshes import UNLABELLED, Source, import_sources
+from congrasp.services.assets.objects.named import find_sources
+from congrasp.services.assets.objects.options import ImportOptions
 
 Affordance = Literal["auto", "parts", "contacts", "none"]
 _Shapes = dict[pathlib.Path, tuple[GraspObject, Surface] | CongraspError]
+_AXES = ImportOptions(unit="m", up="z")
+"""Captured poses refer to the axes of the mesh files."""
 _TOUCHED = 0.03
 """Radius around touched points that counts as touched, m."""
 IN_TABLE = 0.005
@@ -93,6 +99,8 @@ class _Group:
 
     obj: GraspObject
     demonstrations: list[Demonstration] = dataclasses.field(default_factory=list)
+    training: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
+    """(M,) bool, those for training."""
 
 
 def import_sets(
@@ -139,44 +147,37 @@ def import_sets(
         group.obj = dataclasses.replace(group.obj, name=name)
     objects, sets = [], []
     # Sets may hold a single sequence each: 80 % refers to all sequences, not to each set.
-    splits = _split(groups.values(), options.seed)
-    for number, (group, training) in enumerate(zip(groups.values(), splits, strict=True)):
+    ends = np.cumsum([len(group.demonstrations) for group in groups.values()], dtype=int)
+    masks = np.split(for_training(int(ends[-1]), options.seed), ends[:-1]) if len(ends) else []
+    for number, (group, mask) in enumerate(zip(groups.values(), masks, strict=True)):
+        group.training = mask
         try:
-            obj, made, given = _set(hand, group, options, number, source, training)
+            made, given = _set(hand, group, options, number, source)
         except CongraspError as error:
             for demonstration in group.demonstrations:
                 report.drop(Dropped(demonstration.name, "object out of reach", str(error)))
             continue
-        objects.append(obj)
+        objects.append(group.obj)
         sets.append(made)
-        report.kept += _rows(hand, obj, made, group.demonstrations, given, training)
+        report.kept += _rows(hand, group, made, given)
     return objects, sets, report
 
 
-def _rows(
-    hand: Hand,
-    obj: GraspObject,
-    made: Message,
-    demonstrations: Items[Demonstration],
-    given: np.ndarray,
-    training: np.ndarray,
-) -> Iterator[dict[str, Any]]:
+def _rows(hand: Hand, group: _Group, made: Message, given: np.ndarray) -> Iterator[dict[str, Any]]:
     """Yields the outcome of each of M kept demonstrations on an object.
 
     Args:
       hand: hand of the set.
-      obj: the object.
+      group: the object and its demonstrations.
       made: the constraint set.
-      demonstrations: M demonstrations.
       given: (M, F) finger angles before fingers were separated.
-      training: (M,) bool, those for training.
     """
     usable, below = made.arrays["pose/allowed"].any((0, 1)), _from_below(hand, made)
     overlap, moved = np.asarray(deepest(hand, given)), np.abs(made.arrays["pose/q"][0] - given).max(-1)
-    for m, demonstration in enumerate(demonstrations):
+    for m, demonstration in enumerate(group.demonstrations):
         yield {
             "sequence": demonstration.name,
-            "object": obj.name,
+            "object": group.obj.name,
             "frame": demonstration.frame,
             "frames_after_touch": demonstration.later,
             "first_frame": demonstration.start,
@@ -187,30 +188,36 @@ def _rows(
             "touched_points": len(demonstration.contact),
             "clear_of_table": bool(usable[m]),
             "from_below": bool(below[m]),
-            "split": "training" if training[m] else "held-out",
+            "split": "training" if group.training[m] else "held-out",
         }
-
-
-def _split(groups: Collection[_Group], seed: int) -> list[np.ndarray]:
-    """Masks (M,) of each group's demonstrations for training, 80 % of those of all groups together."""
-    ends = np.cumsum([len(group.demonstrations) for group in groups], dtype=int)
-    return np.split(for_training(int(ends[-1]), seed), ends[:-1]) if len(ends) else []
 
 
 def _shapes(sequences: list[Sequence], progress: Callable[[str], None]) -> _Shapes:
     """Imports the sequences' meshes once each; returns objects and surfaces, or the reasons for failures."""
     names = {sequence.mesh: sequence.object_name for sequence in sequences}
     distinct = distinct_names(safe_name(name) for name in names.values())
-    shapes: _Shapes = {}
-    imported = import_meshes(dict(zip(names, distinct, strict=True)), lambda name: progress(f"Mesh of {name}"))
-    for mesh, obj in imported.items():
-        if isinstance(obj, CongraspError):
-            shapes[mesh] = obj
-        else:
+    shapes, sources = _Shapes(), dict[pathlib.Path, Source]()
+    for mesh, name in zip(names, distinct, strict=True):
+        try:
+            sources[mesh] = dataclasses.replace(_source(mesh), name=name)
+        except CongraspError as error:
+            shapes[mesh] = error
+    paths = list(sources)
+    for done, (i, obj) in enumerate(import_sources(list(sources.values()), _AXES), 1):
+        progress(f"Mesh of {sources[paths[i]].name} ({done} of {len(paths)})")
+        if not isinstance(obj, CongraspError):
             # Without labelled parts the whole surface is graspable.
             obj = dataclasses.replace(obj, graspable=np.ones_like(obj.graspable))
-            shapes[mesh] = obj, Surface(obj)
+        shapes[paths[i]] = obj if isinstance(obj, CongraspError) else (obj, Surface(obj))
     return shapes
+
+
+def _source(mesh: pathlib.Path) -> Source:
+    """Returns the files of the one object at a path."""
+    sources = find_sources(mesh)
+    if len(sources) > 1:
+        raise CongraspError(f"{mesh} holds {len(sources)} objects.", "Pass the folder of one, or its file.")
+    return sources[0]
 
 
 def _shape(sequence: Sequence, shapes: _Shapes) -> tuple[GraspObject, Surface]:
@@ -289,10 +296,8 @@ def _resting_poses(
     return clear & (height >= np.clip(height.max(1, keepdims=True), -IN_TABLE, -SOFT))
 
 
-def _set(
-    hand: Hand, group: _Group, options: Options, number: int, source: str, training: np.ndarray
-) -> tuple[GraspObject, Message, np.ndarray]:
-    """Returns the object, its constraint set scaled for the hand, and the initial finger angles (M, F).
+def _set(hand: Hand, group: _Group, options: Options, number: int, source: str) -> tuple[Message, np.ndarray]:
+    """Returns the constraint set of an object scaled for the hand, and the initial finger angles (M, F).
 
     Args:
       hand: hand of the constraints.
@@ -300,7 +305,6 @@ def _set(
       options: options for building.
       number: number of the group, for its seed.
       source: name of the data set.
-      training: (M,) bool, the demonstrations for training.
 
     Raises:
       CongraspError: the hand cannot approach the object in any resting pose.
@@ -342,9 +346,9 @@ def _set(
         "object_digest": store.digest(obj),
     }
     # Demonstrated headings repeat, and each belongs to the split of its demonstration.
-    own = np.resize(training, HEADINGS) if given else None
-    made = set_of(hand, row, fitting, options.seed, about, pose_training=training, heading_training=own)
-    return obj, made, given_q
+    own = np.resize(group.training, HEADINGS) if given else None
+    made = set_of(hand, row, fitting, options.seed, about, pose_training=group.training, heading_training=own)
+    return made, given_q
 
 
 def _from_below(hand: Hand, made: Message) -> np.ndarray:

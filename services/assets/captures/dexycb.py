@@ -17,9 +17,16 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.mano import VARIABLE, ManoModel
 from congrasp.common.io.inputs import file_name, read_file
 from congrasp.common.io.pickles import read_archive
-from congrasp.services.assets.captures import mano
-from congrasp.services.assets.captures.objects import Meshes
-from congrasp.services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
+from congrasp.services.assets.captures import human
+from congrasp.services.assets.captures.sequence import (
+    Dropped,
+    Meshes,
+    Sequence,
+    frames_of,
+    is_unit,
+    known_frames,
+    read_or_drop,
+)
 
 _LARGEST_YAML, _DEEPEST_YAML = 64 << 10, 16
 HOLDS = "<date>-subject-01/<session>/meta.yml"
@@ -58,30 +65,28 @@ def _sequence(name: str, folder: pathlib.Path, root: pathlib.Path, meshes: Meshe
     ids, grasped = _value(name, meta, "ycb_ids"), int(_value(name, meta, "ycb_grasp_ind"))
     if not 0 <= grasped < len(ids) or not 1 <= ids[grasped] <= len(OBJECTS):
         raise Dropped(name, "wrong layout", f"'ycb_grasp_ind' {grasped} names none of the objects {ids}")
-    poses = read_archive(folder / "pose.npz")
-    objects, hands = (
-        array_of(name, "pose.npz", poses, key, "F", "n", width) for key, width in (("pose_y", 7), ("pose_m", 51))
+    objects, hands = frames_of(
+        name, "pose.npz", read_archive(folder / "pose.npz"), {"pose_y": ("n", 7), "pose_m": ("n", 51)}
     )
-    if len(objects) != len(hands) or objects.shape[1] != len(ids) or hands.shape[1] != 1:
+    if objects.shape[1] != len(ids) or hands.shape[1] != 1:
         raise Dropped(
             name, "wrong layout", f"'pose_y' {objects.shape} and 'pose_m' {hands.shape} do not match meta.yml"
         )
     place, hand = objects[:, grasped], hands[:, 0]
-    seen = np.isfinite(np.concatenate([place, hand], 1)).all(-1)
-    present = seen & (hand != 0).any(-1) & (place[:, 4:] != 0).any(-1)
-    norm = np.linalg.norm(place[:, :4], axis=-1)
-    present &= np.abs(norm - 1) < 0.05
-    place, hand = np.where(present[:, None], place, [0, 0, 0, 1, 0, 0, 0]), np.where(present[:, None], hand, 0.0)
-    skeleton = mano.skeleton(model, _betas(name, root, _value(name, meta, "mano_calib")[0]))
+    present = np.isfinite(place).all(-1) & (place[:, 4:] != 0).any(-1) & is_unit(place[:, :4])
+    present &= np.isfinite(hand).all(-1) & (hand != 0).any(-1)
+    place, hand = known_frames(name, present, place, hand)
+    skeleton = human.skeleton(model, _betas(name, root, _value(name, meta, "mano_calib")[0]))
     angles = model.hand_mean + hand[:, 3:48] @ model.components
+    wrist, joints = skeleton.posed(*map(Rotation.from_rotvec, (hand[:, :3], angles.reshape(-1, 15, 3))))
     object_name = OBJECTS[ids[grasped] - 1]
     return Sequence(
         name=name,
         object_name=object_name,
-        mesh=meshes.find(name, object_name, "textured_simple.obj"),
+        mesh=meshes.find(name, object_name, inside="textured_simple.obj"),
         wrist_position=skeleton.wrist + hand[:, 48:],
-        wrist_rotation=mano.wrist_rotation(Rotation.from_rotvec(hand[:, :3]).as_matrix()),
-        joints=skeleton.joints(mano.axis_angles(angles)),
+        wrist_rotation=wrist,
+        joints=joints,
         object_position=place[:, 4:],
         object_rotation=Rotation.from_quat(place[:, :4]).as_matrix(),
         present=present,

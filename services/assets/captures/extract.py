@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.rotations import continuous
-from congrasp.services.assets.captures.fit import Fit, fit
+from congrasp.services.assets.captures.human import Fit, fit
 from congrasp.services.assets.captures.sequence import FINGERS, Dropped, Sequence
 
 STABLE = 5

@@ -15,9 +15,16 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.mano import ManoModel
 from congrasp.common.io.pickles import read_archive
-from congrasp.services.assets.captures import mano
-from congrasp.services.assets.captures.objects import Meshes
-from congrasp.services.assets.captures.sequence import FINGERS, Dropped, Sequence, array_of, read_or_drop
+from congrasp.services.assets.captures import human
+from congrasp.services.assets.captures.sequence import (
+    FINGERS,
+    Dropped,
+    Meshes,
+    Sequence,
+    frames_of,
+    known_frames,
+    read_or_drop,
+)
 
 HOLDS = "s1/*.npz and the other subjects"
 _LABELS = {"thumb": (53, 55), "index": (41, 43), "middle": (44, 46), "ring": (50, 52), "little": (47, 49)}
@@ -60,26 +67,22 @@ def _sequence(
     parts = {key.partition("/")[0] for key in data}
     if "rhand" not in parts and "lhand" in parts:
         raise Dropped(name, "left hand", "it has no right hand")
-    turn, shift, fingers, object_shift, object_turn = (
-        array_of(name, "the file", data, key, "T", width) for key, width in _WIDTHS.items()
-    )
+    arrays = frames_of(name, "the file", data, {key: (width,) for key, width in _WIDTHS.items()})
     object_name = str(data.get("obj_name", file.stem.split("_")[0]))
-    subject = _template(root, data)
-    skeleton = _skeleton(model, subject)
-    frames, grasp = len(turn), named.get((file.parent.name, file.stem))
-    present = np.isfinite(np.concatenate([turn, shift, fingers], 1)).all(-1)
-    present &= np.isfinite(np.concatenate([object_shift, object_turn], 1)).all(-1)
-    for values in (turn, shift, fingers, object_shift, object_turn):
-        values[~present] = 0.0
+    skeleton = _skeleton(model, _template(root, data))
+    frames, grasp = len(arrays[0]), named.get((file.parent.name, file.stem))
+    present = np.isfinite(np.concatenate(arrays, 1)).all(-1)
+    turn, shift, fingers, object_shift, object_turn = known_frames(name, present, *arrays)
+    wrist, joints = skeleton.posed(*map(Rotation.from_rotvec, (turn, fingers.reshape(-1, 15, 3))))
     return Sequence(
         name=name,
         object_name=object_name,
         mesh=meshes.find(name, object_name),
         wrist_position=skeleton.wrist + shift,
-        wrist_rotation=mano.wrist_rotation(Rotation.from_rotvec(turn).as_matrix()),
-        joints=skeleton.joints(mano.axis_angles(fingers)),
+        wrist_rotation=wrist,
+        joints=joints,
         object_position=object_shift,
-        object_rotation=np.swapaxes(Rotation.from_rotvec(object_turn).as_matrix(), -1, -2),
+        object_rotation=Rotation.from_rotvec(object_turn).inv().as_matrix(),
         present=present,
         grasp=grasp if grasp is not None and grasp < frames else None,
         touching=_touching(data, frames),
@@ -101,9 +104,9 @@ def _template(root: pathlib.Path, data: dict[str, np.ndarray]) -> pathlib.Path |
 
 
 @functools.lru_cache(maxsize=32)
-def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> mano.Skeleton:
+def _skeleton(model: ManoModel | None, template: pathlib.Path | None) -> human.Skeleton:
     """Skeleton of a subject, from the template of the hand at rest."""
-    return mano.skeleton(model, template=template)
+    return human.skeleton(model, template=template)
 
 
 def _touching(data: dict[str, np.ndarray], frames: int) -> np.ndarray | None:

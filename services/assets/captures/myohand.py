@@ -15,9 +15,16 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.mano import ManoModel
 from congrasp.common.io.pickles import read_archive
-from congrasp.services.assets.captures.fit import joint_positions
-from congrasp.services.assets.captures.objects import Meshes
-from congrasp.services.assets.captures.sequence import Dropped, Sequence, array_of, read_or_drop
+from congrasp.services.assets.captures.human import joint_positions
+from congrasp.services.assets.captures.sequence import (
+    Dropped,
+    Meshes,
+    Sequence,
+    frames_of,
+    is_unit,
+    known_frames,
+    read_or_drop,
+)
 
 HOLDS = "MyoHand_<object>_<action>.npz"
 _BASE = np.array([0.1, -0.55, 0.32])
@@ -49,23 +56,15 @@ def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
 def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     """Reads the sequence of a file."""
     name = file.stem
-    arrays = read_archive(file)
-    time = array_of(name, "the file", arrays, "time", "T")
-    robot, pose = (array_of(name, "the file", arrays, key, "T", width) for key, width in (("robot", 29), ("object", 7)))
-    if not len(time) == len(robot) == len(pose):
-        lengths = f"{len(time)}, {len(robot)} and {len(pose)}"
-        raise Dropped(name, "wrong layout", f"'time', 'robot' and 'object' have {lengths} frames")
-    present = np.isfinite(robot).all(-1) & np.isfinite(pose).all(-1)
-    norm = np.linalg.norm(pose[:, 3:], axis=-1)
-    present &= np.abs(norm - 1) < 0.05
+    _, robot, pose = frames_of(name, "the file", read_archive(file), {"time": (), "robot": (29,), "object": (7,)})
+    present = np.isfinite(robot).all(-1) & np.isfinite(pose).all(-1) & is_unit(pose[:, 3:])
     if not present.any():
-        raise Dropped(
-            name, "frames missing", "no frame has finite joints and an object with a unit quaternion (w, x, y, z)"
-        )
-    largest = float(np.abs(robot[present, 3:]).max())
+        reason = "no frame has finite joints and an object with a unit quaternion (w, x, y, z)"
+        raise Dropped(name, "frames missing", reason)
+    robot, pose = known_frames(name, present, robot, pose)
+    largest = float(np.abs(robot[:, 3:]).max())
     if largest > _LARGEST:
         raise Dropped(name, "wrong units", f"a joint is at {largest:.4g}: check that its angles are in radians")
-    robot[~present], pose[~present] = robot[present][0], pose[present][0]
     position, rotation = wrist_pose(robot)
     object_name = name.removeprefix("MyoHand_").rsplit("_", 1)[0]
     return Sequence(

@@ -20,9 +20,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.mano import ManoModel
 from congrasp.common.io.inputs import file_name, read_file, read_json
 from congrasp.common.io.pickles import MAX_BYTES, read_pickles
-from congrasp.services.assets.captures import mano
-from congrasp.services.assets.captures.objects import Meshes
-from congrasp.services.assets.captures.sequence import Dropped, Part, Sequence, read_or_drop
+from congrasp.services.assets.captures import human
+from congrasp.services.assets.captures.sequence import Dropped, Meshes, Part, Sequence, array_of, is_unit, read_or_drop
 from congrasp.services.assets.objects.mesh_files import read_mesh
 
 HOLDS = "anno/seq_all.json"
@@ -77,30 +76,28 @@ def _sequence(
     """Reads the sequence of some frames' annotations."""
     object_id = name.split("_")[0]
     object_name = names.get(object_id, object_id)
-    mesh = meshes.find(name, object_id if meshes.has(object_id) else object_name)
+    mesh = meshes.find(name, object_id, object_name)
     files = [folder / f"{file_name(stem, 'a frame')}.pkl" for _, stem in frames]
     there = [file for file in files if file.is_file()]
     contents = dict(zip(there, read_pickles((str(file), read_file(file, MAX_BYTES)) for file in there), strict=True))
-    rows = [_frame(name, file, contents[file]) if file in contents else None for file in files]
+    rows = [_frame(name, file.name, contents[file]) if file in contents else None for file in files]
     known = next((row for row in rows if row is not None), None)
     if known is None:
         raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
     pose, shape, wrist, place = (np.stack([(row or known)[i] for row in rows]) for i in range(4))
-    norms = np.linalg.norm(pose, axis=-1)
-    if np.abs(norms - 1).max() > 0.05:
-        raise Dropped(
-            name, "wrong layout", f"a quaternion of 'hand_pose' has the length {norms.flat[norms.argmin()]:.3g}"
-        )
-    skeleton = mano.skeleton(model, shape[0])
-    rotations = Rotation.from_quat(pose.reshape(-1, 4), scalar_first=True).as_matrix().reshape(-1, 16, 3, 3)
+    if not is_unit(pose).all():
+        length = np.linalg.norm(pose, axis=-1).min()
+        raise Dropped(name, "wrong layout", f"a quaternion of 'hand_pose' has the length {length:.3g}")
+    palm, fingers = (Rotation.from_quat(part, scalar_first=True) for part in (pose[:, 0], pose[:, 1:]))
+    wrist_turn, joints = human.skeleton(model, shape[0]).posed(palm, fingers)
     turn = place[:, :3, :3]
     return Sequence(
         name=name,
         object_name=object_name,
         mesh=mesh,
         wrist_position=wrist,
-        wrist_rotation=mano.wrist_rotation(rotations[:, 0]),
-        joints=skeleton.joints(rotations[:, 1:]),
+        wrist_rotation=wrist_turn,
+        joints=joints,
         object_position=place[:, :3, 3] - turn @ _middle(mesh),
         object_rotation=turn,
         present=np.array([row is not None for row in rows]),
@@ -108,28 +105,18 @@ def _sequence(
     )
 
 
-def _frame(name: str, file: pathlib.Path, content: dict[str, np.ndarray]) -> tuple[np.ndarray, ...] | None:
+_HAND = {"hand_anno/hand_pose": (16, 4), "hand_anno/hand_shape": (10,), "hand_anno/hand_tsl": (3,)}
+
+
+def _frame(name: str, file: str, content: dict[str, np.ndarray]) -> tuple[np.ndarray, ...] | None:
     """Hand pose (16, 4), shape (10,), wrist (3,) and object pose (4, 4); None without a hand or object."""
     known = {key.partition("/")[0] for key in content}
     for key in ("hand_anno", "obj_anno"):
         if key not in known:
-            raise Dropped(name, "wrong layout", f"{file.name} has no '{key}'")
+            raise Dropped(name, "wrong layout", f"{file} has no '{key}'")
         if key in content and not content[key].size:
             return None
-    shapes = {"hand_anno/hand_pose": (16, 4), "hand_anno/hand_shape": (10,), "hand_anno/hand_tsl": (3,)}
-    return tuple(_shaped(name, file, key, content, shape) for key, shape in (shapes | {"obj_anno": (4, 4)}).items())
-
-
-def _shaped(
-    name: str, file: pathlib.Path, key: str, content: dict[str, np.ndarray], shape: tuple[int, ...]
-) -> np.ndarray:
-    """Returns an array of this shape."""
-    if key not in content:
-        raise Dropped(name, "wrong layout", f"{file.name} has no '{key}'")
-    array = content[key].astype(float)
-    if array.size != np.prod(shape):
-        raise Dropped(name, "wrong layout", f"'{key}' of {file.name} has the shape {array.shape}, not {shape}")
-    return array.reshape(shape)
+    return tuple(array_of(name, file, content, key, *shape) for key, shape in (_HAND | {"obj_anno": (4, 4)}).items())
 
 
 @functools.lru_cache(maxsize=64)
@@ -148,5 +135,5 @@ def _parts(root: pathlib.Path, *names: str) -> tuple[Part, ...]:
     for file in sorted(folder.glob("part_*.ply")):
         labels = file.with_suffix(".json")
         label = read_json(labels, _LARGEST_JSON, _REMEDY).get("name", file.stem) if labels.is_file() else file.stem
-        parts.append(Part(str(label), mano.read_vertices(file)))
+        parts.append(Part(str(label), human.read_vertices(file)))
     return tuple(parts) if len(parts) > 1 else ()

@@ -1,10 +1,13 @@
 """Output of importers: one captured grasp of one object by a right hand, in metres, in any world frame.
 
+Importers share `frames_of`, `array_of`, `known_frames` and `Meshes`.
+
 The wrist frame is that of the `human` hand: its origin at the wrist, fingers towards -y, the thumb's side +x, the back
 of the hand +z.
 """
 
 import dataclasses
+import math
 import pathlib
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Items
@@ -13,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.io.inputs import file_name
+from congrasp.services.assets.objects.mesh_files import SUFFIXES
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
@@ -90,14 +95,14 @@ def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> S
 
 
 def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape: int | str) -> np.ndarray:
-    """Returns a copy of an array of floats from a file.
+    """Returns an array of floats from a file.
 
     Args:
       name: name of the sequence.
       where: container of the array, for the reason.
       values: arrays by name.
       key: name of the array.
-      shape: expected sizes; a letter matches any.
+      shape: expected sizes; a letter matches any. As many numbers in another shape count if all sizes are given.
 
     Raises:
       Dropped: the array is missing, or has another shape.
@@ -105,7 +110,81 @@ def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape:
     if key not in values:
         raise Dropped(name, "wrong layout", f"{where} has no '{key}'")
     array = np.array(values[key], float)
+    known = [size for size in shape if isinstance(size, int)]
+    if len(known) == len(shape) and array.size == math.prod(known):
+        return array.reshape(known)
     pairs = zip(shape, array.shape, strict=False)
     if array.ndim != len(shape) or any(wanted != size for wanted, size in pairs if isinstance(wanted, int)):
         raise Dropped(name, "wrong layout", f"'{key}' of {where} has the shape {array.shape}, not {shape}")
     return array
+
+
+def frames_of(
+    name: str, where: str, values: Mapping[str, Any], shapes: Mapping[str, tuple[int | str, ...]]
+) -> list[np.ndarray]:
+    """Returns arrays (T, ...) of floats, one entry a frame.
+
+    Args:
+      name: name of the sequence.
+      where: container of the arrays, for the reason.
+      values: arrays by name.
+      shapes: names of the arrays, with the expected sizes of a frame (`array_of`).
+
+    Raises:
+      Dropped: an array is missing, or has another shape or number of frames.
+    """
+    found = [array_of(name, where, values, key, "T", *shape) for key, shape in shapes.items()]
+    counts = [len(array) for array in found]
+    if len(set(counts)) > 1:
+        text = ", ".join(f"'{key}' {count}" for key, count in zip(shapes, counts, strict=True))
+        raise Dropped(name, "wrong layout", f"the numbers of frames in {where} differ: {text}")
+    return found
+
+
+def is_unit(quaternions: np.ndarray) -> np.ndarray:
+    """(T,) bool: quaternions (T, 4) that are of length one, but for rounding."""
+    return np.abs(np.linalg.norm(quaternions, axis=-1) - 1) < 0.05
+
+
+def known_frames(name: str, present: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
+    """Returns arrays (T, ...) with the first known frame in place of missing ones.
+
+    Raises:
+      Dropped: no frame is known.
+    """
+    if not present.any():
+        raise Dropped(name, "frames missing", "hand and object are in no frame together")
+    return [array[np.where(present, np.arange(len(present)), present.argmax())] for array in arrays]
+
+
+@dataclasses.dataclass(frozen=True)
+class Meshes:
+    """Folders searched for the meshes of objects, in this order."""
+
+    folders: tuple[pathlib.Path, ...]
+
+    def beside(self, *folders: pathlib.Path) -> "Meshes":
+        """Returns the search folders followed by those of the data set."""
+        return Meshes((*self.folders, *folders))
+
+    def find(self, sequence: str, *names: str, inside: str = "") -> pathlib.Path:
+        """Finds the mesh file `<name>.*`, or the folder `<name>` with one, of the first name that has either.
+
+        Args:
+          sequence: name of the sequence that needs it.
+          names: names of the object.
+          inside: file in the folder, if it has several.
+
+        Raises:
+          Dropped: there is no such mesh.
+        """
+        for name in names:
+            file_name(name, "the mesh of an object")
+            for folder in self.folders:
+                files = [folder / f"{name}{suffix}" for suffix in SUFFIXES] + [folder / name / inside] * bool(inside)
+                if mesh := next((file for file in files if file.is_file()), None):
+                    return mesh
+                if (folder / name).is_dir():
+                    return folder / name
+        where = f" in {', '.join(map(str, self.folders))}" if self.folders else ""
+        raise Dropped(sequence, "no mesh", f"there is no mesh of '{names[-1]}'{where}: pass its folder with --meshes")

@@ -1,7 +1,7 @@
 """Self-check of a hand before training: tests by geometry and physics whether it can grasp.
 
 Every check is a line with a measurement and, if in doubt or failed, the field or option to change. Palm, joints,
-opening and strength are computed from the hand's data; servos, overlaps and grips are simulated (`servos`, `grips`) in
+opening and strength are computed from the hand's data; servos, overlaps and grips are simulated (`trials`) in
 the physics of the full task.
 """
 
@@ -29,8 +29,7 @@ from congrasp.common.objects.pool import HELD_OUT_SEED
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.hands.grips import Grip, grips
-from congrasp.services.assets.hands.servos import Response, closed_overlap, responses
+from congrasp.services.assets.hands.trials import Grip, Response, closed_overlap, grips, responses
 
 Verdict = Literal["passed", "doubt", "failed"]
 _APART = 0.03, 0.06  # distance of a finger's first joint from the palm, m: limits for doubt and failure

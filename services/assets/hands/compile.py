@@ -1,21 +1,10 @@
-"""Reads robot descriptions with MuJoCo, in a child process, since a few lines can exceed a machine's resources.
-
-`python -m congrasp.services.assets.hands.compile FUNCTION FILE FOLDER` is that process. FUNCTION ("module:name") uses
-the file, writes its arrays into FOLDER and returns what goes to FOLDER/answer.json.
-"""
+"""Reads robot descriptions, URDF or MJCF, with MuJoCo; those of strangers in a confined process."""
 
 import contextlib
-import importlib
-import json
 import math
-import os
 import pathlib
 import re
-import resource
-import signal
 import stat
-import subprocess
-import sys
 import tempfile
 import urllib.parse
 import xml.etree.ElementTree as ET
@@ -27,14 +16,14 @@ import mujoco
 import numpy as np
 import trimesh
 
-import congrasp
 from congrasp.common.errors import CongraspError
+from congrasp.services.assets.confined import call_confined
 from congrasp.services.assets.objects.mesh_files import load_geometry
 
 MEMORY = 3 << 30
 """Limit of the address space for reading a file, bytes."""
 SECONDS = 30
-"""Limit of the time for reading a file, s."""
+"""Limit of the processor time for reading a file, s."""
 MAX_FILE = 64 << 20
 """Limit of a file, bytes."""
 MAX_COUNT = 1000
@@ -58,21 +47,17 @@ _FINITE = (
 )
 _NATIVE = (".stl", ".obj", ".msh")
 _FACES = 200_000  # most triangles of a mesh in MuJoCo
-_ANSWER = "answer.json"
-_ROOT = pathlib.Path(congrasp.__file__).parents[1]
 _REMEDY = "MuJoCo must be able to load it."
 
 
 @contextlib.contextmanager
 def confined(
-    function: Callable[[pathlib.Path, pathlib.Path, dict[str, Any]], dict[str, Any]],
-    path: pathlib.Path,
-    options: dict[str, Any],
-) -> Iterator[tuple[dict[str, Any], pathlib.Path]]:
-    """Calls a function of a module with a robot description, in a child process under limits.
+    function: Callable[..., Any], path: pathlib.Path, options: dict[str, Any]
+) -> Iterator[tuple[Any, pathlib.Path]]:
+    """Calls a function of a module with a robot description, in a confined process.
 
     Args:
-      function: called as function(path, folder, options); writes arrays into the folder, and returns what JSON takes.
+      function: called as function(folder, path, **options); writes arrays into the folder, and returns what JSON takes.
       path: the description.
       options: further arguments, as JSON takes them.
 
@@ -86,48 +71,17 @@ def confined(
         raise CongraspError(f"There is no file {path}.", "Check the path.")
     if path.stat().st_size > MAX_FILE:
         raise CongraspError(f"{path} has more than {MAX_FILE >> 20} MB.", "Pass a robot description.")
+    options, limits = {"path": str(path), **options}, {"seconds": SECONDS, "patience": SECONDS + _START}
     with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
         folder = pathlib.Path(name)
-        search = os.pathsep.join(filter(None, [str(_ROOT), os.environ.get("PYTHONPATH")]))
-        own = {"PYTHONPATH": search, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
-        called = f"{function.__module__}:{function.__name__}"
         try:
-            subprocess.run(
-                [sys.executable, "-m", "congrasp.services.assets.hands.compile", called, str(path.resolve()), name],
-                input=json.dumps(options).encode(),
-                timeout=SECONDS + _START,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                cwd=folder,
-                env={**os.environ, **own},
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
+            answer = call_confined(function, folder, options, memory=MEMORY, **limits)
+        except TimeoutError:
             raise CongraspError(f"{path} was not read within {SECONDS} s.", _REMEDY) from None
-        try:
-            answer = json.loads((folder / _ANSWER).read_text())
-        except (OSError, ValueError):
+        except ChildProcessError:
             why = f"reading it takes more than {SECONDS} s or {MEMORY >> 30} GB, or MuJoCo fails on it"
             raise CongraspError(f"{path} cannot be read: {why}.", _REMEDY) from None
-        if "error" in answer:
-            raise CongraspError(answer["error"].replace(str(path.resolve()), str(path)))
         yield answer, folder
-
-
-def _child(called: str, source: str, folder: str) -> None:
-    """Calls the function; ends after `SECONDS`, even if the parent is gone."""
-    module, _, name = called.partition(":")
-    function, options = getattr(importlib.import_module(module), name), json.load(sys.stdin)
-    signal.alarm(SECONDS)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    try:
-        answer = function(pathlib.Path(source), pathlib.Path(folder), options)
-    except MemoryError:
-        answer = {"error": f"{source} cannot be read: it takes more than {MEMORY >> 30} GB. {_REMEDY}"}
-    except (CongraspError, mujoco.FatalError) as error:
-        answer = {"error": str(error) if isinstance(error, CongraspError) else _unread(pathlib.Path(source), error)}
-    pathlib.Path(folder, _ANSWER).write_text(json.dumps(answer))
 
 
 def robot_spec(path: pathlib.Path, notes: list[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
@@ -157,7 +111,7 @@ def robot_spec(path: pathlib.Path, notes: list[str]) -> tuple[mujoco.MjSpec, muj
         for name in ("body_mass", "body_inertia"):
             if (getattr(model, name) < 0).any():
                 raise ValueError(f"its {name} holds numbers below zero")
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, mujoco.FatalError) as error:
         raise CongraspError(_unread(path, error)) from None
     return spec, model
 
@@ -422,7 +376,3 @@ def _missing(files: list[str]) -> str:
     """Note on missing files."""
     some = ", ".join(files[:5]) + (f" and {len(files) - 5} more" if len(files) > 5 else "")
     return f"not found or not readable, results without them are approximate: {some}"
-
-
-if __name__ == "__main__":
-    _child(*sys.argv[1:])

@@ -1,7 +1,7 @@
 """A hand from a URDF or MJCF file: its content is used, and missing values are proposed.
 
-MuJoCo reads the file in a confined process (`compile`). Bodies of the hand: `tree`. Capsules of links: `geometry`.
-Motors, couplings and tendons: `actuators`. Open and closed poses, from kinematics: `poses`.
+MuJoCo reads the file in a confined process (`compile`). Links of the hand and their capsules: `links`. Motors,
+couplings and tendons: `actuators`. Open and closed poses, from kinematics: `poses`.
 """
 
 import dataclasses
@@ -19,18 +19,20 @@ from congrasp.common.hands.motors import fitting_scale, motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from congrasp.services.assets.hands.actuators import Drive
 from congrasp.services.assets.hands.compile import LEAST, confined, robot_spec
-from congrasp.services.assets.hands.geometry import (
+from congrasp.services.assets.hands.links import (
+    Tree,
     bare,
     far_end,
     fit_capsules,
-    inertia_box,
+    hand_tree,
+    identifier,
+    inertia_boxes,
     link_mesh,
+    placed,
     solids_of,
-    surface,
 )
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
-from congrasp.services.assets.hands.tree import Tree, body_name, hand_tree, hinges, identifier
-from congrasp.services.assets.objects.sizes import METRES, length
+from congrasp.services.assets.objects.options import METRES, length
 
 _LEVER = 0.02  # least distance of a joint from the tip that it moves, m
 _TURN = np.deg2rad(10)  # largest range of a joint below which grasping is impossible
@@ -82,9 +84,9 @@ def import_hand(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     return Proposal(hand, answer["palm"], tuple(answer["notes"]), meshes)
 
 
-def write_proposal(path: pathlib.Path, folder: pathlib.Path, options: dict[str, Any]) -> dict[str, Any]:
+def write_proposal(folder: pathlib.Path, path: str, **choices: Any) -> dict[str, Any]:
     """Does the work of `import_hand` in the confined process: writes the meshes, returns the rest."""
-    proposal = propose(path, Choices(**options))
+    proposal = propose(pathlib.Path(path), Choices(**choices))
     save_meshes(folder / _HAND, proposal.meshes)
     return {"hand": hand_text(proposal.hand), "palm": proposal.palm, "notes": list(proposal.notes)}
 
@@ -102,24 +104,23 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     """
     notes: list[str] = []
     _, model = robot_spec(path, notes)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
     tree = hand_tree(model, choices.palm, notes)
+    palm = model.body(tree.palm).name
     if len(tree.ends) < 2:
         raise CongraspError(
-            f"{path} has {len(tree.ends)} finger(s) on its palm '{body_name(model, tree.palm)}'.",
-            "Pass another --palm.",
+            f"{path} has {len(tree.ends)} finger(s) on its palm '{identifier(palm, 'world')}'.", "Pass another --palm."
         )
-    _to_palm(data, tree.palm)
     wide = np.sqrt(model.body_inertia.max(1) / np.maximum(model.body_mass, LEAST[0])) > _LINK[1]
     if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
         said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"
         notes.append(f"{said}: {', '.join(doubtful)}")
     sizes: dict[str, float] = {}
-    links, drive = _links(model, data, tree, sizes, notes)
+    links, drive = _links(tree, sizes, notes)
     _check_units(path, links, sizes)
     if choices.own_collision:
-        links = _with_solids(model, data, tree, links, notes)
+        links = [dataclasses.replace(x, solids=solids_of(tree, i)) for x, i in zip(links, tree.groups, strict=True)]
+        if kept := [link.name for link in links if not link.solids]:
+            notes.append(f"only meshes as collision geometry, capsules are used: {', '.join(kept)}")
     hand = Hand(
         name=identifier(choices.name or path.stem, "hand").lower(),
         links=tuple(links),
@@ -146,8 +147,8 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     hand = dataclasses.replace(hand, object_scale=scale)
     _check(path, hand)
     hand = hand_from_text(hand_text(hand), str(path))
-    meshes = _meshes(model, data, tree, notes)
-    return Proposal(hand, model.body(tree.palm).name, tuple(notes), meshes)
+    meshes = _meshes(tree, notes)
+    return Proposal(hand, palm, tuple(notes), meshes)
 
 
 def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
@@ -224,49 +225,34 @@ def _text(vector: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
 
 
-def _to_palm(data: mujoco.MjData, palm: int) -> None:
-    """Transforms positions and axes of the simulation from the world frame to the palm's frame."""
-    turn, origin = data.xmat[palm].reshape(3, 3).copy(), data.xpos[palm].copy()
-    for places in (data.xpos, data.xipos, data.xanchor, data.geom_xpos):
-        places[:] = (places - origin) @ turn
-    data.xaxis[:] = data.xaxis @ turn
-    for frames in (data.ximat, data.geom_xmat):
-        frames[:] = (turn.T @ frames.reshape(-1, 3, 3)).reshape(-1, 9)
-
-
-def _links(
-    model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, sizes: dict[str, float], notes: list[str]
-) -> tuple[list[Link], Drive]:
+def _links(tree: Tree, sizes: dict[str, float], notes: list[str]) -> tuple[list[Link], Drive]:
     """Returns the links and their drive; sides of their geometry (m) are added to `sizes`, proposals to `notes`."""
-    names = {link: "palm" if link == tree.palm else body_name(model, link) for link in tree.groups}
-    above = {link: tree.owner[int(model.body_parentid[link])] for link in tree.groups if link != tree.palm}
-    at = {link: np.zeros(3) if link == tree.palm else data.xanchor[hinges(model, link)[0]] for link in tree.groups}
+    at = {x: tree.data.xanchor[tree.joints(x)[0]] if tree.joints(x) else np.zeros(3) for x in tree.groups}
     shapes = {}
     boxed: list[str] = []
     empty: list[str] = []
-    for link, bodies in tree.groups.items():
-        points = [p for body in bodies for p in surface(model, data, body)]
+    for link in tree.groups:
+        points = [p for mesh in placed(tree, link, colliding=True) for p in mesh.vertices]
         if points:
-            sizes[names[link]] = float(np.ptp(points, axis=0).max())
+            sizes[tree.name(link)] = float(np.ptp(points, axis=0).max())
         else:
-            points = [p for body in bodies for p in inertia_box(model, data, body)]
-            (boxed if points else empty).append(names[link])
-        shapes[link] = fit_capsules(np.array(points or bare(at[link], *(at[x] for x in above if above[x] == link))))
+            points = inertia_boxes(tree, link)
+            (boxed if points else empty).append(tree.name(link))
+        carried = [at[x] for x in tree.groups if x != tree.palm and tree.above(x) == link]
+        shapes[link] = fit_capsules(np.array(points or bare(at[link], *carried)))
     tips = {link: far_end(shapes[link], at[link]) for link in tree.ends}
-    joints = _joint_names(model, tree, {*names.values()})
-    levers = _levers(model, data, tree, above, tips)
-    drive = Drive(model, data, joints, levers)
+    joints = _joint_names(tree)
+    drive = Drive(tree.model, tree.data, joints, _levers(tree, tips))
     links = []
     for link, bodies in tree.groups.items():
-        own = [] if link == tree.palm else hinges(model, link)
-        mass = float(sum(model.body_mass[body] for body in bodies))
+        mass = float(sum(tree.model.body_mass[body] for body in bodies))
         if mass <= 0:
-            notes.append(f"'{names[link]}' has no mass: 1 g ('mass' in the hand file)")
+            notes.append(f"'{tree.name(link)}' has no mass: 1 g ('mass' in the hand file)")
         links.append(
             Link(
-                name=names[link],
-                parent="" if link == tree.palm else names[above[link]],
-                joints=tuple(_joint(model, data, j, joints[j], drive) for j in own),
+                name=tree.name(link),
+                parent="" if link == tree.palm else tree.name(tree.above(link)),
+                joints=tuple(_joint(tree, j, joints[j], drive) for j in tree.joints(link)),
                 capsules=shapes[link],
                 mass=max(mass, 1e-3),
                 contact_weight=3.0 if link in tips else 1.0,
@@ -280,56 +266,40 @@ def _links(
     return links, drive
 
 
-def _with_solids(
-    model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, links: list[Link], notes: list[str]
-) -> list[Link]:
-    """Returns the links with the file's collision geometry; `notes` lists those that keep their capsules."""
-    found = [solids_of(model, data, bodies) for bodies in tree.groups.values()]
-    if kept := [link.name for link, solids in zip(links, found, strict=True) if not solids]:
-        notes.append(f"only meshes as collision geometry, capsules are used: {', '.join(kept)}")
-    return [dataclasses.replace(link, solids=solids) for link, solids in zip(links, found, strict=True)]
-
-
-def _meshes(model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, notes: list[str]) -> Meshes:
+def _meshes(tree: Tree, notes: list[str]) -> Meshes:
     """Visual meshes of each link, unless larger than a hand."""
-    found = {
-        "palm" if link == tree.palm else body_name(model, link): link_mesh(model, data, bodies)
-        for link, bodies in tree.groups.items()
-    }
+    found = {tree.name(link): link_mesh(tree, link) for link in tree.groups}
     drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
     if large := [name for name, (vertices, _) in drawn.items() if np.abs(vertices).max() > MAX_DISTANCE]:
         notes.append(f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and dropped: {', '.join(large)}")
     return {name: mesh for name, mesh in drawn.items() if name not in large}
 
 
-def _joint_names(model: mujoco.MjModel, tree: Tree, taken: set[str]) -> dict[int, str]:
+def _joint_names(tree: Tree) -> dict[int, str]:
     """Names of the hand's joints in its order, distinct from those of links."""
-    order = [j for link in tree.groups if link != tree.palm for j in hinges(model, link)]
-    names = {j: identifier(model.joint(j).name, f"joint_{j}") for j in order}
-    return {j: f"{name}_joint" if name in taken | TAKEN_JOINTS else name for j, name in names.items()}
+    names = {j: identifier(tree.model.joint(j).name, f"joint_{j}") for link in tree.groups for j in tree.joints(link)}
+    taken = {tree.name(link) for link in tree.groups} | TAKEN_JOINTS
+    return {j: f"{name}_joint" if name in taken else name for j, name in names.items()}
 
 
-def _levers(
-    model: mujoco.MjModel, data: mujoco.MjData, tree: Tree, above: dict[int, int], tips: dict[int, np.ndarray]
-) -> dict[int, float]:
+def _levers(tree: Tree, tips: dict[int, np.ndarray]) -> dict[int, float]:
     """Distance of each joint of the hand from the farthest tip that it moves, m."""
-    levers = {j: _LEVER for link in tree.groups if link != tree.palm for j in hinges(model, link)}
-    for end, tip in tips.items():
-        link = end
+    levers = {j: _LEVER for link in tree.groups for j in tree.joints(link)}
+    for link, tip in tips.items():
         while link != tree.palm:
-            for j in hinges(model, link):
-                levers[j] = max(levers[j], float(np.linalg.norm(data.xanchor[j] - tip)))
-            link = above[link]
+            for j in tree.joints(link):
+                levers[j] = max(levers[j], float(np.linalg.norm(tree.data.xanchor[j] - tip)))
+            link = tree.above(link)
     return levers
 
 
-def _joint(model: mujoco.MjModel, data: mujoco.MjData, j: int, name: str, drive: Drive) -> Joint:
+def _joint(tree: Tree, j: int, name: str, drive: Drive) -> Joint:
     """Returns a hinge."""
-    if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
+    if tree.model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
         raise CongraspError(f"The joint '{name}' is not a hinge.", "Only hands of hinges can be imported.")
     limits = drive.limits(j)
     if limits is None:
         raise CongraspError(f"The joint '{name}' has no limits.", "Give it a range.")
     lower, upper = limits
-    axis, anchor = vector(data.xaxis[j]), vector(data.xanchor[j])
+    axis, anchor = vector(tree.data.xaxis[j]), vector(tree.data.xanchor[j])
     return drive.joint(j, lower, upper, Joint(name, axis, anchor, 0.0, 0.0, 0.0, 0.0, 0.0))

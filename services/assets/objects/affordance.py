@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.closure import outline
 from congrasp.common.hands.human import HUMAN
-from congrasp.common.objects.spec import GraspObject
+from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.objects.surface import halves
 from congrasp.common.task.sampling.headings import max_width, sample_headings, within_reach
 from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh, upright
@@ -54,21 +54,24 @@ def relabelled(
             f"The graspable region of '{obj.name}' is {share:.0%} of its surface.",
             f"It must be {LEAST_SHARE:.0%} at least: choose a larger part, or swap the parts with --invert.",
         )
-    near = cKDTree(obj.points)
-    pieces = tuple(
-        dataclasses.replace(piece, part=int(np.bincount(labels[near.query(corners)[1]]).argmax()))
-        for piece, corners in (
-            (piece, np.asarray(piece.pos)[None] if piece.vertices is None else piece.vertices + piece.pos)
-            for piece in obj.pieces
-        )
-    )
     return dataclasses.replace(
         obj,
         name=name or obj.name,
-        pieces=pieces,
+        pieces=with_labels(obj.pieces, obj.points, labels),
         part_names=tuple(names),
         graspable=np.array(graspable, bool),
         labels=labels,
+    )
+
+
+def with_labels(pieces: Sequence[Piece], points: np.ndarray, labels: np.ndarray) -> tuple[Piece, ...]:
+    """The pieces with the part that most of their vertices are nearest to, by labels (N,) of points (N, 3)."""
+    near = cKDTree(points)
+    corners = (np.zeros((1, 3)) if piece.vertices is None else piece.vertices for piece in pieces)
+    votes = (labels[near.query(own + piece.pos)[1]] for piece, own in zip(pieces, corners, strict=True))
+    return tuple(
+        dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
+        for piece, vote in zip(pieces, votes, strict=True)
     )
 
 
@@ -127,14 +130,10 @@ def painted(obj: GraspObject, path: pathlib.Path, colour: tuple[int, int, int]) 
     Raises:
       CongraspError: the file has no coloured vertices, none of this colour, or shows another object.
     """
-    if not path.is_file():
-        raise CongraspError(f"There is no file {path}.", "Check the path.")
     mesh = load_geometry(path, "Export it as PLY with coloured vertices.")
     visual = getattr(mesh, "visual", None)
-    colours = getattr(visual, "vertex_colors", None) if getattr(visual, "kind", None) == "vertex" else None
-    if colours is None and isinstance(mesh, trimesh.PointCloud):
-        colours = mesh.colors if len(mesh.colors) else None
-    if colours is None:
+    colours = getattr(visual, "vertex_colors", ()) if getattr(visual, "kind", None) == "vertex" else ()
+    if not len(colours):
         raise CongraspError(f"{path} has no coloured vertices.", "Paint them and export as PLY with colours.")
     vertices = upright(np.asarray(mesh.vertices, float), obj.file_up) * obj.file_scale + obj.origin
     finite = np.isfinite(vertices).all(-1)

@@ -10,8 +10,8 @@ from trimesh.visual.color import uv_to_interpolated_color
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import COLOUR_POINTS, Colours
-from congrasp.services.assets.objects.mesh_files import kind_of, load_geometry, up_of, upright
-from congrasp.services.assets.objects.sizes import Up
+from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
+from congrasp.services.assets.objects.options import Up
 
 _UNSAID = (102, 102, 102)  # default colour of a material in trimesh
 
@@ -34,9 +34,7 @@ def sample_colours(
       CongraspError: a file cannot be read with its colours.
     """
     try:
-        meshes = [
-            mesh for path in paths if kind_of(path) != ".stl" for mesh in _meshes(path, up, notes)
-        ]  # STL has no colours
+        meshes = [mesh for path in paths for mesh in _meshes(path, up, notes)]
         if not any(_has_colours(mesh.visual) for mesh in meshes):
             return None
         rng = np.random.default_rng(seed)
@@ -56,7 +54,7 @@ def _meshes(path: pathlib.Path, up: Up, notes: list[str] | None) -> list[trimesh
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and part.area > 0]
     for mesh in meshes:
-        mesh.vertices = upright(mesh.vertices, up_of(path, up))
+        mesh.vertices = upright(mesh.vertices, up_of(loaded, up))
     return meshes
 
 

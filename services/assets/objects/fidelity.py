@@ -7,6 +7,7 @@ surface. The inside of a cup is outside. Only the part of the surface that a bal
 finger reaches into a crack.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -59,8 +60,7 @@ def fidelity(mesh: np.ndarray, pieces: list[np.ndarray], closed: bool) -> Fideli
       closed: True if the mesh encloses a volume; otherwise all of it counts as surface.
     """
     union = np.concatenate([np.asarray(shapes.triangulate(piece).triangles) for piece in pieces])
-    corners = np.concatenate([mesh, union]).reshape(-1, 3)
-    low, spacing = corners.min(0), float(np.ptp(corners, axis=0).max()) / _RAYS
+    low, spacing = _grid(np.concatenate([mesh, union]))
     volume, surface = _cut(union, low, spacing)
     if closed:
         wanted, wanted_surface = _cut(mesh, low, spacing)
@@ -98,22 +98,46 @@ def _farthest(surface: _Surface, other: _Surface) -> float:
     return float(cKDTree(other.points[other.outer]).query(points[touched])[0].max(initial=0.0))
 
 
-def interior(triangles: np.ndarray, count: int) -> np.ndarray:
-    """Evenly distributed points (`count`, 3) inside of the outward triangles (F, 3, 3) of a closed mesh."""
-    corners = triangles.reshape(-1, 3)
-    low, spacing = corners.min(0), float(np.ptp(corners, axis=0).max()) / _RAYS
-    first, last = list[np.ndarray](), list[np.ndarray]()
+class _Rays(NamedTuple):
+    """Crossings (N) of parallel rays with triangles."""
+
+    axis: int
+    """That of the rays."""
+    rays: np.ndarray
+    """(N, 2) the ray of each crossing."""
+    place: np.ndarray
+    """(N,) where on the ray, in spacings."""
+    points: np.ndarray
+    """(N, 3) where in space, m."""
+    normals: np.ndarray
+    """(N, 3) unit normals of the triangles."""
+    change: np.ndarray
+    """(N,) of the winding number."""
+
+
+def _rays(triangles: np.ndarray, low: np.ndarray, spacing: float) -> Iterator[_Rays]:
+    """Yields the crossings of triangles (F, 3, 3) with rays along each axis, on a grid of this corner and spacing."""
     for axis in range(3):
-        order = [(axis + 1) % 3, (axis + 2) % 3, axis]
+        order = [(axis + 1) % 3, (axis + 2) % 3, axis]  # the rays run along the last of these
         shift = np.array([*_OFF_GRID[order[:2]], 0.0])
         rays, place, owner, normal = _crossings((triangles[..., order] - low[order]) / spacing + shift)
-        for ends, side in zip(
-            (first, last), _intervals(rays, place, -np.sign(normal[owner, 2]), _SEAM / spacing), strict=False
-        ):
-            points = np.empty((len(side), 3))
-            points[:, order] = (np.column_stack([rays, place])[side] - shift) * spacing + low[order]
-            ends.append(points)
-    start, end = np.concatenate(first), np.concatenate(last)
+        points, normals = np.empty((2, len(place), 3))
+        points[:, order] = (np.column_stack([rays, place]) - shift) * spacing + low[order]
+        normals[:, order] = normal[owner]
+        yield _Rays(axis, rays, place, points, normals, -np.sign(normal[owner, 2]))
+
+
+def _grid(triangles: np.ndarray) -> tuple[np.ndarray, float]:
+    """Corner (3,) and spacing of the rays for triangles (F, 3, 3), m."""
+    corners = triangles.reshape(-1, 3)
+    return corners.min(0), float(np.ptp(corners, axis=0).max()) / _RAYS
+
+
+def interior(triangles: np.ndarray, count: int) -> np.ndarray:
+    """Evenly distributed points (`count`, 3) inside of the outward triangles (F, 3, 3) of a closed mesh."""
+    low, spacing = _grid(triangles)
+    spans = [(found.points, *_intervals(found, _SEAM / spacing)) for found in _rays(triangles, low, spacing)]
+    start, end = (np.concatenate([span[0][span[side]] for span in spans]) for side in (1, 2))
     along = np.cumsum(np.linalg.norm(end - start, axis=-1))
     wanted = (np.arange(count) + 0.5) / count * along[-1]
     chosen = np.searchsorted(along, wanted)
@@ -146,28 +170,22 @@ def enclosed(triangles: np.ndarray) -> Enclosed:
     first, second = volume * center, _second_moment(exact["inertia"]) + volume * np.outer(center, center)
     crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area, twice = float(np.linalg.norm(crosses, axis=-1).sum() / 2), 0.0
-    corners = triangles.reshape(-1, 3)
-    low, spacing = corners.min(0), float(np.ptp(corners, axis=0).max()) / _RAYS
-    for axis in range(3):
-        order = [(axis + 1) % 3, (axis + 2) % 3, axis]
-        shift = np.array([*_OFF_GRID[order[:2]], 0.0])
-        rays, place, owner, normal = _crossings((triangles[..., order] - low[order]) / spacing + shift)
-        change = -np.sign(normal[owner, 2])
-        along = np.lexsort((-change, np.round(place, 4), rays[:, 1], rays[:, 0]))  # entries before exits in one place
-        winding = np.cumsum(change[along])
-        points = np.empty((len(along), 3))
-        points[:, order] = (np.column_stack([rays, place])[along] - shift) * spacing + low[order]
+    low, spacing = _grid(triangles)
+    for found in _rays(triangles, low, spacing):
+        # Entries before exits in one place.
+        along = np.lexsort((-found.change, np.round(found.place, 4), found.rays[:, 1], found.rays[:, 0]))
+        winding, points = np.cumsum(found.change[along]), found.points[along]
         start = np.flatnonzero(winding > 1.5)  # up to the next crossing, it lies in two bodies or more
-        length = points[start + 1, axis] - points[start, axis]
+        length = (points[start + 1] - points[start])[:, found.axis]
         weight = (winding[start] - 1) * length * spacing**2 / 3
         middle = (points[start] + points[start + 1]) / 2
         twice += weight.sum()
         first -= weight @ middle
         second -= (weight[:, None] * middle).T @ middle
-        second[axis, axis] -= weight @ length**2 / 12
+        second[found.axis, found.axis] -= weight @ length**2 / 12
         # Rays along the axis k meet a patch in proportion to |n_k|: each crossing stands for 1 / sum |n_k|.
         inner = np.minimum(winding, np.r_[0, winding[:-1]]) > 0.5
-        area -= float((spacing**2 / np.abs(normal[owner[along[inner]]]).sum(-1)).sum())
+        area -= float((spacing**2 / np.abs(found.normals[along[inner]]).sum(-1)).sum())
     if twice < _OVERLAP * volume:
         return Enclosed(volume, area, center, np.asarray(exact["inertia"]), False)
     volume -= twice
@@ -184,17 +202,11 @@ def _second_moment(inertia: np.ndarray) -> np.ndarray:
 def _cut(triangles: np.ndarray, low: np.ndarray, spacing: float) -> tuple[float, _Surface]:
     """Volume (m^3; the mean of three axes) and outer surface of what triangles (F, 3, 3) enclose."""
     volumes, surfaces = [], []
-    for axis in range(3):
-        order = [(axis + 1) % 3, (axis + 2) % 3, axis]  # the rays run along the last of these
-        shift = np.array([*_OFF_GRID[order[:2]], 0.0])
-        rays, place, owner, normal = _crossings((triangles[..., order] - low[order]) / spacing + shift)
-        entries, exits, closed = _intervals(rays, place, -np.sign(normal[owner, 2]), _SEAM / spacing)
-        volumes.append((place[exits] - place[entries]).sum() * spacing**3)
+    for found in _rays(triangles, low, spacing):
+        entries, exits, closed = _intervals(found, _SEAM / spacing)
+        volumes.append((found.place[exits] - found.place[entries]).sum() * spacing**3)
         ends = np.concatenate([entries, exits, closed])
-        points, normals = np.empty((2, len(ends), 3))
-        points[:, order] = (np.column_stack([rays, place])[ends] - shift) * spacing + low[order]
-        normals[:, order] = normal[owner[ends]]
-        surfaces.append(_Surface(points, normals, np.arange(len(ends)) < 2 * len(entries)))
+        surfaces.append(_Surface(found.points[ends], found.normals[ends], np.arange(len(ends)) < 2 * len(entries)))
     return float(np.mean(volumes)), _Surface(*map(np.concatenate, zip(*surfaces, strict=True)))
 
 
@@ -229,20 +241,16 @@ def _integers(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return index, first[index] + np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-def _intervals(
-    rays: np.ndarray, place: np.ndarray, change: np.ndarray, seam: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _intervals(found: _Rays, seam: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The crossings (N,) where rays enter, those (N,) where they leave, and those (M,) at the ends of closed gaps.
 
     Args:
-      rays: (K, 2) the ray of each crossing.
-      place: (K,) where on the ray.
-      change: (K,) of the winding number.
-      seam: gaps narrower than this are closed.
+      found: crossings of rays.
+      seam: gaps narrower than this, in spacings, are closed.
     """
-    order = np.lexsort((place, rays[:, 1], rays[:, 0]))
-    rays, place = rays[order], place[order]
-    inside = np.cumsum(change[order]) > 0.5
+    order = np.lexsort((found.place, found.rays[:, 1], found.rays[:, 0]))
+    rays, place = found.rays[order], found.place[order]
+    inside = np.cumsum(found.change[order]) > 0.5
     before = np.r_[False, inside[:-1]]
     entries, exits = np.flatnonzero(inside & ~before), np.flatnonzero(~inside & before)
     same = (rays[entries[1:]] == rays[exits[:-1]]).all(-1)

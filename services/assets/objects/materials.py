@@ -9,8 +9,9 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.shapes import tessellate
-from congrasp.common.objects.spec import GraspObject
-from congrasp.services.assets.objects.fidelity import enclosed
+from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.common.objects.surface import mass_properties
+from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.repair import encloses
 
 DENSITIES = (500.0, 2500.0)
@@ -145,6 +146,43 @@ def _on_surface(mesh: trimesh.Trimesh, mass: float) -> Weight:
     second = np.einsum("f,fki,fkj->ij", share, corners, corners) + np.einsum("f,fi,fj->ij", share, total, total)
     second *= mass / 12
     return Weight(mass, center, np.trace(second) * np.eye(3) - second)
+
+
+def weigh_parts(
+    whole: Sequence[trimesh.Trimesh], parts: Sequence[trimesh.Trimesh], material: str, names: Sequence[str]
+) -> Weight:
+    """Mass properties of an object by its material, or by that of each part.
+
+    Args:
+      whole: its surface, m.
+      parts: that of each part.
+      material: see `materials_of`.
+      names: names of the parts.
+    """
+    if "=" in material:
+        return weigh(parts, materials_of(material, names))
+    return weigh(whole, materials_of(material, [""] * len(whole)))
+
+
+def weigh_evenly(
+    mesh: trimesh.Trimesh, solid: Enclosed | None, hulls: Sequence[np.ndarray], density: float | None
+) -> Weight:
+    """Mass properties of an evenly dense body.
+
+    Args:
+      mesh: its surface, m.
+      solid: measures of what the surface encloses; None for an open one.
+      hulls: vertices (V, 3) of the convex solids that replace an open surface, m.
+      density: kg/m^3; None guesses the mass.
+    """
+    if solid:
+        volume, area, center, inertia, _ = solid
+    else:
+        pieces = tuple(Piece("mesh", (0, 0, 0), vertices=hull) for hull in hulls)
+        volume, center, inertia = mass_properties(pieces, np.ones(len(pieces)))
+        area = float(mesh.area)
+    mass = guessed_mass(volume, area) if density is None else density * volume
+    return Weight(mass, center, inertia * mass / volume)
 
 
 def guessed_mass(volume: float, area: float) -> float:

@@ -8,7 +8,7 @@ import array
 import io
 import pathlib
 import re
-import stat
+import tomllib
 import zipfile
 from typing import Any, Literal
 
@@ -19,58 +19,16 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.gltf import MAX_FACES, plain_glb
-from congrasp.services.assets.objects.sizes import Up
+from congrasp.services.assets.objects.options import Up
 
 SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CONVERT = "Convert it to STL, OBJ, PLY or GLB."
 MAX_BYTES = 512 << 20
 """Bytes of a mesh file."""
 _AGAIN = "Export it again, or convert it."
-_BLENDER = "Open it in Blender and export it as GLB or OBJ."
 _UNPACK = "Unpack it and name the mesh inside."
 _SURFACE = "Make a surface of it (in MeshLab: Filters, Remeshing, Screened Poisson) and export that."
-_FREECAD = "Open it in FreeCAD and export it as STL."
-_FOREIGN = (
-    (b"Kaydara FBX", "an FBX file", _BLENDER),
-    (b"; FBX", "an FBX file", _BLENDER),
-    (b"BLENDER", "a Blender file", _BLENDER),
-    (b"ISO-10303-21", "a STEP file (surfaces, no triangles)", _FREECAD),
-    (b"DBRep_DrawableShape", "a BREP file (surfaces, no triangles)", _FREECAD),
-    (b"CASCADE Topology", "a BREP file (surfaces, no triangles)", _FREECAD),
-    (b"\xd0\xcf\x11\xe0", "a document of a CAD program", "Open it there and export it as STL."),
-    (b"3D Geometry File", "a Rhino file", "Open it in Rhino and export it as STL."),
-    (b"AC10", "a DWG drawing", _FREECAD),
-    (b"MM", "a 3DS file", _BLENDER),
-    (b"PXR-USDC", "a USD scene", "Open it in Blender and export it as GLB."),
-    (b"#usda", "a USD scene", "Open it in Blender and export it as GLB."),
-    (b"OFF", "an OFF file", "Open it in MeshLab and export it as STL."),
-    (b"#VRML", "a VRML file", _BLENDER),
-    (b"# vtk", "a VTK file", "Open it in ParaView and export it as STL."),
-    (b"# .PCD", "a point cloud (PCD)", _SURFACE),
-    (b"LASF", "a point cloud (LAS)", _SURFACE),
-    (b"ASTM-E57", "a point cloud (E57)", _SURFACE),
-    (b"\x1f\x8b", "a gzip archive", _UNPACK),
-    (b"\x28\xb5\x2f\xfd", "a zstd archive", _UNPACK),
-    (b"7z\xbc\xaf", "a 7z archive", _UNPACK),
-    (b"Rar!", "a RAR archive", _UNPACK),
-    (b"BZh", "a bzip2 archive", _UNPACK),
-    (b"\xfd7zXZ", "an xz archive", _UNPACK),
-    (b"\x89PNG", "a picture", "Name the mesh."),
-    (b"\xff\xd8\xff", "a picture", "Name the mesh."),
-    (b"%PDF", "a PDF document", "Name the mesh."),
-    (b"version https://git-lfs", "a Git LFS pointer, not the mesh itself", "Fetch it with 'git lfs pull'."),
-    (b"<!doctype html", "a web page, not a mesh", "Download the file itself again."),
-    (b"<html", "a web page, not a mesh", "Download the file itself again."),
-)
-"""Beginnings of files that are no meshes, or of other formats."""
-_XML = (
-    (b"<collada", "a COLLADA file (.dae)", _BLENDER),
-    (b"<x3d", "an X3D file", _BLENDER),
-    (b"<amf", "an AMF file", "Open it in a slicer and export it as STL."),
-    (b"<robot", "a robot description (URDF)", "Name its mesh, or import a hand with 'congrasp hands import'."),
-    (b"<mujoco", "a robot description (MJCF)", "Name its mesh, or import a hand with 'congrasp hands import'."),
-    (b"<svg", "a drawing (SVG)", "Name the mesh."),
-)
+_FOREIGN = pathlib.Path(__file__).with_name("foreign.toml")
 _STL_HEADER, _STL_TRIANGLE = 84, 50  # bytes
 _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
@@ -78,6 +36,7 @@ _RELATIVE = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t/]-\d")
 _ZERO = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t]0+(?=[/\s]|$)")
 _COMMA = re.compile(rb"(?m)^[ \t]*v[ \t]+-?\d+,\d")
 _START = 4096
+_MARK = b"\xef\xbb\xbf"  # of UTF-8
 _FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and products are finite
 _PLY_HEADER = 1 << 16  # bytes
 _SIZES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
@@ -91,20 +50,19 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto
     Args:
       path: the file; its content determines the kind, not its name.
       notes: repairs are appended.
-      up: axis that points up in the file; a y axis becomes z. `auto` is y for GLB and z for others.
+      up: axis that points up in the file (`up_of`); a y axis becomes z.
 
     Raises:
       CongraspError: not a mesh, empty, or not finite.
     """
     said = [] if notes is None else notes
-    suffix = kind_of(path)
-    kind = suffix[1:].upper()
-    if suffix != path.suffix.lower():
-        said.append(f"its content is {kind}, whatever its name says, and was read as that")
-    mesh = load_geometry(path, _AGAIN, notes=said, skip_materials=True)
-    mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
+    kind, data = _content(path)
+    if f".{kind}" != path.suffix.lower():
+        said.append(f"its content is {kind.upper()}, whatever its name says, and was read as that")
+    loaded = _geometry(path, kind, data, _AGAIN, said, skip_materials=True)
+    axis, mesh = up_of(loaded, up), loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
     if not len(getattr(mesh, "faces", ())):
-        raise CongraspError(*_without_triangles(path, len(getattr(mesh, "vertices", ())), kind))
+        raise CongraspError(*_without_triangles(path, kind, data, len(getattr(mesh, "vertices", ()))))
     if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
         raise CongraspError(f"{path} has points that are not of three numbers.", _AGAIN)
     if len(mesh.faces) > MAX_FACES or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
@@ -116,23 +74,16 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto
     if (farthest := np.abs(finite[0]).max(initial=0.0)) > _FARTHEST:
         raise CongraspError(f"{path} has a coordinate of {farthest:.3g}.", f"{_FARTHEST:g} is the most, in any unit.")
     vertices, faces = repair.reduced(*finite, said)
-    apart = trimesh.Trimesh(upright(vertices, up_of(path, up)), faces, process=False)
-    mesh = apart.copy()
-    mesh.merge_vertices()
-    if len(mesh.faces):
-        mesh.update_faces(mesh.nondegenerate_faces())
-        mesh = repair.without_repeats(mesh, said)
-        mesh.remove_unreferenced_vertices()
-    if apart.is_watertight and not mesh.is_watertight:  # bodies that touch along an edge
-        mesh = apart
+    mesh = repair.merged(upright(vertices, axis), faces, said)
     if len(mesh.faces) < 4:
         raise CongraspError(f"{path} has no volume: only {len(mesh.faces)} proper triangles.", "Export a closed mesh.")
+    mesh.metadata["kind"] = kind
     return mesh
 
 
-def up_of(path: pathlib.Path, up: Up = "auto") -> Literal["y", "z"]:
-    """The axis that points up in a mesh file: y in GLB by the standard of glTF, z in others, unless it is given."""
-    return up if up != "auto" else "y" if kind_of(path) == ".glb" else "z"
+def up_of(geometry: Any, up: Up = "auto") -> Literal["y", "z"]:
+    """The axis that points up in the file of a geometry: y in GLB by the standard of glTF, z in others, or `up`."""
+    return up if up != "auto" else "y" if geometry.metadata["kind"] == "glb" else "z"
 
 
 def upright(points: np.ndarray, up: Literal["y", "z"]) -> np.ndarray:
@@ -149,23 +100,31 @@ def load_geometry(path: pathlib.Path, remedy: str, *, notes: list[str] | None = 
       notes: what was left out of it, or is missing, is appended.
       **options: of `trimesh.load`.
 
+    Returns:
+      The geometry; its `metadata["kind"]` is stl, obj, ply or glb.
+
     Raises:
       CongraspError: it cannot be read; the line ends with the remedy.
     """
-    said = [] if notes is None else notes
-    kind = kind_of(path)
-    data = read_file(path, MAX_BYTES, remedy)
+    return _geometry(path, *_content(path), remedy, [] if notes is None else notes, **options)
+
+
+def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: list[str], **options: Any) -> Any:
+    """The geometry of a file with this content; see `load_geometry`."""
     try:
-        if kind == ".stl":
-            return _stl(data, said)
-        prepared = {".ply": _checked_ply, ".glb": plain_glb, ".obj": _plain_obj}[kind](data, said)
-        files = _Files(path, said)
-        return trimesh.load(io.BytesIO(prepared), file_type=kind[1:], resolver=files, process=False, **options)
+        if kind == "stl":
+            found: Any = _stl(data, notes)
+        else:
+            prepared = {"ply": _checked_ply, "glb": plain_glb, "obj": _plain_obj}[kind](data, notes)
+            files = _Files(path, notes)
+            found = trimesh.load(io.BytesIO(prepared), file_type=kind, resolver=files, process=False, **options)
     except CongraspError as error:
         raise CongraspError(f"{path} {error}") from None
     except Exception as error:  # the readers raise whatever they stumble over
         reason = (str(error) or type(error).__name__).splitlines()[0][:200].rstrip(" .!")
-        raise CongraspError(f"{path} cannot be read as {kind[1:].upper()}: {reason}.", remedy) from None
+        raise CongraspError(f"{path} cannot be read as {kind.upper()}: {reason}.", remedy) from None
+    found.metadata["kind"] = kind
+    return found
 
 
 class _Files(trimesh.resolvers.FilePathResolver):
@@ -187,60 +146,63 @@ class _Files(trimesh.resolvers.FilePathResolver):
         raise FileNotFoundError(note)
 
 
-def kind_of(path: pathlib.Path) -> str:
-    """Returns the suffix for a file's content, or that of its name if the content is ambiguous.
+def _content(path: pathlib.Path) -> tuple[str, bytes]:
+    """The kind of a mesh file by its content, or by its name if the content is ambiguous; and the content.
 
     Raises:
       CongraspError: it cannot be read, is empty, or is not a mesh; the remedy describes how to get one.
     """
-    try:
-        about = path.stat()
-        if not stat.S_ISREG(about.st_mode):
-            raise CongraspError(f"{path} is no regular file.", "Name a mesh file.")
-        with path.open("rb") as file:
-            start = file.read(_START)
-    except OSError as error:
-        raise CongraspError(
-            f"{path} cannot be read: {error.strerror}.", "Check the path and its permissions."
-        ) from None
-    if not start:
+    data = read_file(path, MAX_BYTES, "Check the path and its permissions.")
+    if not data:
         raise CongraspError(f"{path} is empty (0 bytes).", "Export or download it again.")
-    suffix, text = path.suffix.lower(), start.removeprefix(b"\xef\xbb\xbf").lstrip()
-    if found := _supported(start, about.st_size):
-        return found
-    if start.startswith(b"PK\x03\x04"):
-        raise CongraspError(f"{path} {_zip(path)[0]}.", _zip(path)[1])
-    for magic, what, remedy in _FOREIGN:
-        if text.startswith(magic) or text.lower().startswith(magic) or start.startswith(magic):
-            raise CongraspError(f"{path} is {what}.", remedy)
-    if text.startswith(b"<"):
-        what, remedy = next((row[1:] for row in _XML if row[0] in text.lower()), ("an XML file", CONVERT))
-        raise CongraspError(f"{path} is {what}.", remedy)
-    if text.startswith(b"{") and b'"asset"' in text:
-        raise CongraspError(f"{path} is a glTF scene in several files.", "Export it as GLB, which is a single file.")
+    start, suffix = data[:_START], path.suffix.lower()
+    if kind := _supported(start, len(data)):
+        return kind, data
+    text = start.removeprefix(_MARK).lstrip()
+    if foreign := _foreign(text, data):
+        raise CongraspError(f"{path} is {foreign[0]}.", foreign[1])
     if suffix not in SUFFIXES:
         if _rows_of_numbers(text):
             raise CongraspError(f"{path} holds rows of numbers: a point cloud.", _SURFACE)
         raise CongraspError(f"{path} is not an STL, OBJ, PLY or GLB file.", CONVERT)
-    return suffix
+    return suffix[1:], data
 
 
-def _supported(start: bytes, size: int) -> str | None:
-    """The suffix of a mesh file with this beginning and size in bytes, if it is one."""
+def _supported(start: bytes, size: int) -> str:
+    """The kind of a mesh file with this beginning and size in bytes; empty if it is none."""
     if start.startswith(b"glTF"):
-        return ".glb"
+        return "glb"
     if start.startswith((b"ply\n", b"ply\r", b"ply ")):
-        return ".ply"
+        return "ply"
     if _is_exact(start, size) or _is_text_stl(start) or _holds_records(start):
-        return ".stl"
+        return "stl"
     lines = [line.split() for line in start.splitlines()]
     points = sum(len(words) >= 4 and words[0] == b"v" for words in lines)
-    return ".obj" if points >= 3 else None
+    return "obj" if points >= 3 else ""
+
+
+def _foreign(text: bytes, data: bytes) -> tuple[str, str] | None:
+    """Kind of a file that is no mesh, by its beginning and its content, and the remedy; None if it is unknown."""
+    inside, zipped, names = text.lower(), text.startswith(b"PK\3\4"), list[str]()
+    if zipped:
+        try:
+            names = zipfile.ZipFile(io.BytesIO(data)).namelist()
+        except (OSError, zipfile.BadZipFile):
+            return "a zip archive that is damaged", "Download it again."
+        inside = " ".join(names).lower().encode()
+    for row in tomllib.loads(_FOREIGN.read_text())["format"]:
+        begins = tuple(beginning.encode("latin-1") for beginning in row["begins"])
+        holds = row.get("holds", [""])
+        if (text.startswith(begins) or text.lower().startswith(begins)) and any(x.encode() in inside for x in holds):
+            return row["what"], row["remedy"]
+    if meshes := [name for name in names if name.lower().endswith(SUFFIXES)]:
+        return f"a zip archive with {', '.join(meshes[:3])}{' …' if len(meshes) > 3 else ''} in it", _UNPACK
+    return ("a zip archive without a mesh in it", CONVERT) if zipped else None
 
 
 def _is_text_stl(start: bytes) -> bool:
     """True for the beginning of an STL file of text; some writers use capitals, or write a mark of the encoding."""
-    text = start[:_START].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    text = start[:_START].removeprefix(_MARK).lstrip().lower()
     return text.startswith(b"solid") and re.search(rb"\bfacet\s", text) is not None
 
 
@@ -261,31 +223,14 @@ def _rows_of_numbers(text: bytes) -> bool:
     return len(lines) > 2 and all(re.fullmatch(rb"\s*([-+.\deE]+[\s,;]*){3,}", line) for line in lines[:-1])
 
 
-def _zip(path: pathlib.Path) -> tuple[str, str]:
-    """Kind of a zip archive, and the remedy."""
-    try:
-        names = zipfile.ZipFile(path).namelist()
-    except (OSError, zipfile.BadZipFile):
-        return "is a zip archive that is damaged", "Download it again."
-    if any(name.lower().endswith("3dmodel.model") for name in names):
-        return "is a 3MF file", "Export it as STL."
-    if any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names):
-        return "is a USDZ scene", "Export it as GLB."
-    inside = [name for name in names if name.lower().endswith(SUFFIXES)]
-    if not inside:
-        return "is a zip archive without a mesh in it", CONVERT
-    return f"is a zip archive with {', '.join(inside[:3])}{' …' if len(inside) > 3 else ''} in it", _UNPACK
-
-
-def _without_triangles(path: pathlib.Path, points: int, kind: str) -> tuple[str, str]:
+def _without_triangles(path: pathlib.Path, kind: str, data: bytes, points: int) -> tuple[str, str]:
     """Fault and remedy of a file without triangles."""
-    start = read_file(path, MAX_BYTES)[:_START]
-    if b"property float f_dc_0" in start:
+    if b"property float f_dc_0" in data[:_START]:
         return f"{path} is a Gaussian splat of {points} points: it has no triangles.", _SURFACE
     if points:
         return f"{path} has no triangles: it holds only {points} points.", _SURFACE
     fault = f"{path} has no triangles: it holds nothing that can be read as a mesh."
-    return fault, f"Export it as a triangle mesh ({kind})."
+    return fault, f"Export it as a triangle mesh ({kind.upper()})."
 
 
 def _stl(data: bytes, notes: list[str]) -> trimesh.Trimesh:
@@ -352,7 +297,7 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
     Raises:
       ValueError: an index is 0, or the numbers have decimal commas.
     """
-    data = data.removeprefix(b"\xef\xbb\xbf")
+    data = data.removeprefix(_MARK)
     if _ZERO.search(data):
         raise ValueError("a face has the index 0, but OBJ counts from 1")
     if _COMMA.search(data):

@@ -8,36 +8,68 @@ import pathlib
 import queue
 import threading
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import QhullError, cKDTree
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import cache_folder
 from congrasp.common.objects import shapes, store
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.spec import Colours, GraspObject, Piece
-from congrasp.common.objects.surface import halves, mass_properties, sample_mesh
+from congrasp.common.objects.surface import halves, sample_mesh
 from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects import decompose, repair
-from congrasp.services.assets.objects.affordance import cut_to_hold
-from congrasp.services.assets.objects.collision import convex_pieces
+from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
 from congrasp.services.assets.objects.colours import sample_colours
-from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
-from congrasp.services.assets.objects.materials import Weight, guessed_mass, materials_of, weigh
+from congrasp.services.assets.objects.fidelity import enclosed
+from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
 from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
-from congrasp.services.assets.objects.options import ImportOptions, check_options
+from congrasp.services.assets.objects.options import ImportOptions, Up, check_options, metres_per_unit
 from congrasp.services.assets.objects.repair import encloses
-from congrasp.services.assets.objects.sizes import Up, metres_per_unit
-from congrasp.services.assets.objects.sources import Source
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
 _CACHE_VERSION = 10
 _DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshFile:
+    """One mesh of an object."""
+
+    path: pathlib.Path
+    role: Literal["visual", "piece", "part"]
+    part: str = ""
+    """Name of the part that it shows."""
+    graspable: bool = True
+    """True if that part may be grasped."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """The files of one object."""
+
+    name: str
+    path: pathlib.Path
+    visuals: tuple[MeshFile, ...]
+    """The surface; the part files if they form the surface together."""
+    pieces: tuple[MeshFile, ...] = ()
+    """Convex pieces, if it is already decomposed."""
+    parts: tuple[MeshFile, ...] = ()
+    """Meshes of the parts of the surface."""
+
+    @property
+    def parts_are_pieces(self) -> bool:
+        """True if the part files together are the object, so that no collision piece spans two of them."""
+        return bool(self.parts) and self.visuals == self.parts
+
+    def files(self) -> tuple[MeshFile, ...]:
+        """All files, without repetition."""
+        return tuple(dict.fromkeys(self.visuals + self.pieces + self.parts))
 
 
 def import_source(source: Source, options: ImportOptions) -> GraspObject:
@@ -118,11 +150,11 @@ def _key(source: Source, options: ImportOptions) -> str:
 def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     """The object of a source; the seed draws its surface points."""
     notes: list[str] = []
-    given, visuals, up = _read(source, options.up, notes)
-    sides = tuple(_joined(visuals).extents.tolist())
+    given, visuals, parts, up, coloured = _read(source, options.up, notes)
+    sides = tuple(trimesh.util.concatenate(visuals).extents.tolist())
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
-    meshes = [_scaled(mesh, factor) for mesh in visuals]
-    whole = _joined(meshes)
+    meshes, parts = ([_scaled(mesh, factor) for mesh in some] for some in (visuals, parts))
+    whole = trimesh.util.concatenate(meshes).copy()
     closed = all(encloses(mesh) for mesh in meshes)
     if not (closed or options.material):
         notes.append(
@@ -132,31 +164,32 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     solid = enclosed(np.asarray(whole.triangles)) if closed else None
     if solid and solid.overlaps:
         notes.append("its bodies overlap: what lies in several of them weighs once")
-    hulls, owners, errors = convex_pieces(
-        source, meshes, np.asarray(whole.triangles), solid and solid.volume, [factor * x for x in given], options, notes
-    )
-    mass, center, inertia = _weighed(source, meshes, factor, solid, hulls if source.pieces else None, options)
+    surfaces = decompose.Surfaces(meshes, np.asarray(whole.triangles), solid and solid.volume)
+    hulls, owners, errors = _cut(source, [factor * piece for piece in given], surfaces, options, notes)
+    if options.material:
+        found = weigh_parts(meshes, parts or meshes, options.material, [part.part for part in source.parts])
+    else:
+        found = weigh_evenly(whole, solid, hulls if source.pieces else [np.asarray(whole.vertices)], options.density)
+    mass, center = found.mass if options.mass is None else options.mass, found.center
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
     whole.apply_translation(-center)
     points, normals, face = sample_mesh(
         np.asarray(whole.triangles), pieces, np.random.default_rng(seed), oriented=closed
     )
-    part_names, graspable, labels = _labels(source, meshes, factor, center, points, face, options.up)
+    part_names, graspable, labels = _labels(source, meshes, parts, center, points, face)
     share = graspable[labels].mean()
     if not 0.1 <= share <= 0.9:
         notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
-    if not source.parts_are_pieces:
-        pieces = _labelled(pieces, points, labels)
     picture = repair.with_few_faces(whole)
-    colours = _colours(source, factor, center, seed, options.up, notes)
+    colours = _colours(coloured, factor, center, seed, options.up, notes)
     obj = GraspObject(
         name=source.name,
         family="imported",
-        pieces=pieces,
+        pieces=pieces if source.parts_are_pieces else with_labels(pieces, points, labels),
         part_names=part_names,
         graspable=graspable,
         mass=mass,
-        inertia=inertia,
+        inertia=found.inertia * (mass / found.mass),
         points=points.astype(np.float32),
         normals=normals.astype(np.float32),
         labels=labels.astype(np.int32),
@@ -175,38 +208,66 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     return obj if source.parts else cut_to_hold(obj)
 
 
-def _read(
-    source: Source, up: Up, notes: list[str]
-) -> tuple[list[np.ndarray], list[trimesh.Trimesh], Literal["y", "z"]]:
-    """The convex pieces (V, 3) in a source's folder, its repaired surfaces, z up, and the files' axis that was up."""
-    given = [np.asarray(read_mesh(file.path, up=up).vertices, np.float64) for file in source.pieces]
+class _Files(NamedTuple):
+    """The meshes of a source, in the files' unit, z up."""
+
+    given: list[np.ndarray]
+    """Vertices (V, 3) of the convex pieces in its folder."""
+    visuals: list[trimesh.Trimesh]
+    """Its repaired surfaces."""
+    parts: list[trimesh.Trimesh]
+    """Those of its parts, unless they are the surfaces."""
+    up: Literal["y", "z"]
+    """The files' axis that was up."""
+    coloured: list[pathlib.Path]
+    """Files of the surfaces that may have colours."""
+
+
+def _read(source: Source, up: Up, notes: list[str]) -> _Files:
+    """Reads the meshes of a source."""
+    pieces = [read_mesh(file.path, up=up) for file in source.pieces]
     visuals = [read_mesh(file.path, notes, up) for file in source.visuals]
-    visuals = visuals or [shapes.triangulate(piece) for piece in given]
-    found = up_of(source.files()[0].path, up)
+    parts = [] if source.parts_are_pieces else [read_mesh(file.path, up=up) for file in source.parts]
+    found = up_of((visuals or pieces)[0], up)
+    kinds = [mesh.metadata["kind"] for mesh in visuals]
+    coloured = [file.path for file, kind in zip(source.visuals, kinds, strict=True) if kind != "stl"]
     if found == "y":
         notes.append("its y axis, which points up in the file, became its z axis (--up z leaves the axes)")
+    given = [np.asarray(mesh.vertices, np.float64) for mesh in pieces]
+    visuals = visuals or [shapes.triangulate(piece) for piece in given]
     if not (given or source.parts):
         visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
     if not source.parts:
         visuals = [repair.closed(mesh, notes) for mesh in visuals]
-    return given, visuals, found
+    return _Files(given, visuals, parts, found, coloured)
 
 
-def _colours(source: Source, factor: float, center: np.ndarray, seed: int, up: Up, notes: list[str]) -> Colours | None:
-    """Colours of the files, in the object frame; None if they have none, or cannot be read."""
+def _cut(
+    source: Source,
+    given: Sequence[np.ndarray],
+    surfaces: decompose.Surfaces,
+    options: ImportOptions,
+    notes: list[str],
+) -> decompose.Collision:
+    """Convex pieces of an object (`decompose.convex_pieces`)."""
     try:
-        found = sample_colours([file.path for file in source.visuals], seed, up, notes)
+        return decompose.convex_pieces(given, surfaces, options, notes, shown=bool(source.visuals))
+    except QhullError:
+        raise CongraspError(
+            f"{source.path} has no volume: its points lie in a plane.", "Give it a thickness in a modelling program."
+        ) from None
+
+
+def _colours(
+    paths: Sequence[pathlib.Path], factor: float, center: np.ndarray, seed: int, up: Up, notes: list[str]
+) -> Colours | None:
+    """Colours of files, in the object frame; None if they have none, or cannot be read."""
+    try:
+        found = sample_colours(paths, seed, up, notes)
     except CongraspError as error:
         notes.append(f"its colours are left out: {error}")
         return None
     return found and found._replace(points=(factor * found.points - center).astype(np.float32))
-
-
-def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Several meshes as one, faces in their order."""
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
-    return trimesh.Trimesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces), process=False)
 
 
 def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
@@ -218,91 +279,32 @@ def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
     return mesh
 
 
-def _scaled_parts(source: Source, factor: float, up: Up) -> list[trimesh.Trimesh]:
-    """Meshes of the part files in metres."""
-    return [_scaled(read_mesh(part.path, up=up), factor) for part in source.parts]
-
-
-def _weighed(
-    source: Source,
-    meshes: Sequence[trimesh.Trimesh],
-    factor: float,
-    solid: Enclosed | None,
-    hulls: Sequence[np.ndarray] | None,
-    options: ImportOptions,
-) -> Weight:
-    """Mass properties by the options: of materials, or of an evenly dense body.
-
-    Args:
-      source: the object's files.
-      meshes: its surface, m.
-      factor: metres per unit of the files.
-      solid: measures of what the surface encloses; None for an open one.
-      hulls: vertices (V, 3) of the convex solids that replace an open surface, m; the surface's hull if None.
-      options: material, density and mass.
-    """
-    whole, text = _joined(meshes), options.material
-    if "=" in text:
-        bodies = meshes if source.parts_are_pieces else _scaled_parts(source, factor, options.up)
-        found = weigh(bodies, materials_of(text, [part.part for part in source.parts]))
-    elif text:
-        found = weigh(meshes, materials_of(text, [""] * len(meshes)))
-    else:
-        area = float(whole.area)
-        if solid:
-            volume, area, center, inertia, _ = solid
-        else:
-            solids = [np.asarray(whole.vertices)] if hulls is None else hulls
-            pieces = tuple(Piece("mesh", (0, 0, 0), vertices=solid) for solid in solids)
-            volume, center, inertia = mass_properties(pieces, np.ones(len(pieces)))
-        mass = guessed_mass(volume, area) if options.density is None else options.density * volume
-        found = Weight(mass, center, inertia * mass / volume)
-    mass = found.mass if options.mass is None else options.mass
-    return Weight(mass, found.center, found.inertia * (mass / found.mass))
-
-
 def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
     """A convex piece of vertices (V, 3), with its origin at their mean, relative to the centre of mass."""
     middle = hull.mean(0)
     return Piece("mesh", (0.0, 0.0, 0.0), tuple((middle - center).tolist()), vertices=hull - middle, part=part)
 
 
-def _labelled(pieces: tuple[Piece, ...], points: np.ndarray, labels: np.ndarray) -> tuple[Piece, ...]:
-    """The pieces with the part to which most of their vertices are nearest, by labels (N,) of points (N, 3)."""
-    near = cKDTree(points)
-    votes = (labels[near.query(np.asarray(piece.vertices) + piece.pos)[1]] for piece in pieces)
-    return tuple(
-        dataclasses.replace(piece, part=int(np.bincount(vote).argmax()))
-        for piece, vote in zip(pieces, votes, strict=True)
-    )
-
-
 def _labels(
     source: Source,
-    meshes: list[trimesh.Trimesh],
-    factor: float,
+    meshes: Sequence[trimesh.Trimesh],
+    parts: Sequence[trimesh.Trimesh],
     center: np.ndarray,
     points: np.ndarray,
     face: np.ndarray,
-    up: Up,
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Names of the parts, which of them form the graspable region, and the part (N,) of each surface point."""
-    if source.parts_are_pieces:
-        ends = np.cumsum([len(mesh.faces) for mesh in meshes])
-        labels = np.searchsorted(ends, face, side="right")
-    elif source.parts:
-        distances = []
-        for part in _scaled_parts(source, factor, up):
-            dense, _ = trimesh.sample.sample_surface(part, 4000, seed=0)
-            distances.append(cKDTree(dense - center).query(points)[0])
-        labels = np.argmin(distances, axis=0)
-    else:
+    if not source.parts:
         labels = halves(points, 0.5)
         middle = [points[labels == k] - points[labels == k].mean(0) for k in (0, 1)]
         slim = int(np.argmin([np.linalg.svd(half, compute_uv=False)[2] / np.sqrt(len(half)) for half in middle]))
         return UNLABELLED, np.arange(2) == slim, labels
-    files = source.parts
-    graspable = np.array([bool(file.graspable) for file in files])
+    if parts:
+        dense = [trimesh.sample.sample_surface(part, 4000, seed=0)[0] for part in parts]
+        labels = np.argmin([cKDTree(some - center).query(points)[0] for some in dense], axis=0)
+    else:
+        labels = np.searchsorted(np.cumsum([len(mesh.faces) for mesh in meshes]), face, side="right")
+    graspable = np.array([bool(part.graspable) for part in source.parts])
     if graspable.all() or not graspable.any():
-        graspable = np.arange(len(files)) == np.bincount(labels, minlength=len(files)).argmax()
-    return tuple(file.part for file in files), graspable, labels
+        graspable = np.arange(len(source.parts)) == np.bincount(labels, minlength=len(source.parts)).argmax()
+    return tuple(part.part for part in source.parts), graspable, labels

@@ -1,12 +1,37 @@
-"""Options for converting meshes to objects, separate from their use, so that the command line starts quickly."""
+"""Options for converting meshes to objects, units and sizes, apart from their use: the command line starts fast."""
 
 import dataclasses
 import pathlib
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import can_cache
 from congrasp.common.objects.spec import MAX_MESH_PIECES
-from congrasp.services.assets.objects.sizes import Unit, Up
+
+Unit = Literal["auto", "guess", "m", "cm", "mm", "in"]
+Up = Literal["auto", "y", "z"]
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
+_PLAUSIBLE = (0.01, 0.6)  # m, longest side for which metres are assumed
+_POSSIBLE = (0.005, 1.0)  # m, longest side that a unit of the user may give
+_LIKELY = (0.02, 0.4)  # m, longest side for which a unit is proposed
+_THINNEST = 2e-4  # m
+_SCALES = ((0.01, 1000.0, "mm"), (1.0, 100.0, "cm"), (1000.0, 1.0, "m"))
+"""Upper end of the lengths (m) shown in a unit, number of these units in a metre, and the unit."""
+_COMMON = (
+    (0.015, "a pea"),
+    (0.03, "a grape"),
+    (0.05, "a walnut"),
+    (0.075, "an egg"),
+    (0.12, "a mug"),
+    (0.17, "a phone"),
+    (0.22, "a banana"),
+    (0.35, "a wine bottle"),
+    (0.6, "a keyboard"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,3 +76,91 @@ def check_options(options: ImportOptions) -> None:
         raise CongraspError("--material and --density both say how dense it is.", "Leave one of them out.")
     if options.cache_dir:
         can_cache(pathlib.Path(options.cache_dir), "--cache-dir")
+
+
+def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: float, notes: list[str]) -> float:
+    """Metres per unit of a file, with the scale.
+
+    Args:
+      path: the file, for messages.
+      sides: the three sides of its mesh, in the file's unit.
+      unit: unit of its numbers; see `ImportOptions.unit`.
+      scale: factor on the size, after the unit.
+      notes: a guess of the unit is appended.
+
+    Raises:
+      CongraspError: no hand can grasp an object of that size; the remedy is the unit that would fit.
+    """
+    taken: str = "m" if unit in ("auto", "guess") else unit
+    longest = max(sides) * scale
+    low, high = _PLAUSIBLE if unit in ("auto", "guess") else _POSSIBLE
+    if not low <= longest * METRES[taken] <= high:
+        others = [other for other in ("mm", "cm", "in", "m") if other != taken]
+        fitting = [other for other in others if _LIKELY[0] <= longest * METRES[other] <= _LIKELY[1]]
+        size = length(longest * METRES[taken])
+        if unit != "guess" or len(fitting) != 1:
+            options = [f"{UNIT_NAMES[u]}, add '--unit {u}' ({length(longest * METRES[u])})" for u in fitting]
+            remedy = f"Set '--scale {0.1 / (max(sides) * METRES[taken]):.3g}' for an object of 10 cm."
+            if options:
+                remedy = f"If they are {'; if '.join(options)}; or set --scale."
+            fault = "large" if longest * METRES[taken] > high else "small"
+            raise CongraspError(
+                f"{path} is {size} long if its numbers are {UNIT_NAMES[taken]}: too {fault} for a hand.", remedy
+            )
+        taken = fitting[0]
+        notes.append(
+            f"it would be {size} long in metres, so its numbers are taken as {UNIT_NAMES[taken]}: "
+            f"{length(longest * METRES[taken])} (if that is wrong, add --unit or --scale)"
+        )
+    factor = METRES[taken] * scale
+    if min(sides) * factor < _THINNEST:
+        raise CongraspError(
+            f"{path} is flat: it is {length(min(sides) * factor)} thick.",
+            "Give it a thickness in a modelling program.",
+        )
+    return factor
+
+
+def guessed_unit(path: object, sides: tuple[float, float, float]) -> str:
+    """The unit in which a mesh with these sides is an object for a hand; empty unless exactly one is likely.
+
+    Raises:
+      CongraspError: there is no such unit.
+    """
+    longest = max(sides)
+    if _PLAUSIBLE[0] <= longest <= _PLAUSIBLE[1]:
+        return "m"
+    fitting = [unit for unit, factor in METRES.items() if _LIKELY[0] <= longest * factor <= _LIKELY[1]]
+    if not fitting and not any(possible for _, possible in sizes_by_unit(sides).values()):
+        raise CongraspError(
+            f"{path} is {longest:.4g} units long: in none of {', '.join(METRES)} is that an object for a hand.",
+            "Scale it in a modelling program.",
+        )
+    return fitting[0] if len(fitting) == 1 else ""
+
+
+def sizes_by_unit(sides: tuple[float, float, float]) -> dict[str, tuple[str, bool]]:
+    """For each possible unit of a mesh with these sides: its size as text, and True if a hand could grasp it."""
+    return {
+        unit: (_size([side * factor for side in sides]), _POSSIBLE[0] <= max(sides) * factor <= _POSSIBLE[1])
+        for unit, factor in METRES.items()
+    }
+
+
+def _size(sides: Sequence[float]) -> str:
+    """Formats sides, in m, with the unit that suits the longest."""
+    longest = max(sides)
+    factor, unit = next(((f, u) for limit, f, u in _SCALES if longest < limit), (1e-3, "km"))
+    return f"{' x '.join(f'{side * factor:.3g}' for side in sides)} {unit}"
+
+
+def length(metres: float) -> str:
+    """Formats a length, in m, with a suitable unit."""
+    return _size([metres])
+
+
+def size_in_words(sides: Sequence[float] | np.ndarray) -> str:
+    """Formats three sides, in m, as cm, with a common object of similar length."""
+    longest = max(sides)
+    like = next((name for limit, name in _COMMON if longest < limit), "an arm")
+    return f"{' x '.join(f'{100 * side:.1f}' for side in sides)} cm, about as long as {like}"

@@ -2,8 +2,8 @@
 
 import numpy as np
 import trimesh
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from trimesh.geometry import faces_to_edges
+from trimesh.graph import connected_component_labels
 
 MAX_FACES = 20_000
 """Triangles beyond which a mesh is reduced before anything else is done with it."""
@@ -42,6 +42,21 @@ def reduced(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[
     return np.asarray(small.vertices), np.asarray(small.faces)
 
 
+def merged(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> trimesh.Trimesh:
+    """A mesh (V, 3), (F, 3) with merged vertices and each proper triangle once; unmerged if only that leaves it closed.
+
+    The latter are bodies that touch along an edge.
+    """
+    apart = trimesh.Trimesh(vertices, faces, process=False)
+    mesh = apart.copy()
+    mesh.merge_vertices()
+    if len(mesh.faces):
+        mesh.update_faces(mesh.nondegenerate_faces())
+        mesh = without_repeats(mesh, notes)
+        mesh.remove_unreferenced_vertices()
+    return apart if apart.is_watertight and not mesh.is_watertight else mesh
+
+
 def with_few_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh with at most `MAX_FACES` triangles."""
     return mesh if len(mesh.faces) <= MAX_FACES else mesh.simplify_quadric_decimation(face_count=MAX_FACES)
@@ -49,8 +64,8 @@ def with_few_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     """The largest of several bodies that lie apart from one another; parts that lie close together are one body."""
-    count, labels = _components(np.asarray(mesh.faces), len(mesh.vertices))
-    if count == 1:
+    labels = connected_component_labels(mesh.edges, len(mesh.vertices))
+    if (count := labels.max() + 1) == 1:
         return mesh
     order = np.argsort(labels, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(labels[order]) > 0])
@@ -78,21 +93,15 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 def bodies(vertices: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Vertices (V, 3) and faces (F, 3) of each body of a closed mesh, with the hollows inside of it."""
-    count, labels = _components(faces, len(vertices))
-    owner = labels[faces[:, 0]]
-    shells = [faces[owner == i] for i in range(count)]
-    solid = [shell for shell in shells if len(shell) and np.linalg.det(vertices[shell]).sum() > 0]
+    labels = connected_component_labels(faces_to_edges(faces), len(vertices))[faces[:, 0]]
+    shells = [faces[labels == i] for i in np.unique(labels)]
+    solid = [shell for shell in shells if np.linalg.det(vertices[shell]).sum() > 0]
     for shell in shells:
-        if not len(shell) or np.linalg.det(vertices[shell]).sum() > 0:
-            continue
-        low, high = vertices[shell].min((0, 1)), vertices[shell].max((0, 1))
-        around = [
-            i
-            for i, body in enumerate(solid)
-            if (vertices[body].min((0, 1)) <= low).all() and (vertices[body].max((0, 1)) >= high).all()
-        ]
-        if around:
-            i = min(around, key=lambda i: float(np.ptp(vertices[solid[i]].reshape(-1, 3), axis=0).prod()))
+        corners = vertices[shell].reshape(-1, 3)
+        boxes = [np.stack([vertices[body].min((0, 1)), vertices[body].max((0, 1))]) for body in solid]
+        around = [i for i, (low, high) in enumerate(boxes) if (low <= corners).all() and (corners <= high).all()]
+        if around and np.linalg.det(vertices[shell]).sum() <= 0:
+            i = min(around, key=lambda i: float(np.ptp(boxes[i], axis=0).prod()))
             solid[i] = np.concatenate([solid[i], shell])
     parts = [np.unique(body, return_inverse=True) for body in solid]
     return [(vertices[used], places.reshape(-1, 3)) for used, places in parts]
@@ -107,12 +116,6 @@ def encloses(mesh: trimesh.Trimesh) -> bool:
     _, group = np.unique(_codes(edges), return_inverse=True)
     passes = np.bincount(group.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
     return not passes.any() and float(np.linalg.det(mesh.triangles).sum()) > 0
-
-
-def is_manifold(faces: np.ndarray) -> bool:
-    """True if each edge of triangles (F, 3) belongs to two of them."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return bool((np.unique(_codes(edges), return_counts=True)[1] == 2).all())
 
 
 def _codes(edges: np.ndarray) -> np.ndarray:
@@ -148,14 +151,6 @@ def without_repeats(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 def _even(faces: np.ndarray) -> np.ndarray:
     """(F,) bool: triangles (F, 3) whose corners are an even permutation of their order."""
     return ((faces[:, 0] < faces[:, 1]).astype(int) + (faces[:, 1] < faces[:, 2]) + (faces[:, 2] < faces[:, 0])) == 2
-
-
-def _components(faces: np.ndarray, count: int) -> tuple[int, np.ndarray]:
-    """Connected components of triangles (F, 3) over `count` vertices: their number, and that of each vertex."""
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_matrix((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (count, count))
-    number, labels = connected_components(graph, directed=False)
-    return int(number), labels
 
 
 def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
@@ -237,8 +232,7 @@ def _wound_alike(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     count = len(faces)
     first = np.concatenate([pairs[:, 0], pairs[:, 0] + count])
     second = np.concatenate([pairs[:, 1] + count * differ, pairs[:, 1] + count * ~differ])
-    graph = coo_matrix((np.ones(len(first), bool), (first, second)), (2 * count, 2 * count))
-    _, labels = connected_components(graph, directed=False)
+    labels = connected_component_labels(np.column_stack([first, second]), 2 * count)
     # Of the two copies of a body, the one in which more triangles are unchanged is used.
     lower = np.minimum(labels[:count], labels[count:])
     turned = labels[:count] != lower

@@ -21,8 +21,6 @@ import pathlib
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -40,7 +38,6 @@ from tests.services.conftest import quick_imports
 
 ROOT = pathlib.Path(__file__).parents[3]
 CASES = ROOT / "tests" / "cases"
-SHARED = ROOT.parent / "shared" / "cases"
 NAMES = sorted(folder.parent.name for folder in CASES.glob("*/case.json"))
 
 
@@ -50,6 +47,7 @@ def prepared(name: str, folder: pathlib.Path) -> dict[str, Any]:
     case = json.loads((folder / "case.json").read_text())
     for file, how in case.get("files", {}).items():
         if "copy" in how:
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(CASES / how["copy"], folder / file)
             continue
         text = how["text"] if "text" in how else (CASES / "_hand" / how["from"]).read_text()
@@ -65,11 +63,7 @@ def prepared(name: str, folder: pathlib.Path) -> dict[str, Any]:
 @contextlib.contextmanager
 def here(function, path, options):
     """Does what a confined process does in this one, which is faster."""
-    folder = path.resolve().parent
-    try:
-        yield function(path.resolve(), folder, options), folder
-    except CongraspError as error:
-        raise CongraspError(str(error).replace(str(path.resolve()), str(path))) from None
+    yield function(path.resolve().parent, str(path), **options), path.resolve().parent
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -114,57 +108,6 @@ def test_a_case_ends_as_it_should(name, tmp_path, monkeypatch, capsys):
                 facts["volume_cm3"], rel=0.2
             )
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
-
-
-_HELD = {
-    "01_names": (0, "2 of 2"),
-    "04_draco": (2, "Draco. Export it without"),
-    "05_meshopt": (2, "meshopt .*Export it without"),
-    "05_quantised_int16": (0, "1 of 1"),
-    "06_no_position": (0, "were left out"),
-    "08_negative": (0, "1 of 1"),
-    "09_missing_image": (0, r"\.\.\\tex\\a b\.png"),
-    "10_short_count": (0, "announces 11 triangles, but it holds 12"),
-    "10_trailing": (0, "bytes after its triangles"),
-    "11_capitals": (0, "its content is STL"),
-    "12_cloud": (2, "only 500 points.*Make a surface"),
-    "13_fallback": (0, "3 convex pieces.*0.[0-9]% too"),
-    "15_double": (0, "1 of 1"),
-    "15_two_bodies": (0, "2 convex pieces"),
-    "16_containers": (2, "3MF file. Export it as STL"),
-    "17_hand_urdf_xacro": (2, "xacro.*Run 'xacro"),
-    "17_undeclared_urdf": (2, "xacro.*Run 'xacro"),
-    "18_comment": (0, "4 joints"),
-    "18_newline": (0, "4 joints"),
-    "19_mjcf_called_urdf": (0, "4 joints"),
-    "19_urdf_called_xml": (0, "4 joints"),
-    "20_attached_meshdir": (0, "4 joints"),
-    "20_classes": (2, "repeated.*'finger'"),
-    "20_texture": (0, r"wood\.png"),
-    "21_mm": (2, "'palm' is 100 m long.*mm"),
-    "22_fixed": (0, "'thumb_j0' mimics .*fixed"),
-    "23_inside": (0, "3 motors"),
-    "24_minus_one": (0, "15 N at the fingertip"),
-    "25_swapped": (2, "lower limit.*above.*Swap"),
-    "26_grams": (2, "'thumb_0' weighs 30 kg.*grams"),
-    "30_backslash": (0, "4 joints"),
-    "33_degrees_urdf": (2, "90 rad.*degrees"),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", _HELD)
-def test_a_case_of_public_bug_reports_ends_as_it_should(name, tmp_path):
-    """As a user runs it, with processes and pictures."""
-    if not (SHARED / name).is_dir():
-        pytest.skip(f"{SHARED} is not on this machine")
-    shutil.copytree(SHARED / name, tmp_path / "case")
-    command = json.loads((tmp_path / "case" / "case.json").read_text())["command"].partition("&&")[0]
-    cli = [sys.executable, "-m", "congrasp.services.cli.main", *shlex.split(command)[1:]]
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    done = subprocess.run(cli, cwd=tmp_path / "case", env=env, capture_output=True, text=True, check=False)
-    status, pattern = _HELD[name]
-    assert done.returncode == status and re.search(pattern, done.stdout + done.stderr, re.DOTALL), done
 
 
 @pytest.mark.parametrize("name", ["hand_plain", "hand_swapped"])

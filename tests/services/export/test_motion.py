@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.objects.spec import Colours
 from congrasp.common.rotations import continuous
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.cli.main import main
 from congrasp.services.export import frames, motion_formats
 from congrasp.services.export.frames import COLOURS

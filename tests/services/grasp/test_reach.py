@@ -11,10 +11,10 @@ from congrasp.actors.initial import handover_speed
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.objects import procedural
 from congrasp.common.rotations import rotate
 from congrasp.common.task.config import TaskConfig
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.export.motion_file import motion_of_episode
 from congrasp.services.grasp.files import _steps_to_draw
 from congrasp.services.grasp.jobs import find_objects, rest_pose

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from tests.episodes import CONTROL_DT, episode
 

@@ -18,17 +18,19 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import link_origin
-from congrasp.common.wire.codec import decode
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.common.objects.spec import Colours
+from congrasp.common.wire.codec import Message, decode
+from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.record import scene
 from congrasp.services.record.channels import Entry
 from congrasp.services.record.goals import active_blocks, active_constraints
 from congrasp.services.record.palette import JOINT, SKIN
 from congrasp.services.record.palette import MATERIALS as COLOURS
 from congrasp.services.record.recorder import Converter
-from congrasp.services.record.scene import SPACING, surface_parts, surface_points
+from congrasp.services.record.scene import SPACING, check_episode, surface_parts, surface_points
 from congrasp.services.record.writer import LogWriter
 from tests.episodes import CONTROL_DT, FORCE, episode, older
 
@@ -313,3 +315,21 @@ def test_meshes_that_cannot_be_read_leave_the_capsules_surface(monkeypatch: pyte
     hand = dataclasses.replace(get_hand("allegro"), name="torn")
     monkeypatch.setattr(scene, "skin_of", damaged)
     assert all(surface_parts(hand)) and sum(len(points) for points, _ in surface_points(hand)) > 2000
+
+
+def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhere(tmp_path):
+    whole = episode()
+    colours = {"colour_points": np.zeros((2, 3), np.float32), "colour_values": np.zeros((2, 3), np.uint8)}
+    check_episode(Message(whole.arrays | colours, whole.meta))
+    for name in colours:
+        with pytest.raises(CongraspError, match="colour_points without colour_values, or the reverse"):
+            check_episode(Message(whole.arrays | {name: colours[name]}, whole.meta))
+    far = {**colours, "colour_points": np.full((2, 3), 1e3, np.float32)}
+    with pytest.raises(CongraspError, match="colour_points are more than 10 m"):
+        check_episode(Message(whole.arrays | far, whole.meta))
+    with pytest.raises(CongraspError, match="object of a motion"):
+        motion_of_episode(Message(whole.arrays, {**whole.meta, "object": "../evil"}))
+    motion = dataclasses.replace(motion_of_episode(whole), colours=Colours(np.zeros((1, 3)), np.full((1, 3), -5)))
+    save_motion(tmp_path / "motion.npz", motion)
+    with pytest.raises(CongraspError, match="not from 0 to 255"):
+        load_motion(tmp_path / "motion.npz")

@@ -22,9 +22,9 @@ from scipy.spatial.transform import Rotation
 
 import congrasp
 from congrasp.common.hands import get_hand
+from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.objects import procedural
 from congrasp.common.transport.ports import free_port
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
 from congrasp.services.client.policy import Answer
 from tests.waits import eventually
 

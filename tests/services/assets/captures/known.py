@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.mano import MANO_FINGERS
-from congrasp.services.assets.captures.fit import joint_positions
-from congrasp.services.assets.captures.mano import TO_HUMAN
-from congrasp.services.assets.captures.separate import separated
-from congrasp.services.assets.hands.kinematics import mujoco_link_poses
+from congrasp.common.hands.mjcf import mujoco_link_poses
+from congrasp.services.assets.captures.human import TO_HUMAN, joint_positions
+from congrasp.services.assets.captures.references import separated
 
 FRAMES, GRASP = 90, 60
 """Frames of a sequence, and the one in which the fingers have closed."""

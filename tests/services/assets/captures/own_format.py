@@ -6,8 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from congrasp.common.hands.mano import ManoModel
-from congrasp.services.assets.captures.objects import Meshes
-from congrasp.services.assets.captures.sequence import Dropped, Sequence, read_or_drop
+from congrasp.services.assets.captures.sequence import Dropped, Meshes, Sequence, read_or_drop
 
 HOLDS = "*.capture.npz"
 

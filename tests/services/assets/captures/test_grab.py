@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.assets.captures.mano import MEAN_WRIST
+from congrasp.services.assets.captures.human import MEAN_WRIST
 from tests.mano_file import content, mano_pickle, skeleton
 from tests.services.assets.captures import known
 

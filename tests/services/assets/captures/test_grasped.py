@@ -14,8 +14,8 @@ from congrasp.common.hands.human import HUMAN
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.common.objects.procedural import generate, plain_object
 from congrasp.common.objects.spec import Piece
-from congrasp.services.assets.captures.extract import LATER, Surface, _opposed
-from congrasp.services.assets.captures.refuse import DEEPEST, check_reference, depth, width
+from congrasp.services.assets.captures.extract import LATER, Surface, _before_carried, _opposed
+from congrasp.services.assets.captures.references import DEEPEST, check_reference, depth, width
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write
@@ -37,25 +37,28 @@ class Slab:
         return np.sign(points[..., :1]) * [1.0, 0.0, 0.0]
 
 
+def moving(joints, lift, wrist=0.0, present=True):
+    """An object that does not turn, at heights (T,), and a wrist so far above it, with fingers at (T, 5, 4, 3)."""
+    count, up = len(joints), np.array([0.0, 0.0, 1.0])
+    return Sequence(
+        name="lift",
+        object_name="box",
+        mesh=pathlib.Path("box.stl"),
+        wrist_position=np.outer(lift + wrist * np.ones(count), up),
+        wrist_rotation=np.tile(np.eye(3), (count, 1, 1)),
+        joints=joints,
+        object_position=np.outer(lift * np.ones(count), up),
+        object_rotation=np.tile(np.eye(3), (count, 1, 1)),
+        present=np.broadcast_to(present, count),
+    )
+
+
 def opposed(thumb, index, lift=0.0, present=True, surface=None):
     """Frame found for skins of thumb and index so far (T,) from a slab, m, which rises by `lift` (T,)."""
-    ones = np.ones(FRAMES)
     joints = np.full((FRAMES, 5, 4, 3), 0.3)  # other fingers stay away
-    joints[:, 0, :, 0] = (0.02 + THUMB + thumb * ones)[:, None]
-    joints[:, 1, :, 0] = -(0.02 + INDEX + index * ones)[:, None]
-    up = np.outer(lift * ones, [0.0, 0.0, 1.0])
-    sequence = Sequence(
-        name="pinch",
-        object_name="slab",
-        mesh=pathlib.Path("slab.stl"),
-        wrist_position=up,
-        wrist_rotation=np.tile(np.eye(3), (FRAMES, 1, 1)),
-        joints=joints,
-        object_position=up,
-        object_rotation=np.tile(np.eye(3), (FRAMES, 1, 1)),
-        present=np.broadcast_to(present, FRAMES),
-    )
-    return _opposed(sequence, surface or Slab(), joints, FIRST)
+    joints[:, 0, :, 0] = (0.02 + THUMB + thumb * np.ones(FRAMES))[:, None]
+    joints[:, 1, :, 0] = -(0.02 + INDEX + index * np.ones(FRAMES))[:, None]
+    return _opposed(moving(joints, lift, present=present), surface or Slab(), joints, FIRST)
 
 
 AT = np.arange(FRAMES)
@@ -81,6 +84,35 @@ def test_fingers_on_one_side_do_not_oppose():
     side = Slab()
     side.normals = lambda points: np.tile([0, 1.0, 0], (*points.shape[:-1], 1))
     assert opposed(CLOSING, 0.0, surface=side) == FIRST
+
+
+# For 11 frames the wrist comes down by 2 cm a frame; then the object rises by 6 mm a frame, 6 cm at frame 20.
+WRIST = np.concatenate([np.arange(0.30, 0.095, -0.02), np.full(10, 0.10)])
+LIFT = np.concatenate([np.zeros(11), 0.006 * np.arange(1, 11)])
+
+
+def picked(wrist, lift, present=True):
+    """Frame found for a grasp that is noticed at frame 20."""
+    motion = moving(np.zeros((21, 5, 4, 3)), lift, wrist, present)
+    return _before_carried(motion, np.outer(wrist, [0.0, 0.0, 1.0]), 20)
+
+
+def test_a_grasp_that_is_noticed_late_belongs_to_where_the_object_was_picked_up():
+    assert picked(WRIST, LIFT) == 11  # the last frame within a centimetre of the place
+    # Missing frames do not count: at frame 9 the wrist is 2 cm from where it will be.
+    assert picked(WRIST, LIFT, ~np.isin(np.arange(21), (10, 11))) == 9
+
+
+@pytest.mark.parametrize(
+    ("wrist", "lift"),
+    [
+        (WRIST, 0.45 * LIFT),  # 2.7 cm: nudged
+        (WRIST, 0 * LIFT),
+        (np.linspace(0.30, 0.10, 21), LIFT),  # another hand lifts it while this one comes
+    ],
+)
+def test_an_object_that_this_hand_does_not_carry_leaves_the_frame_as_it_is(wrist, lift):
+    assert picked(wrist, lift) == 20
 
 
 @pytest.fixture

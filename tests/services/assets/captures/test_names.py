@@ -9,8 +9,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.services.assets.captures import build
 from congrasp.services.assets.captures.dexycb import _betas, _yaml
 from congrasp.services.assets.captures.grab import _template
-from congrasp.services.assets.captures.objects import Meshes
-from congrasp.services.assets.captures.sequence import Dropped
+from congrasp.services.assets.captures.sequence import Dropped, Meshes
 
 
 def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folders(tmp_path):
@@ -18,7 +17,7 @@ def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folder
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "y.obj").write_text("v 0 0 0\n")
     meshes = Meshes((tmp_path / "in",))
-    assert meshes.has("y")
+    assert meshes.find("a", "none", "y") == tmp_path / "in" / "y.obj"
     for name in ("../x", str(tmp_path / "x"), ".."):
         with pytest.raises(CongraspError, match="cannot name the mesh"):
             meshes.find("a", name)
@@ -29,12 +28,15 @@ def test_names_of_objects_calibrations_and_templates_stay_inside_of_their_folder
     assert _template(tmp_path / "in", outside) is None
 
 
-def test_objects_of_one_name_and_different_meshes_get_different_names(monkeypatch):
-    named = {}
-    monkeypatch.setattr(build, "import_meshes", lambda names, progress: named.update(names) or {})
-    files = [pathlib.Path(folder, "cup.obj") for folder in "aba"]
+def test_objects_of_one_name_and_different_meshes_get_different_names(tmp_path, monkeypatch):
+    named = []
+    monkeypatch.setattr(build, "import_sources", lambda sources, options: named.extend(sources) or [])
+    files = [tmp_path / folder / "cup.obj" for folder in "aba"]
+    for file in files[:2]:
+        file.parent.mkdir()
+        file.write_text("v 0 0 0\n")
     build._shapes([types.SimpleNamespace(mesh=file, object_name="cup") for file in files], print)
-    assert named == {files[0]: "cup", files[1]: "cup-2"}
+    assert [(source.path, source.name) for source in named] == [(files[0], "cup"), (files[1], "cup-2")]
 
 
 @pytest.mark.parametrize("text", ["[" * 50_000, "a: " * 5, "\x00", "- a", "a: &x [1]\nb: [*x, *x]"])

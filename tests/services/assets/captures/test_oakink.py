@@ -1,12 +1,8 @@
 """OakInk-Image's annotations, with tensors as PyTorch pickles them: a known answer, affordance, and what is wrong."""
 
-import collections
-import io
 import json
 import pickle
 import struct
-import sys
-import types
 
 import numpy as np
 import pytest
@@ -15,69 +11,34 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.captures.oakink import read
-from congrasp.services.assets.captures.objects import Meshes
+from congrasp.services.assets.captures.sequence import Meshes
+from tests.mano_file import Global, Reduced, dumps
 from tests.services.assets.captures import known
 
 STAMP = "2021-09-26-19-59-58"
 
 
-def _load_from_bytes(data):
-    raise AssertionError("a file was unpickled")
+def tensor(values):
+    """PyTorch's pickle of a tensor of 32-bit floats: pickles of facts about the storage, and its numbers."""
+    values = np.ascontiguousarray(values, np.float32)
+    machine = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"short": 2, "int": 4, "long": 4}}
+    facts = [pickle.dumps(fact, 2) for fact in (0x1950A86A20F9469CFC6C, 1001, machine, values.size, ["94"])]
+    reference = b"\x80\x02(" + b"".join(
+        dumps(word)[2:-1] for word in ("storage", Global("torch FloatStorage"), "94", "cpu")
+    )
+    facts[3] = reference + facts[3][2:-1] + b"NtQ."
+    stored = b"".join(facts) + struct.pack("<q", values.size) + values.tobytes()
+    storage = Reduced("torch.storage _load_from_bytes", (Reduced("_codecs encode", (stored, "latin1")),))
+    strides = tuple(stride // 4 for stride in values.strides)
+    ordered = Reduced("collections OrderedDict")
+    return Reduced("torch._utils _rebuild_tensor_v2", (storage, 0, values.shape, strides, False, ordered))
 
 
-def _rebuild_tensor_v2(*arguments):
-    raise AssertionError("a file was unpickled")
-
-
-class FloatStorage:
-    """PyTorch's name for 32-bit floats in a row; pickled by reference, as PyTorch does, before its numbers."""
-
-    def __init__(self, values):
-        self.values = values
-
-    def __reduce__(self):
-        class Referring(pickle.Pickler):
-            def persistent_id(self, thing):
-                if isinstance(thing, FloatStorage):
-                    return ("storage", FloatStorage, "94", "cpu", thing.values.size, None)
-                return None
-
-        machine = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"short": 2, "int": 4, "long": 4}}
-        stream = io.BytesIO()
-        for part in (0x1950A86A20F9469CFC6C, 1001, machine):
-            pickle.dump(part, stream, 2)
-        Referring(stream, 2).dump(self)
-        pickle.dump(["94"], stream, 2)
-        stream.write(struct.pack("<q", self.values.size) + self.values.tobytes())
-        return _load_from_bytes, (stream.getvalue(),)
-
-
-class Tensor:
-    """What PyTorch's tensors are pickled as."""
-
-    def __init__(self, values):
-        self.values = np.ascontiguousarray(values, np.float32)
-
-    def __reduce__(self):
-        strides = tuple(stride // 4 for stride in self.values.strides)
-        storage = FloatStorage(self.values.ravel())
-        return _rebuild_tensor_v2, (storage, 0, self.values.shape, strides, False, collections.OrderedDict())
-
-
-def dumps(value):
-    """`pickle.dumps` where PyTorch were installed, under whose names the tensors are written."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, members in {
-            "torch": (FloatStorage,),
-            "torch._utils": (_rebuild_tensor_v2,),
-            "torch.storage": (_load_from_bytes,),
-        }.items():
-            module = types.ModuleType(name)
-            for member in members:
-                patch.setattr(member, "__module__", name)
-                setattr(module, member.__name__, member)
-            patch.setitem(sys.modules, name, module)
-        return pickle.dumps(value)
+def pickled(info):
+    """Annotations as OakInk has them, whose arrays are tensors."""
+    if isinstance(info, dict):
+        return {name: pickled(value) for name, value in info.items()}
+    return tensor(info) if isinstance(info, np.ndarray) else info
 
 
 def write(case, root, *, cameras=(3, 1), every=1, change=lambda frame, info: info):
@@ -94,17 +55,15 @@ def write(case, root, *, cameras=(3, 1), every=1, change=lambda frame, info: inf
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = case.object_rotation[frame].as_matrix(), middle[frame]
         hand = {
-            "hand_pose": Tensor(turns.as_quat(scalar_first=True).reshape(64)),
-            "hand_shape": Tensor(np.zeros(10)),
-            "hand_tsl": Tensor(case.wrist_position[frame]),
+            "hand_pose": turns.as_quat(scalar_first=True).reshape(64),
+            "hand_shape": np.zeros(10),
+            "hand_tsl": case.wrist_position[frame],
         }
-        info = change(
-            frame, {"hand_anno": hand, "obj_anno": Tensor(pose), "cam_extr": Tensor(np.eye(4)), "cam_intr": np.eye(3)}
-        )
+        info = change(frame, {"hand_anno": hand, "obj_anno": pose, "cam_extr": np.eye(4), "cam_intr": np.eye(3)})
         for camera in cameras:
             rows.append([f"{case.name}/{STAMP}", 0, frame, camera])
             if info is not None:
-                (folder / f"{case.name}__{STAMP}__0__{frame}__{camera}.pkl").write_bytes(dumps(info))
+                (folder / f"{case.name}__{STAMP}__0__{frame}__{camera}.pkl").write_bytes(dumps(pickled(info)))
     index.write_text(json.dumps(rows))
     known.write_mesh(case, root / "obj" / f"{case.object_name}.obj")
 
@@ -170,7 +129,7 @@ def test_what_is_wrong_with_annotations_is_said(run_import, tmp_path):
         return change
 
     def millimetres(frame, info):
-        info["obj_anno"] = Tensor(info["obj_anno"].values * np.array([[1, 1, 1, 1000]] * 3 + [[1] * 4]))
+        info["obj_anno"] = info["obj_anno"] * np.array([[1, 1, 1, 1000]] * 3 + [[1] * 4])
         return info
 
     variant("0001", lambda frame, info: None if frame in (20, 21, 22) else info)
@@ -197,12 +156,9 @@ def test_what_is_wrong_with_annotations_is_said(run_import, tmp_path):
 
 
 def test_a_file_that_would_run_something_is_not_unpickled(run_import, tmp_path):
-    class Hostile:
-        def __reduce__(self):
-            return (tmp_path / "it ran").mkdir, ()
-
+    hostile = Reduced("os mkdir", (str(tmp_path / "it ran"),))
     case = known.make("A01001_0001_0000", "A01001", 12)
-    write(case, tmp_path, cameras=(0,), change=lambda frame, info: info | {"obj_anno": Hostile()})
+    write(case, tmp_path, cameras=(0,), change=lambda frame, info: info | {"obj_anno": hostile})
     _, report = run_import("oakink", tmp_path, code=2)
     assert report.dropped[0]["rule"] == "unreadable"
     assert "is not part of an array" in report.dropped[0]["reason"]

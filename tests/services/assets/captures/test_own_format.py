@@ -5,7 +5,7 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.captures import IMPORTERS
-from congrasp.services.assets.captures.fit import joint_positions
+from congrasp.services.assets.captures.human import joint_positions
 from congrasp.services.cli.main import load
 from tests.services.assets.captures import known
 

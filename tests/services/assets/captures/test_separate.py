@@ -12,7 +12,7 @@ from congrasp.common.hands.kinematics import link_transforms
 from congrasp.common.hands.motors import coupled
 from congrasp.common.hands.spec import Capsule, Coupling, Hand, Joint, Link
 from congrasp.common.task.plausibility import hand_hand
-from congrasp.services.assets.captures.separate import DEEPEST, deepest, separated
+from congrasp.services.assets.captures.references import OVERLAP, deepest, separated
 
 ASIDE, LONG, RADIUS = 0.02, 0.05, 0.005
 
@@ -35,7 +35,7 @@ def test_two_fingers_part_evenly():
     hand, q = two_fingers(), np.array([[-0.38, 0.38]], np.float32)
     overlap = 2 * RADIUS - 2 * (ASIDE - LONG * np.sin(0.38))
     np.testing.assert_allclose(deepest(hand, q), overlap, atol=1e-6)
-    angle = np.arcsin((ASIDE - RADIUS + DEEPEST / 2) / LONG)
+    angle = np.arcsin((ASIDE - RADIUS + OVERLAP / 2) / LONG)
     np.testing.assert_allclose(separated(hand, q), [[-angle, angle]], atol=2e-4)
 
 
@@ -49,14 +49,14 @@ def test_where_one_may_not_go_the_other_does():
     hand = dataclasses.replace(hand, open_pose={"a": -0.38}, closed_pose={"a": -0.38})
     found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
     assert found[0, 0] == np.float32(-0.38) and found[0, 1] < 0.3
-    np.testing.assert_allclose(deepest(hand, found), DEEPEST, atol=2e-5)
+    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
 
 
 def test_followers_still_follow():
     hand = two_fingers(couplings=(Coupling("b", "a", -1.0),))
     found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
     np.testing.assert_allclose(found, coupled(hand, found), atol=1e-6)
-    np.testing.assert_allclose(deepest(hand, found), DEEPEST, atol=2e-5)
+    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", ["human", "sharpa"])
@@ -67,9 +67,9 @@ def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
     q = hand.q_open + share * (hand.q_closed - hand.q_open) + rng.normal(0, 0.25, (12, len(hand.joints)))
     q = np.clip(q, hand.lower, hand.upper).astype(np.float32)
     before, found = np.asarray(deepest(hand, q)), separated(hand, q)
-    deep = before > DEEPEST
+    deep = before > OVERLAP
     assert deep.any() and not deep.all()
     np.testing.assert_array_equal(found[~deep], q[~deep])
     assert np.all(found >= hand.lower) and np.all(found <= hand.upper)
-    np.testing.assert_array_less(hand_hand(hand, link_transforms(hand, jnp.asarray(found))), DEEPEST + 5e-5)
+    np.testing.assert_array_less(hand_hand(hand, link_transforms(hand, jnp.asarray(found))), OVERLAP + 5e-5)
     np.testing.assert_allclose(separated(hand, found), found, atol=1e-3)

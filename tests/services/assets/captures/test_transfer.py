@@ -11,7 +11,7 @@ from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transf
 from congrasp.common.task.sampling.build import HEADINGS
 from congrasp.common.task.sampling.sets import bank_of
 from congrasp.common.task.sampling.write_sets import describe
-from congrasp.services.assets.captures.fit import joint_positions
+from congrasp.services.assets.captures.human import joint_positions
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write
 

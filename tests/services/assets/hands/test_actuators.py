@@ -1,43 +1,14 @@
 """Tendons through space, whose levers are known where they run around a pulley."""
 
+import pathlib
+
 import mujoco
 import numpy as np
 import pytest
 
 from congrasp.services.assets.hands.actuators import Drive, servos
 
-_FINGER = """
-<mujoco>
-  <compiler angle="radian" autolimits="true"/>
-  <worldbody>
-    <body name="palm">
-      <geom type="box" size=".02 .02 .02"/>
-      <site name="low" pos=".012 0 0"/><site name="back" pos="-.012 0 0"/>
-      <body name="near" pos="0 0 .05">
-        <joint name="root" axis="0 1 0" range="-.4 .4"/>
-        <geom name="pulley" type="cylinder" size=".01 .01" euler="1.5707963 0 0" contype="0" conaffinity="0"/>
-        <geom type="capsule" size=".005" fromto="0 0 0 0 0 .04"/>
-        <site name="front of near" pos=".012 0 .03"/><site name="back of near" pos="-.012 0 .03"/>
-        <site name="side" pos=".01 0 0"/><site name="side of back" pos="-.01 0 0"/>
-        <body name="far" pos="0 0 .06">
-          <joint name="end" axis="0 1 0" range="0 .8"/>
-          <geom type="capsule" size=".005" fromto="0 0 0 0 0 .03"/>
-          <site name="tip" pos=".006 0 .02"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <tendon>
-    <spatial name="flexor"><site site="low"/><geom geom="pulley" sidesite="side"/><site site="front of near"/>
-      <site site="tip"/></spatial>
-    <spatial name="extensor"><site site="back"/><geom geom="pulley" sidesite="side of back"/>
-      <site site="back of near"/></spatial>
-  </tendon>
-  <actuator>
-    <position name="pull" tendon="flexor" kp="20000" forcerange="-50 50" ctrlrange="0 .2"/>
-    {}
-  </actuator>
-</mujoco>"""
+_FINGER = (pathlib.Path(__file__).parents[3] / "hands" / "tendons.xml").read_text()
 
 
 def _drive(actuators: str) -> Drive:

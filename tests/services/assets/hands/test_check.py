@@ -11,7 +11,7 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import faults, hand_text
-from congrasp.services.assets.hands import check, servos
+from congrasp.services.assets.hands import check, trials
 from congrasp.services.assets.hands.check import check_hand
 from congrasp.services.assets.hands.model_files import propose
 from congrasp.services.cli import main
@@ -94,11 +94,11 @@ def test_a_palm_that_is_far_from_the_grasp_frame_is_found():
 
 def test_gains_that_shake_are_found_and_named():
     loose = with_joints(CLAW, lambda j: dataclasses.replace(j, kp=20 * j.kp, kv=0.0, damping=0.0), only="left_middle")
-    found = check._servos(loose, servos.responses(loose, recipe(loose).task, 2))
+    found = check._servos(loose, trials.responses(loose, recipe(loose).task, 2))
     assert [finding.verdict for finding in found] == ["failed"] and "'left_middle'" in found[0].measured
     assert "raise kv" in found[0].remedy
     soft = with_joints(CLAW, lambda j: dataclasses.replace(j, kp=0.05, kv=1.0))
-    found = check._servos(soft, servos.responses(soft, recipe(soft).task, 2))
+    found = check._servos(soft, trials.responses(soft, recipe(soft).task, 2))
     assert len(found) == 6 and all("raise kp" in finding.remedy for finding in found)
 
 

@@ -1,23 +1,15 @@
 """Hands of one's own: from URDF and MJCF to a file, and from the file to everywhere."""
 
-import json
 import pathlib
 
 import numpy as np
 import pytest
 
-from congrasp.common.config import run_config_from_json, to_json
-from congrasp.common.errors import CongraspError
 from congrasp.common.hands import VARIABLE, get_hand
-from congrasp.common.hands.files import hand_from_text, hand_text, read_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.mjcf import add_hand
-from congrasp.common.policy.bundle import policy_spec
-from congrasp.common.task.config import TaskConfig
 from congrasp.services.assets.hands.model_files import Choices, describe, propose
 from congrasp.services.cli import main
-from congrasp.services.train.presets import get_preset, with_hand
-from congrasp.services.viz.hand_sheets import hands_sheet, joints_sheet
 
 HANDS = pathlib.Path(__file__).parents[3] / "hands"
 ENDS = {"left_root": -0.96, "left_middle": -1.28, "opposing_root": 0.96, "opposing_middle": 1.28}
@@ -107,58 +99,6 @@ def test_a_dexterous_hand_comes_back_from_mjcf(name, tmp_path):
     assert found.object_scale == pytest.approx(original.object_scale, abs=0.15)
 
 
-def test_a_hand_file_is_a_hand_by_path_by_name_and_by_its_text(claw, tmp_path):
-    path = tmp_path / "own" / "claw.json"
-    path.parent.mkdir()
-    path.write_text(hand_text(claw.hand))
-    assert get_hand(str(path)) is get_hand("claw") is get_hand(claw.hand.reference) is claw.hand
-    config = with_hand(get_preset("quickstart"), "claw")
-    path.unlink()  # actors elsewhere do not have the file
-    travelled = run_config_from_json(to_json(config))
-    assert get_hand(travelled.task.hand) is claw.hand
-    spec = policy_spec(travelled.task, travelled.network)
-    assert spec.hand_name == "claw" and spec.action_size == 12
-    assert spec.schema != policy_spec(TaskConfig(), travelled.network).schema
-
-
-def test_a_hand_file_from_before_links_had_solids_stays_as_it_is():
-    """Its text names the hand in policies, and says whether a training that was interrupted was of this hand."""
-    path = HANDS / "claw.json"
-    assert hand_text(read_hand(path)) == path.read_text()
-
-
-def test_wrong_hand_files_are_one_line(claw, tmp_path):
-    path = tmp_path / "bad.json"
-    fields = json.loads(hand_text(claw.hand))
-
-    def refused(word, **changes):
-        path.write_text(json.dumps({**fields, **changes}))
-        with pytest.raises(CongraspError, match=word) as raised:
-            read_hand(path)
-        assert str(path) in str(raised.value) and "\n" not in str(raised.value)
-
-    links = fields["links"]
-    refused("format 2", format=2)
-    refused("the thumb must be a link with a tip", thumb="palm")
-    refused("first link must be the palm", links=links[1:])
-    refused("parent 'palm' of|must precede", links=[links[0], links[2], links[1], *links[3:]])
-    refused("more than once", links=[*links, links[-1]])
-    refused("is not a joint", open_pose={"elbow": 1.0})
-    refused("outside its limits in the closed pose", closed_pose={"left_root": 3.0})
-    refused("not a hand", links=3)
-    refused("'wings'|wings", wings=2)
-    refused("mass above zero", links=[{**links[0], "mass": 0.0}, *links[1:]])
-    joint = {**links[1]["joints"][0], "axis": [0.0, 2.0, 0.0]}
-    refused("not a unit vector", links=[links[0], {**links[1], "joints": [joint]}, *links[2:]])
-    path.write_text("not json")
-    with pytest.raises(CongraspError, match="is not JSON"):
-        read_hand(path)
-    with pytest.raises(CongraspError, match="cannot be read"):
-        get_hand(str(tmp_path / "none.json"))
-    with pytest.raises(CongraspError, match="the hand file has the format None"):
-        hand_from_text("{}")
-
-
 def test_the_commands_import_list_and_draw(tmp_path, capsys):
     assert main.run(["hands", "import", str(HANDS / "claw.urdf"), "--name", "gripper"]) == 0
     said = capsys.readouterr().out
@@ -167,14 +107,3 @@ def test_the_commands_import_list_and_draw(tmp_path, capsys):
     assert main.run(["hands", "list"]) == 0
     said = capsys.readouterr().out
     assert all(name in said for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO"))
-    with pytest.raises(CongraspError, match="'allegro' is a hand of congrasp"):
-        main.run(["hands", "import", str(HANDS / "claw.urdf"), "--name", "allegro"])
-    with pytest.raises(CongraspError, match=r"does not end in \.json"):
-        main.run(["hands", "import", str(HANDS / "claw.urdf"), "--out", "a.txt"])
-
-
-def test_sheets_show_every_hand_and_every_joint(claw):
-    image = hands_sheet([claw.hand], size=(40, 40))
-    rows = joints_sheet(claw.hand, size=(40, 40))
-    assert image.shape[1] > 3 * 40 and rows.shape[0] > 2 * 40 and rows.shape[1] > 8 * 40
-    assert len(np.unique(rows.reshape(-1, 3), axis=0)) > 100

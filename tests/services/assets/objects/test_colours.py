@@ -12,13 +12,10 @@ from congrasp.actors.episode import _geometry
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import COLOUR_POINTS, Colours
-from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.meshes import import_source
+from congrasp.services.assets.objects.named import find_sources
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.sources import find_sources
-from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
-from congrasp.services.record.scene import check_episode
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.scene import Camera
 from congrasp.services.viz.views import _object
@@ -131,21 +128,3 @@ def test_an_object_file_with_half_of_its_colours_is_refused(tmp_path, quick_impo
     )
     with pytest.raises(CongraspError, match="colour_values has the shape"):
         store.load(tmp_path / "bad.safetensors")
-
-
-def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhere(tmp_path):
-    whole = episode()
-    colours = {"colour_points": np.zeros((2, 3), np.float32), "colour_values": np.zeros((2, 3), np.uint8)}
-    check_episode(Message(whole.arrays | colours, whole.meta))
-    for name in colours:
-        with pytest.raises(CongraspError, match="colour_points without colour_values, or the reverse"):
-            check_episode(Message(whole.arrays | {name: colours[name]}, whole.meta))
-    far = {**colours, "colour_points": np.full((2, 3), 1e3, np.float32)}
-    with pytest.raises(CongraspError, match="colour_points are more than 10 m"):
-        check_episode(Message(whole.arrays | far, whole.meta))
-    with pytest.raises(CongraspError, match="object of a motion"):
-        motion_of_episode(Message(whole.arrays, {**whole.meta, "object": "../evil"}))
-    motion = dataclasses.replace(motion_of_episode(whole), colours=Colours(np.zeros((1, 3)), np.full((1, 3), -5)))
-    save_motion(tmp_path / "motion.npz", motion)
-    with pytest.raises(CongraspError, match="not from 0 to 255"):
-        load_motion(tmp_path / "motion.npz")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.services.assets.objects.fidelity import Fidelity, fidelity
+from congrasp.services.assets.objects.fidelity import fidelity
 
 SIDES = np.array([0.04, 0.06, 0.08])
 
@@ -81,9 +81,3 @@ def test_an_open_mesh_has_no_volume_to_compare_with():
     # One side is missing in the mesh: its middle is half of its shorter edge away.
     assert 0.015 < errors.surface < 0.035
     assert "the mesh is open" in str(errors)
-
-
-def test_errors_as_a_phrase():
-    assert str(Fidelity(-0.021, 0.00234)) == (
-        "their surface is at most 2.3 mm off the mesh's, and their volume 2.1% too small"
-    )

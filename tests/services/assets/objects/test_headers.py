@@ -1,15 +1,11 @@
-"""Mesh files that announce more than they hold, and valid ones with whatever noise in them."""
+"""Mesh files that announce more than they hold."""
 
 import json
 import struct
 
-import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects.mesh_files import read_mesh
 from tests.limits import limited
 
@@ -70,25 +66,3 @@ def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path
 def test_a_scene_that_shows_a_mesh_often_is_read_in_bounded_memory(tmp_path):
     (tmp_path / "a.glb").write_bytes(_glb(_many))
     assert "Trimesh" in limited(read_mesh, tmp_path / "a.glb")
-
-
-_VALID = {kind: trimesh.creation.icosphere(1).export(file_type=kind) for kind in ("stl", "obj", "ply")} | {
-    "glb": _glb()
-}
-_VALID = {kind: data.encode() if isinstance(data, str) else data for kind, data in _VALID.items()}
-
-
-@pytest.mark.parametrize("kind", _VALID)
-def test_a_mesh_with_noise_in_it_is_read_or_refused(tmp_path, kind):
-    path, data = tmp_path / f"a.{kind}", _VALID[kind]
-
-    @settings(max_examples=60, deadline=4000, database=None)
-    @given(st.integers(0, len(data)), st.binary(max_size=6), st.integers(0, len(data)))
-    def mutated(at, noise, end):
-        path.write_bytes((data[:at] + noise + data[at + len(noise) :])[: max(end, at) if end % 3 == 0 else None])
-        try:
-            assert np.isfinite(read_mesh(path).vertices).all()
-        except CongraspError as error:
-            assert str(path) in str(error) and "\n" not in str(error)
-
-    assert limited(mutated, seconds=30) == "None"

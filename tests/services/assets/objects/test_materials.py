@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
-from congrasp.services.assets.objects.materials import MATERIALS, guessed_mass, materials_of, weigh
+from congrasp.services.assets.objects.materials import guessed_mass, materials_of, weigh
 from congrasp.services.assets.objects.named import ObjectAt, objects_of
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.grasp.jobs import _load
@@ -81,22 +80,6 @@ def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer, quick_import):
     np.testing.assert_allclose(given.inertia / 0.5, obj.inertia / obj.mass)
 
 
-@pytest.mark.parametrize(
-    ("material", "words"),
-    [
-        ("adamantium", "--material is 'adamantium'. Materials: aluminium, "),
-        ("wood,shaft=steel", "names the part 'shaft'. The parts are: handle, head."),
-        ("head=steel", "leaves out the part 'handle'. Add handle=NAME."),
-    ],
-)
-def test_what_is_wrong_with_a_material_is_said_in_one_line(hammer, quick_import, material, words):
-    with pytest.raises(CongraspError) as error:
-        imported(hammer, material=material)
-    assert words in str(error.value) and "\n" not in str(error.value)
-    with pytest.raises(CongraspError, match="--material and --density"):
-        imported(hammer, material="wood", density=3.0)
-
-
 def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_mass():
     assert guessed_mass(1e-6, 6e-4) == pytest.approx(0.0024)  # a centimetre's cube, at 2,400 kg/m^3
     assert guessed_mass(2e-4, 0.02) == pytest.approx(0.1)  # 500 kg/m^3
@@ -112,10 +95,3 @@ def test_options_weigh_objects_of_the_generator_too():
     steel, wood = (_load(at, ImportOptions(material=name)).mass for name in ("body=wood,handle=steel", "wood"))
     assert steel > 1.2 * wood
     assert _load(at, ImportOptions()).mass == before.mass
-
-
-@pytest.mark.parametrize("name", MATERIALS)
-def test_materials_have_a_density_with_a_source(name):
-    material = MATERIALS[name]
-    assert 200 < material.density < 9000 and len(material.source) > 10
-    assert 5e-4 < material.wall < material.thickest

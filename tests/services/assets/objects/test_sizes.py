@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.assets.objects.sizes import METRES, guessed_unit, metres_per_unit, sizes_by_unit
+from congrasp.services.assets.objects.options import METRES, guessed_unit, metres_per_unit, sizes_by_unit
 from congrasp.services.studio.app import MeshImporter
 
 

@@ -1,0 +1,226 @@
+"""References of a hand from demonstrations: those that it cannot take are refused, and overlapping fingers separated.
+
+A human's finger angles and wrist do not apply to a robot hand. Its hand centre is placed at the human one, with the
+grasp axes v and w (`common.hands.kinematics.grasp_frame`) along the human ones; the fingers then close around the
+object. Lengths scale with the object, which is scaled for the hand. Captured hands have other bones and flesh than the
+`human` hand that follows them, so that their angles make its fingers overlap, in poses that no hand can hold.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from congrasp.common.hands.closure import widest_gap
+from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
+from congrasp.common.hands.motors import transmission
+from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.shapes import hull_of, tessellate
+from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp.common.rotations import continuous
+from congrasp.common.task.plausibility import overlaps
+from congrasp.common.task.sampling.closed_poses import closed_poses
+from congrasp.common.task.sampling.headings import Headings
+from congrasp.common.task.types import Array
+from congrasp.services.assets.captures.extract import Demonstration
+from congrasp.services.assets.captures.human import joint_positions
+from congrasp.services.assets.captures.sequence import Dropped
+
+DEEPEST = 0.01
+"""Tolerated depth of skin in the object, similar to the error of captured hands, m."""
+OVERLAP = 0.001
+"""Tolerated overlap of two links, as skin and flesh give way, m."""
+_ITERATIONS = 100
+_ALONG = np.linspace(0.0, 1.0, 5)[:, None]
+_AT_ONCE = 20
+"""Number of poses closed in one compiled call."""
+
+
+def check_reference(hand: Hand, demonstration: Demonstration, obj: GraspObject, scale: float) -> None:
+    """Raises Dropped for a reference that the hand cannot take.
+
+    Args:
+      hand: hand of the reference; for a hand other than the human one, which closes around the object by itself, only
+        the width is checked.
+      demonstration: demonstration of the human hand.
+      obj: the unscaled object.
+      scale: factor on the object's lengths for the hand.
+    """
+    wide, opening = scale * width(demonstration), widest_gap(hand)
+    if wide > opening:
+        reason = f"thumb and fingers touch it {100 * wide:.1f} cm apart, but the hand opens only {100 * opening:.1f} cm"
+        raise Dropped(demonstration.name, "too wide", reason)
+    deep = depth(demonstration, obj) if hand is HUMAN else 0.0
+    if deep > DEEPEST:
+        reason = f"the hand is {1000 * deep:.0f} mm deep in the object ({1000 * DEEPEST:.0f} mm at most)"
+        raise Dropped(demonstration.name, "too deep", reason)
+
+
+def width(demonstration: Demonstration) -> float:
+    """Extent of the touched points along the cross-finger axis, m."""
+    turn = Rotation.from_quat(demonstration.quaternion[-1], scalar_first=True)
+    along = demonstration.contact @ turn.apply(grasp_frame(HUMAN).cross)
+    return float(np.ptp(along)) if len(along) else 0.0
+
+
+def depth(demonstration: Demonstration, obj: GraspObject) -> float:
+    """Depth in m of the human hand's skin in a piece of the object; negative without contact.
+
+    It is exact if a finger's axis is in the piece, and an upper bound beyond its edges.
+    """
+    ends = np.asarray(_capsules(HUMAN, demonstration.q.astype(np.float32)), float)
+    axes = (1 - _ALONG) * ends[:, :1] + _ALONG * ends[:, 1:]
+    turn = Rotation.from_quat(demonstration.quaternion[-1], scalar_first=True)
+    points = turn.apply(axes.reshape(-1, 3)) + demonstration.position[-1]
+    outside = np.min([_above_faces(piece, points) for piece in obj.pieces], axis=0)
+    return float((np.repeat(HUMAN.capsule_radii, len(_ALONG)) - outside).max())
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _capsules(hand: Hand, q: Array) -> Array:
+    """Ends (C, 2, 3) of a hand's capsules at finger angles (F,), compiled as one program."""
+    return capsules(hand, link_transforms(hand, q))
+
+
+def _above_faces(piece: Piece, points: np.ndarray) -> np.ndarray:
+    """Greatest height (N,) of points (N, 3) above the planes of a piece's faces, m; negative inside."""
+    vertices, _ = tessellate(piece)
+    planes = hull_of(vertices).equations
+    return np.asarray((points @ planes[:, :3].T + planes[:, 3]).max(-1))
+
+
+def demonstrated_headings(demonstrations: Sequence[Demonstration], scale: float) -> Headings:
+    """Hand centres (M, 3) m, heading axes and cross-finger axes (M, 3) of the captured grasps, object frame.
+
+    Args:
+      demonstrations: M demonstrations on one object.
+      scale: factor on the object's lengths.
+    """
+    frame = grasp_frame(HUMAN)
+    turns = Rotation.from_quat([d.quaternion[-1] for d in demonstrations], scalar_first=True)
+    center = turns.apply(_centers(demonstrations)) + [d.position[-1] for d in demonstrations]
+    rows = scale * center, turns.apply(frame.heading), turns.apply(frame.cross)
+    return Headings(*(row.astype(np.float32) for row in rows))
+
+
+def transferred(
+    hand: Hand, demonstrations: Sequence[Demonstration], obj: GraspObject, scale: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Reference poses and wrist trajectories of another hand that follow M demonstrations on one object.
+
+    Args:
+      hand: any hand.
+      demonstrations: demonstrations on one object.
+      obj: object scaled for the hand.
+      scale: factor of this scaling.
+
+    Returns:
+      Finger angles (M, F) that close the hand at the last waypoint, and waypoints (M, K, 3) m and (M, K, 4) of its
+      wrist in the object frame.
+    """
+    headings = demonstrated_headings(demonstrations, scale)
+    surface = obj.points.astype(np.float32), obj.normals.astype(np.float32)
+    rows = np.resize(np.arange(len(demonstrations)), (-(-len(demonstrations) // _AT_ONCE), _AT_ONCE))
+    parts = [closed_poses(hand, *surface, *(field[some] for field in headings)) for some in rows]
+    q, end = (np.concatenate([np.asarray(part[i]) for part in parts])[: len(demonstrations)] for i in (0, 1))
+    onto = _onto_human(hand)
+    positions, quaternions = [], []
+    for demonstration, center, last in zip(demonstrations, _centers(demonstrations), end, strict=True):
+        human = Rotation.from_quat(demonstration.quaternion, scalar_first=True)
+        turn = human * onto
+        path = scale * (human.apply(center) + demonstration.position)
+        # The hand centre of the closed hand in the wrist frame follows from the last pose.
+        positions.append(path - turn.apply(turn[-1].inv().apply(path[-1] - last)))
+        quaternions.append(continuous(turn.as_quat(scalar_first=True)))
+    return q, np.array(positions), np.array(quaternions)
+
+
+def followed(hand: Hand, position: np.ndarray, rotation: Rotation) -> tuple[np.ndarray, Rotation]:
+    """Path of the wrist of a hand whose open grasp moves like that of a human hand, for captures without fingers.
+
+    Args:
+      hand: any hand.
+      position: (T, 3) positions of the human wrist, m.
+      rotation: T orientations of its frame, that of the `human` hand.
+    """
+    turn = rotation * _onto_human(hand)
+    return position + rotation.apply(grasp_frame(HUMAN).center) - turn.apply(grasp_frame(hand).center), turn
+
+
+def _centers(demonstrations: Sequence[Demonstration]) -> np.ndarray:
+    """Centres (M, 3) of the human hand in its wrist frame, m: between the thumb's tip and the mean of the others."""
+    tips = joint_positions(np.stack([d.q for d in demonstrations]))[:, :, 3]
+    return (tips[:, 0] + tips[:, 1:].mean(1)) / 2
+
+
+def _onto_human(hand: Hand) -> Rotation:
+    """Rotation from the hand's wrist frame to the human one that aligns the grasp axes."""
+    return Rotation.from_matrix(_axes(HUMAN) @ _axes(hand).T)
+
+
+def _axes(hand: Hand) -> np.ndarray:
+    """Axes v, w and v x w as columns (3, 3), in the wrist frame."""
+    frame = grasp_frame(hand)
+    return np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)], -1)
+
+
+def separated(hand: Hand, q: np.ndarray) -> np.ndarray:
+    """Returns the nearest finger angles whose links overlap by at most `OVERLAP`.
+
+    They minimise |q - q_0|^2 subject to the limit on all pairs of `common.task.plausibility.overlaps`, by sequential
+    quadratic programming. The variables are motors, so that couplings and tendons are preserved; all joints stay within
+    their limits.
+
+    Args:
+      hand: any hand.
+      q: (M, F) rad, within the limits; poses within the limit are returned unchanged.
+    """
+    deep = np.asarray(deepest(hand, q)) > OVERLAP
+    return np.stack([_apart(hand, row) if moved else row for row, moved in zip(q, deep, strict=True)])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def deepest(hand: Hand, q: Array) -> Array:
+    """Greatest overlap (M,) of two links at finger angles (M, F), m; 0 if there is none."""
+    return jnp.maximum(overlaps(hand, link_transforms(hand, q)).max(-1), 0.0)
+
+
+def _apart(hand: Hand, q: np.ndarray) -> np.ndarray:
+    """Separates one pose (F,)."""
+    own, motors = transmission(hand), range(len(hand.motors))
+    # Range of each motor until the first of its joints is at a limit.
+    ends = np.sort([(limit - q) / own.ratio for limit in (hand.lower, hand.upper)], axis=0)
+    bounds = [(min(ends[0][own.motor == m].max(), 0.0), max(ends[1][own.motor == m].min(), 0.0)) for m in motors]
+    weight = np.bincount(own.motor, own.ratio**2)
+    found = minimize(
+        lambda way: (0.5 * weight @ way**2, weight * way),
+        np.zeros(len(weight)),
+        jac=True,
+        method="SLSQP",
+        bounds=bounds,
+        constraints={
+            "type": "ineq",
+            "fun": lambda way: np.asarray(_room(hand, q, way), float),
+            # For two intersecting axes the direction of separation is undefined.
+            "jac": lambda way: np.nan_to_num(np.asarray(_room_change(hand, q, way), float)),
+        },
+        options={"maxiter": _ITERATIONS},
+    )
+    apart = np.clip(q + own.ratio * found.x[own.motor], hand.lower, hand.upper).astype(q.dtype)
+    before, after = deepest(hand, np.stack([q, apart]))
+    return apart if after < before else q
+
+
+def _room_of(hand: Hand, q: Array, way: Array) -> Array:
+    """Remaining clearance (Q,) in mm of pairs of links after a motion (M,) of the motors from angles (F,)."""
+    own = transmission(hand)
+    return 1e3 * (OVERLAP - overlaps(hand, link_transforms(hand, q + own.ratio * way[own.motor])))
+
+
+_room = jax.jit(_room_of, static_argnums=0)
+_room_change = jax.jit(jax.jacfwd(_room_of, 2), static_argnums=0)
