@@ -1,0 +1,281 @@
+"""Audit of a run: the outcome of every rollout, from the journals of its actors and its learner.
+
+Actors record what they sent, with a checksum, and every reply; the learner records what it used, with a checksum from
+the start of the update, what it dropped, and where its sessions began and ended. Neither reads the other's journal, and
+this module does not use the code that decided.
+
+The content of missing or damaged lines of a journal is unknown. Rollouts that they may concern are no faults, but are
+counted as not in the journals, and reported as unjudged. A journal without its last lines looks like that of a process
+that was killed.
+"""
+
+import collections
+import dataclasses
+import pathlib
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.journal import AUDIT, JournalLines, has_fields, read_journal
+from congrasp.learner.hub.used_rollouts import Used, read_uses, replay
+
+Identity = tuple[str, str, int]
+"""Actor, incarnation and sequence number."""
+FAULTS = {"lost": "loss", "duplicated": "surplus", "corrupted": "damage", "unmatched": "surplus"}
+"""Faults of rollouts, and their kinds."""
+EXIT_CODES = {"loss": 1, "surplus": 5, "damage": 6, "unjudged": 7}
+"""Exit codes of `congrasp audit` by kind, the most serious first; 2 to 4 are those of errors."""
+UNJUDGED = "not in the journals"
+"""Outcome of accepted rollouts that cannot be judged."""
+
+
+class Made(NamedTuple):
+    """A rollout as recorded by its actor."""
+
+    version: int
+    checksum: str
+    answers: list[tuple[str, str]]
+    """(outcome, session id of the learner)."""
+
+
+class Report(NamedTuple):
+    """Outcome of every rollout of a run."""
+
+    counts: dict[str, int]
+    """Numbers of rollouts made and accepted, and the outcomes of accepted ones; the last ones are faults."""
+    faults: list[str]
+    """One line for each rollout that was lost, duplicated, corrupted or unmatched."""
+    lag_mean: float
+    lag_max: int
+    max_staleness: int
+    holes: int
+    """Lines missing from the journals because of a full disk, or cut at the end."""
+    damaged: int
+    """Damaged lines of the journals."""
+    missing: int
+    """Places in the journals from which lines were removed, and journals without a line."""
+    unchecked: int
+    """Lines of older versions of congrasp, between which missing ones cannot be detected."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 without findings, else that of the most serious kind."""
+        damaged = self.damaged or self.counts.get("damaged on disk")
+        kinds = {FAULTS[name] for name in FAULTS if self.counts[name]} | ({"damage"} if damaged else set())
+        if self.missing or self.counts.get(UNJUDGED) or not self.counts["made"]:
+            kinds.add("unjudged")
+        return next((code for kind, code in EXIT_CODES.items() if kind in kinds), 0)
+
+
+class _Gaps(NamedTuple):
+    """True for kinds of journals with missing lines."""
+
+    actors: bool
+    learners: bool
+
+
+def compare(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
+    """Compares the journals of a run.
+
+    Args:
+      run_dir: directory of the run.
+      more: journals of actors on other machines.
+
+    Raises:
+      CongraspError: there are no journals.
+    """
+    folder = run_dir / AUDIT
+    learners = sorted(folder.glob("learner-*.jsonl"))
+    actors = [*(path for path in sorted(folder.glob("*.jsonl")) if path not in learners), *more]
+    if not learners or not actors:
+        kind = "actor" if learners else "learner"
+        raise CongraspError(
+            f"There is no journal of {'an' if kind == 'actor' else 'a'} {kind} in {folder}.",
+            "Actors on other machines write theirs with 'congrasp actor --audit FILE'; pass these files.",
+        )
+    notes = [read_journal(path, _is_entry) for path in actors]
+    books = [read_uses(path) for path in learners]
+    gaps = _Gaps(*(any(each.lost or each.damaged or each.missing for each in group) for group in (notes, books)))
+    return _compare(_made(notes), _outcomes(book.intact for book in books), gaps, [*notes, *books])
+
+
+def _is_entry(entry: dict[str, Any]) -> bool:
+    """True if a line is a valid entry of an actor."""
+    if "made" in entry:
+        return has_fields(entry, made=int, version=int, checksum=str)
+    if "answer" in entry:
+        return has_fields(entry, answer=int, outcome=str, session_id=str)
+    return has_fields(entry, actor=str, incarnation=str)
+
+
+def _made(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
+    """Rollouts sent by actors, and the replies they received."""
+    made: dict[Identity, Made] = {}
+    for journal in journals:
+        who: tuple[str, str] | None = None
+        for entry in journal.entries:
+            if entry is None:
+                who = None  # unnamed lines that follow may belong to another incarnation
+                continue
+            if has_fields(entry, actor=str, incarnation=str):
+                who = entry["actor"], entry["incarnation"]
+            if who is not None and "made" in entry:
+                made[*who, entry["made"]] = Made(entry["version"], entry["checksum"], [])
+            elif who is not None and (identity := (*who, entry.get("answer", -1))) in made:
+                made[identity].answers.append((entry["outcome"], entry["session_id"]))
+    return made
+
+
+@dataclasses.dataclass
+class _Session:
+    """Initial state of a learner's session, and its record of unused rollouts."""
+
+    session_id: str
+    run_id: str
+    version: int
+    max_staleness: int
+    kept: bool
+    """Accepted rollouts were written to disk before the acknowledgement; older versions of congrasp did not."""
+    falls_back: bool
+    """It began from a checkpoint older than the newest, which was damaged or missing."""
+    started: bool
+    """It recovered rollouts from disk, after which it accepts."""
+    taken: set[Identity] = dataclasses.field(default_factory=set)
+    unwritten: set[Identity] = dataclasses.field(default_factory=set)
+    waiting: set[Identity] | None = None
+    """Queued rollouts at its end; None while it runs, or if it was killed."""
+
+    def had(self, identity: Identity, accepted_by: set[str]) -> bool:
+        """True if it accepted a rollout, or recovered it from an earlier session."""
+        return self.session_id in accepted_by or identity in self.taken
+
+
+class _Outcomes(NamedTuple):
+    """Actions of the learners on rollouts."""
+
+    books: list[list[_Session]]
+    """Sessions of each learner."""
+    standing: dict[Identity, list[Used]]
+    undone: set[Identity]
+    dropped: set[Identity]
+    spoilt: set[Identity]
+
+
+def _outcomes(books: Iterable[list[dict[str, Any]]]) -> _Outcomes:
+    """Collects outcomes from the learners' journals."""
+    found = _Outcomes([], collections.defaultdict(list), set(), set(), set())
+    for book in books:
+        found.books.append(_sessions(book))
+        stands, lost = replay(book)
+        for use in stands:
+            found.standing[use.actor, use.incarnation, use.sequence].append(use)
+        found.undone.update((use.actor, use.incarnation, use.sequence) for use in lost)
+        for entry in book:
+            found.dropped.update(_rows(entry, "dropped"))
+            found.spoilt.update(_rows(entry, "spoilt"))
+    return found
+
+
+def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
+    """Sessions of one learner, in order, without those killed before they recovered anything."""
+    sessions: list[_Session] = []
+    saved = -1
+    for entry in book:
+        if "session_id" in entry:
+            begin = entry["session_id"], entry["run_id"], entry["version"], entry["max_staleness"]
+            kept = entry.get("kept") is True
+            sessions.append(_Session(*begin, kept, entry["version"] < saved, started=not kept))
+        saved = entry.get("saved", entry["version"] if "session_id" in entry else saved)
+        if sessions:
+            sessions[-1].started |= "taken" in entry
+            sessions[-1].taken.update(_rows(entry, "taken"))
+            sessions[-1].unwritten.update(_rows(entry, "unwritten"))
+            if "end" in entry:
+                sessions[-1].waiting = _rows(entry, "end")
+    return [session for session in sessions if session.started]
+
+
+def _rows(entry: dict[str, Any], name: str) -> set[Identity]:
+    """Rollouts named by a field of a line."""
+    return {(actor, incarnation, sequence) for actor, incarnation, sequence in entry.get(name, ())}
+
+
+def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals: Sequence[JournalLines]) -> Report:
+    """Compares every rollout's replies with the actions of the learner's sessions."""
+    standing = found.standing
+    counts = collections.Counter({"made": len(made)})
+    faults: list[str] = []
+
+    def fault(kind: str, identity: Identity, text: str) -> None:
+        """Counts a fault, and records the rollout."""
+        counts[kind] += 1
+        faults.append(f"{'/'.join(map(str, identity))}: {text}")
+
+    known = {identity[:2] for identity in made}
+    for identity, uses in standing.items():
+        if identity[:2] not in known:
+            counts["of actors without a journal"] += 1
+            continue
+        if identity not in made:
+            if gaps.actors:
+                counts["used, not in the journals"] += 1
+            else:
+                fault("unmatched", identity, "used, but never sent")
+        elif any(use.checksum != made[identity].checksum for use in uses):
+            fault("corrupted", identity, "used with different content than sent")
+        if len(uses) > 1 and not gaps.learners:  # the line with which a resume undid one of them may be missing
+            fault("duplicated", identity, f"used {len(uses)} times")
+    for identity, rollout in made.items():
+        outcomes = [outcome for outcome, _ in rollout.answers]
+        if "accepted" not in outcomes and "duplicate" not in outcomes:
+            counts["used, answer lost" if identity in standing else outcomes[-1] if outcomes else "unanswered"] += 1
+            continue
+        counts["accepted"] += 1
+        outcome = _outcome(identity, rollout, found)
+        if outcome == "lost" and any(gaps):
+            outcome = UNJUDGED
+        if outcome == "lost":
+            fault("lost", identity, "accepted, but missing afterwards")
+        else:
+            counts[outcome] += 1
+    lags = [use.lag for uses in standing.values() for use in uses]
+    return Report(
+        dict(counts) | {name: counts[name] for name in FAULTS},
+        faults,
+        sum(lags) / max(1, len(lags)),
+        max(lags, default=0),
+        max((session.max_staleness for book in found.books for session in book), default=0),
+        sum(journal.lost for journal in journals),
+        sum(journal.damaged for journal in journals),
+        sum(journal.missing for journal in journals),
+        sum(journal.unchecked for journal in journals),
+    )
+
+
+def _outcome(identity: Identity, rollout: Made, found: _Outcomes) -> str:
+    """Outcome of an accepted rollout, from the last session that had it and the next one."""
+    if identity in found.standing:
+        return "used"
+    if identity in found.dropped:
+        return "dropped"
+    if identity in found.spoilt:
+        return "damaged on disk"
+    accepted_by = {session for outcome, session in rollout.answers if outcome in ("accepted", "duplicate")}
+    for book in found.books:
+        had = [n for n, session in enumerate(book) if session.had(identity, accepted_by)]
+        if not had:
+            continue
+        last, after = book[had[-1]], book[had[-1] + 1 : had[-1] + 2]
+        if not after:
+            return "waiting" if last.waiting is None or identity in last.waiting else "lost"
+        return _without_trace(identity, rollout.version, last, after[0], undone=identity in found.undone)
+    return UNJUDGED
+
+
+def _without_trace(identity: Identity, version: int, last: _Session, after: _Session, *, undone: bool) -> str:
+    """Reason why the session after the last that had a rollout did not recover it; "lost" without a reason."""
+    if abs(version - after.version) > after.max_staleness or after.run_id != last.run_id:
+        return "undone" if undone else "too old after a restart"
+    if not last.kept or identity in last.unwritten or after.falls_back:
+        return "undone" if undone else "not kept on disk"
+    return "lost"

@@ -1,0 +1,249 @@
+"""Checks of this machine and installation, each with a remedy if it fails."""
+
+import importlib.metadata
+import os
+import pathlib
+import platform
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from packaging.requirements import Requirement
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import FLOWS
+from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.services.ops.certificates import certificates
+from congrasp.services.ops.status import ask
+
+_PACKAGES = ("mujoco", "mujoco-mjx", "warp-lang", "jax", "flax", "eclipse-zenoh")
+_PAIRS = (("mujoco", "mujoco-mjx"), ("jax", "jaxlib"))
+"""Packages whose versions must match."""
+_PORT = int(LEARNER_URL.rpartition(":")[2])
+_LEAST_GIB = 2.0
+_LEAST_MB_S, _SAMPLE = 5.0, 16 << 20
+_DRIVER = 580
+_LEAST_DAYS = 14.0  # warning before a certificate expires, days
+_OFFSET = 1.0  # tolerated offset from the learner's clock, s
+_BETWEEN = 0.05  # seconds between two requests; a secured learner accepts a hundred per second
+_NVIDIA = "/dev/nvidia0"
+
+
+class Finding(NamedTuple):
+    """Result of one check."""
+
+    what: str
+    fine: bool
+    text: str
+
+
+def examine(
+    connect: str = "",
+    run: str = "quickstart",
+    folder: pathlib.Path = pathlib.Path(),
+    certs: pathlib.Path | None = None,
+) -> list[Finding]:
+    """Runs all checks, without side effects.
+
+    Args:
+      connect: endpoint of a learner to test, if any.
+      run: name of its run.
+      folder: folder for runs.
+      certs: folder of certificates to check, and to use for the connection.
+    """
+    checks: list[Callable[[], Iterator[Finding]]] = [_python, _packages, _gpu, _jax, _warp, _ports]
+    checks += [lambda: _disk(folder), _clock]
+    if certs:
+        checks.append(lambda: _certificates(certs))
+    if connect:
+        checks.append(lambda: _learner(connect, run, certs))
+    return [finding for check in checks for finding in _tried(check)]
+
+
+def _tried(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """Runs a check; an exception is a failed finding."""
+    try:
+        yield from check()
+    except Exception as error:
+        name = getattr(check, "__name__", "").strip("_<>") or "check"
+        yield Finding(name, False, f"could not be checked: {type(error).__name__}: {str(error).splitlines()[0]}")
+
+
+def _python() -> Iterator[Finding]:
+    """Checks the version of Python."""
+    fine = (3, 11) <= sys.version_info[:2] < (3, 14)
+    yield Finding("python", fine, platform.python_version() + ("" if fine else ": 3.11, 3.12 or 3.13 is needed"))
+
+
+def _packages() -> Iterator[Finding]:
+    """Checks versions required by the package's metadata, and those that must match."""
+    gpu = os.path.exists(_NVIDIA)
+    wanted = {}
+    for text in importlib.metadata.requires("congrasp") or ():
+        requirement = Requirement(text)
+        extras = ("", "train", "cuda") if gpu else ("", "train")
+        if not requirement.marker or any(requirement.marker.evaluate({"extra": extra}) for extra in extras):
+            wanted[requirement.name] = requirement.specifier
+    have: dict[str, str] = {}
+    for name in _PACKAGES:
+        needed = name in wanted
+        try:
+            have[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            if needed:
+                extra = "cuda" if gpu else "train"
+                yield Finding(name, False, f"not installed; run: pip install 'congrasp[{extra}]'")
+            continue
+        fine = not needed or wanted[name].contains(have[name])
+        remedy = "" if fine else f": {wanted[name]} is needed; run: pip install '{name}{wanted[name]}'"
+        yield Finding(name, fine, f"{have[name]}{remedy}")
+    for one, other in _PAIRS:
+        versions = [importlib.metadata.version(name) for name in (one, other)] if one in have else ["", ""]
+        if versions[0] != versions[1]:
+            text = f"{versions[0]} and {versions[1]} do not match; run: pip install '{other}=={versions[0]}'"
+            yield Finding(f"{one}, {other}", False, text)
+
+
+def _gpu() -> Iterator[Finding]:
+    """Reports name, memory and driver of each NVIDIA GPU."""
+    if not os.path.exists(_NVIDIA):
+        yield Finding("gpu", True, "no NVIDIA GPU here; actors use the native engine")
+        return
+    query = ["nvidia-smi", "--query-gpu=name,memory.total,memory.used,driver_version", "--format=csv,noheader,nounits"]
+    try:
+        lines = subprocess.run(query, capture_output=True, text=True, timeout=30, check=True).stdout.splitlines()
+    except (OSError, subprocess.SubprocessError):
+        yield Finding("gpu", False, "nvidia-smi does not respond: install the NVIDIA driver")
+        return
+    for number, line in enumerate(lines):
+        name, memory, used, driver = (part.strip() for part in line.split(","))
+        fine = int(driver.split(".")[0]) >= _DRIVER
+        text = f"{name}, {int(memory) / 1024:.0f} GiB ({int(used) / 1024:.0f} used), driver {driver}"
+        yield Finding(f"gpu {number}", fine, text + ("" if fine else f": {_DRIVER} or newer is needed; update it"))
+
+
+def _jax() -> Iterator[Finding]:
+    """Checks that JAX finds the machine's devices, and that a small program runs."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # a learner may be using this GPU
+    import jax
+    import jax.numpy as jnp
+
+    devices = ", ".join(device.device_kind for device in jax.devices())
+    backend = jax.default_backend()
+    computed = float(jax.jit(lambda x: (x * x).sum())(jnp.arange(4.0)))
+    missing = backend == "cpu" and os.path.exists(_NVIDIA)
+    wrong = ": an NVIDIA GPU is not found; run: pip install 'congrasp[cuda]'" if missing else ""
+    wrong = wrong or ("" if computed == 14.0 else f": a small program gave {computed}, not 14; reinstall it")
+    yield Finding("jax", not wrong, f"{jax.__version__} on {backend} ({devices}), a small program runs{wrong}")
+
+
+def _warp() -> Iterator[Finding]:
+    """Checks that Warp finds the GPU, and that a small kernel runs."""
+    if not os.path.exists(_NVIDIA):
+        return
+    import warp as wp
+
+    @wp.kernel
+    def double(values: wp.array(dtype=float)):  # type: ignore[valid-type]
+        i = wp.tid()
+        values[i] = 2.0 * values[i]  # type: ignore[index]
+
+    devices = wp.get_cuda_devices()
+    if not devices:
+        yield Finding("warp", False, "no GPU found; run: pip install 'congrasp[cuda]', and update the driver")
+        return
+    values = wp.full(4, 3.0, dtype=float, device=devices[0])
+    wp.launch(double, dim=4, inputs=[values], device=devices[0])
+    total = float(values.numpy().sum())
+    fine = total == 24.0
+    names = ", ".join(device.name for device in devices)
+    text = f"{wp.__version__} ({names}), a small kernel runs"
+    yield Finding("warp", fine, text if fine else f"{text}, but gave {total}, not 24; reinstall it")
+
+
+def _ports() -> Iterator[Finding]:
+    """Checks the default ports of a learner."""
+    last = _PORT + len(FLOWS) - 1
+    for port in range(_PORT, last + 1):
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                text = f"{port} is in use (by another learner?); pass others with --listen"
+                yield Finding("ports", True, text)
+                return
+    yield Finding("ports", True, f"{_PORT}-{last} are free")
+
+
+def _disk(folder: pathlib.Path) -> Iterator[Finding]:
+    """Checks free space, and the speed of a synchronous write."""
+    free = shutil.disk_usage(folder).free / 2**30
+    if free < _LEAST_GIB:
+        text = f"{free:.1f} GiB free: a run needs about {_LEAST_GIB:g} GiB; free some, or pass another --run-dir"
+        yield Finding("disk", False, text)
+        return
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder) as file:
+            sample = os.urandom(_SAMPLE)
+            began = time.monotonic()
+            file.write(sample)
+            file.flush()
+            os.fsync(file.fileno())
+            speed = _SAMPLE / 1e6 / (time.monotonic() - began)
+    except OSError as error:
+        yield Finding("disk", False, f"{folder.absolute()} cannot be written: {error.strerror}; pass another --run-dir")
+        return
+    fine = speed >= _LEAST_MB_S
+    slow = "" if fine else f": checkpoints and recordings need about {_LEAST_MB_S:g} MB/s; pass another --run-dir"
+    yield Finding("disk", fine, f"{free:.1f} GiB free, written at {speed:.0f} MB/s{slow}")
+
+
+def _clock() -> Iterator[Finding]:
+    """Checks that the date is plausible, and that the monotonic clock runs at the same rate."""
+    began, monotonic = time.time(), time.monotonic()
+    time.sleep(0.2)
+    drift = abs((time.time() - began) - (time.monotonic() - monotonic))
+    behind = began < 1.7e9
+    now = time.strftime("%Y-%m-%d %H:%M:%S %Z")
+    wrong = ": it is years behind; set it (timedatectl set-ntp true)" if behind else ""
+    wrong = wrong or (f": it jumped by {drift:.2f} s in 0.2 s; check the time service" if drift > 0.1 else "")
+    yield Finding("clock", not wrong, now + wrong)
+
+
+def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
+    """Reports the expiry of each certificate."""
+    try:
+        found = certificates(folder)
+    except CongraspError as error:
+        yield Finding("certificates", False, str(error))
+        return
+    for one in found:
+        fine = one.days > _LEAST_DAYS
+        text = f"{one.name}: valid until {one.expires:%Y-%m-%d}" if one.days > 0 else f"{one.name}: expired"
+        remedy = (
+            "" if fine else "; run 'congrasp certs issue --force' to renew it, 'certs init --force' for all of them"
+        )
+        yield Finding("certificate", fine, text + remedy)
+
+
+def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Iterator[Finding]:
+    """Checks that a learner responds, and the offset of its clock."""
+    try:
+        with urls.connect(connect, "observer", certs=certs, wait=5.0, run=run) as transport:
+            ask(transport, run)
+            time.sleep(_BETWEEN)
+            began = time.time()
+            status = ask(transport, run)
+            ended = time.time()
+    except CongraspError as error:
+        yield Finding("learner", False, str(error))
+        return
+    yield Finding("learner", True, f"{connect} responds in {1e3 * (ended - began):.1f} ms, version {status['version']}")
+    offset = status["time"] - (began + ended) / 2
+    fine = abs(offset) < _OFFSET + (ended - began) / 2
+    remedy = "" if fine else ": times in recordings will not match; synchronise both clocks"
+    yield Finding("its clock", fine, f"{offset:+.3f} s from this one (± {(ended - began) / 2:.3f}){remedy}")
