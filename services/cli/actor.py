@@ -7,7 +7,7 @@ import tyro
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.transport.ports import LEARNER_URL
-from congrasp.services.cli.watch import Watch, Watched
+from congrasp.services.ops.logs import Watch, announced, log
 
 
 def actor(
@@ -19,7 +19,7 @@ def actor(
     patience: float = 60.0,
     audit: pathlib.Path | None = None,
     references: pathlib.Path | None = None,
-    watch: Watched = Watch(),  # noqa: B008
+    watch: Watch = Watch(),  # noqa: B008
     certs: pathlib.Path | None = None,
 ) -> int:
     """Run one actor for a learner on this or another machine; actors may join and leave during training.
@@ -45,7 +45,6 @@ def actor(
     from congrasp.common.runtime.parallel import cores
     from congrasp.common.transport import urls
     from congrasp.common.transport.keys import process_name
-    from congrasp.services.ops.logs import announced, log
     from congrasp.services.ops.metrics import ActorMetrics
     from congrasp.services.ops.shutdown import on_signal
 

@@ -77,7 +77,10 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     def bind(*args: Any, **options: Any) -> Callable[[], Any]:
         return functools.partial(command, *args, **options)
 
-    hints = {name: _described(name, hint) for name, hint in typing.get_type_hints(command, include_extras=True).items()}
+    hints = {
+        name: _described(name, hint, *([tyro.conf.arg(name="")] if dataclasses.is_dataclass(hint) else []))
+        for name, hint in typing.get_type_hints(command, include_extras=True).items()
+    }
     signature = inspect.signature(command)
     taken = [value.replace(annotation=hints[name]) for name, value in signature.parameters.items()]
     vars(bind)["__signature__"] = signature.replace(parameters=taken)
@@ -86,7 +89,7 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     return bind
 
 
-def _described(name: str, hint: Any) -> Any:
+def _described(name: str, hint: Any, *more: Any) -> Any:
     """Returns a parameter's type, with the display of its values and default, and the range of seeds."""
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     marks += [_SEED] if name == "seed" or name.endswith("_seed") else []
@@ -95,7 +98,7 @@ def _described(name: str, hint: Any) -> Any:
     metavar = None
     if typing.get_origin(kind) is tuple and typing.get_args(kind)[-1] is Ellipsis:
         metavar = f"{_value(typing.get_args(kind)[0])} ..."
-    return Annotated[(kind, *marks, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint))]
+    return Annotated[(kind, *marks, *more, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint))]
 
 
 def _seed(words: list[str]) -> int:
@@ -133,16 +136,17 @@ _REGISTRY = tyro.constructors.ConstructorRegistry()
 @_REGISTRY.struct_rule
 def _dataclass(info: tyro.constructors.StructTypeInfo) -> tyro.constructors.StructConstructorSpec | None:
     """Options of a dataclass: tyro's own rule, with each field's text on one line and described as parameters are."""
-    if not dataclasses.is_dataclass(info.type) or not dataclasses.is_dataclass(info.default):
+    if not dataclasses.is_dataclass(info.type):
         return None
     hints = typing.get_type_hints(info.type, include_extras=True)
+    source = info.default if dataclasses.is_dataclass(info.default) else info.type
     return tyro.constructors.StructConstructorSpec(
         instantiate=info.type,
         fields=tuple(
             tyro.constructors.StructFieldSpec(
                 field.name,
                 _described(field.name, hints[field.name]),
-                getattr(info.default, field.name),
+                getattr(source, field.name, tyro.MISSING),
                 functools.partial(_meaning, info.type, field.name),
             )
             for field in dataclasses.fields(info.type)

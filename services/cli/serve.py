@@ -3,7 +3,7 @@
 import pathlib
 
 from congrasp.common.transport.ports import SERVER_URL
-from congrasp.services.cli.watch import Watch, Watched
+from congrasp.services.ops.logs import Watch, announced, log
 
 
 def serve(
@@ -13,7 +13,7 @@ def serve(
     run: str = "quickstart",
     listen: str = SERVER_URL,
     name: str = "policy",
-    watch: Watched = Watch(),  # noqa: B008
+    watch: Watch = Watch(),  # noqa: B008
     certs: pathlib.Path | None = None,
     insecure: bool = False,
 ) -> int:
@@ -38,8 +38,6 @@ def serve(
     import contextlib
     import os
     import secrets
-
-    from congrasp.services.ops.logs import announced, log
 
     starting = contextlib.ExitStack()
     starting.enter_context(announced("Loading and compiling the policy"))

@@ -33,6 +33,7 @@ from congrasp.learner.run_directory import (
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.evaluate.scores import Row
+from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.shutdown import on_signal
 from congrasp.services.serve.load import example_episode, one_answer, serving
 from congrasp.services.train.launch import Launch, Plan
@@ -80,9 +81,8 @@ def run_training(
                     wire=None,
                     inside=plan.physics,
                     stop=stop,
-                    resume=resume,
                     writers=launch.metric_writers,
-                    metrics_port=launch.metrics_port,
+                    watch=Watch(metrics_port=launch.metrics_port),
                     on_update=progress.update,
                     on_event=lambda level, text: _warn(text) if level == "error" else None,
                 )

@@ -10,20 +10,24 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from congrasp.actors.harvest import references_file
 from congrasp.actors.process.actor import run_actor
 from congrasp.common.config import MetricWriter, RunConfig
+from congrasp.common.policy.bundle import policy_spec
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores, prepare_workers
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.memory import PairTransport
+from congrasp.learner.algorithms import make_algorithm
+from congrasp.learner.batch import rollout_form
 from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
 from congrasp.learner.process import run_learner
-from congrasp.learner.run_directory import LOGS, create_run
-from congrasp.services.ops.metrics import LearnerMetrics, exposed
+from congrasp.learner.run_directory import LOGS, create_run, has_checkpoints
+from congrasp.services.ops.logs import Watch
+from congrasp.services.ops.metrics import LearnerMetrics
 from congrasp.services.ops.shutdown import GRACE
 from congrasp.services.ops.status import ask
 from congrasp.services.record.channels import Entry, flatten
@@ -33,20 +37,10 @@ from congrasp.services.train.launch import engine_of
 _TOPIC = "/metrics/learner/"
 
 
-class _Writer(Protocol):
-    """Destination of scalars."""
-
-    def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """Writes the scalars of an update."""
-
-    def close(self) -> None:
-        """Finishes."""
-
-
 class MetricWriters:
     """A sink of `services.record.recorder.Recorder` for learners' metrics; a failed writer is not used again."""
 
-    def __init__(self, writers: Mapping[str, _Writer]):
+    def __init__(self, writers: Mapping[str, "_TensorBoard | _WeightsAndBiases"]):
         """Creates a sink with writers by name."""
         self._writers = dict(writers)
 
@@ -64,7 +58,7 @@ class MetricWriters:
         """Finishes every writer."""
         self._each(lambda writer: writer.close())
 
-    def _each(self, action: Callable[[_Writer], None]) -> None:
+    def _each(self, action: Callable[[Any], None]) -> None:
         for name, writer in list(self._writers.items()):
             try:
                 action(writer)
@@ -84,7 +78,7 @@ class _TensorBoard:
         self._files: dict[str, Any] = {}
 
     def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """See `_Writer`."""
+        """Writes the scalars of an update."""
         from tensorboardX.proto.event_pb2 import Event, SessionLog
         from tensorboardX.proto.summary_pb2 import Summary
 
@@ -105,7 +99,7 @@ class _TensorBoard:
         return EventsWriter(str(folder / "events"), f".{secrets.token_hex(4)}")
 
     def close(self) -> None:
-        """See `_Writer`."""
+        """Finishes."""
         for file in self._files.values():
             file.close()
 
@@ -129,12 +123,12 @@ class _WeightsAndBiases:
         self._run.define_metric("*", step_metric="update")
 
     def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """See `_Writer`."""
+        """Writes the scalars of an update."""
         prefix = "" if learner == "0" else f"learner-{learner}/"
         self._run.log({**{f"{prefix}{name}": value for name, value in values.items()}, "update": step})
 
     def close(self) -> None:
-        """See `_Writer`."""
+        """Finishes."""
         import wandb
 
         self._run.finish()
@@ -156,7 +150,7 @@ def recorded(
     Raises:
       ModuleNotFoundError: a writer's package is not installed.
     """
-    writers: dict[str, _Writer] = {}
+    writers: dict[str, _TensorBoard | _WeightsAndBiases] = {}
     for name in dict.fromkeys(names):
         if name == "tensorboard":
             writers[name] = _TensorBoard(run_dir / name)
@@ -179,28 +173,25 @@ def learn(
     wire: Transport | None,
     inside: PhysicsName | None,
     stop: threading.Event,
-    resume: bool,
     ranks: Ranks | None = None,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
     on_event: Callable[[str, str], None] = lambda level, text: None,
     writers: Sequence[MetricWriter] = (),
-    metrics_port: int = 0,
-    metrics_host: str = "127.0.0.1",
+    watch: Watch = Watch(),  # noqa: B008
     grace: float = GRACE,
 ) -> None:
-    """Runs a learner until it is finished or stopped.
+    """Runs a learner from the newest checkpoint, if there is one, until it is finished or stopped.
 
     An actor in the same process shares the processors: acting with old weights during an update would gain nothing.
     Updates are then on-policy, regardless of `max_staleness`.
 
     Args:
-      run_dir: see `run_learner`, also for `config`, `resume`, `ranks`, `on_update` and `on_event`.
+      run_dir: see `run_learner`, also for `config`, `ranks`, `on_update` and `on_event`.
       wire: a listening transport for rollouts and status queries of others; None only with an actor inside.
       inside: engine of an actor in this process, over the in-memory transport; None for no actor.
       stop: ends training.
       writers: metric writers of rank 0.
-      metrics_port: port of a Prometheus endpoint; 0 for none.
-      metrics_host: interface of the endpoint.
+      watch: endpoint of the metrics.
       grace: deadline for the end of the actor inside, s.
     """
     rank, transport = 0 if ranks is None else ranks.rank, wire
@@ -217,8 +208,7 @@ def learn(
             metrics.update(values)
             on_update(values)
 
-        if metrics_port:
-            stack.enter_context(exposed(metrics_port, metrics_host, metrics))
+        stack.enter_context(watch.exposed(metrics))
         if inside is not None:
             stack.enter_context(_actor_thread(url, config, run_dir, f"actor-{rank}", inside, stop, grace))
         run_learner(
@@ -226,13 +216,20 @@ def learn(
             config,
             transport,
             stop_event=stop,
-            resume=resume,
+            resume=rank == 0 and has_checkpoints(run_dir),
             ranks=ranks,
             audit=inside is None,
             recorder=recorded(transport, config, run_dir, writers) if rank == 0 else None,
             on_update=updated,
             on_event=on_event,
         )
+
+
+def longest_rollout(config: RunConfig) -> int:
+    """Limit of rollout messages: twice the size of the run's rollouts, bytes."""
+    spec = policy_spec(config.task, config.network)
+    form = rollout_form(config, spec, make_algorithm(spec, config).batch_schema)
+    return 2 * sum(array.nbytes for array in form.zeros().values())
 
 
 @contextlib.contextmanager
@@ -311,7 +308,6 @@ def until_first_update(
             wire=None,
             inside=engine_of(physics, False),
             stop=stop,
-            resume=False,
             on_update=updated,
             grace=_GRACE,
         )

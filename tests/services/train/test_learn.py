@@ -87,7 +87,7 @@ def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(tmp_path, mon
 def test_it_ends_with_the_first_update_and_leaves_no_run_behind(monkeypatch):
     seen, events = {}, []
 
-    def learn(run_dir, config, *, wire, inside, stop, resume, on_update, grace):
+    def learn(run_dir, config, *, wire, inside, stop, on_update, grace):
         seen.update(run_dir=run_dir, config=config, inside=inside, stop=stop)
         assert pathlib.Path(run_dir, "config.json").exists()
         for update in range(2):
