@@ -156,14 +156,13 @@ def import_captures(
     from congrasp.common.hands.mano import own_mano_model
     from congrasp.services.assets.captures.build import Options, import_sets
     from congrasp.services.assets.captures.objects import Meshes
-    from congrasp.services.cli.console import bars
+    from congrasp.services.cli.console import bars, in_range
 
     if format not in IMPORTERS:
         raise CongraspError(f"There is no format '{format}'.", f"Choose one of: {', '.join(IMPORTERS)}.")
     if not path.exists():
         raise CongraspError(f"There is no file or folder {path}.", "Pass the data set's folder.")
-    if not beyond >= 0:
-        raise CongraspError(f"--beyond is {beyond}.", "It must be in radians, and not negative.")
+    in_range(0.0, beyond=beyond)
     known, options = get_hand(hand), Options(headings, affordance, beyond, seed=seed)
     importer = importlib.import_module(IMPORTERS[format])
     with bars() as progress:
@@ -272,20 +271,14 @@ def show(
     """
     from congrasp.common.task.sampling.sets import load
     from congrasp.common.task.sampling.write_sets import describe
-    from congrasp.services.cli.console import show_facts
+    from congrasp.services.cli.console import in_range, save_picture, show_facts
+    from congrasp.services.viz.object_sheet import constraint_sheet
 
     constraints = load(file)
-    rests = len(constraints.arrays["rest"])
-    if not 0 <= rest <= rests:
-        raise CongraspError(f"--rest is {rest}.", f"The object has the resting poses 1 to {rests}.")
+    in_range(0, len(constraints.arrays["rest"]), rest=rest)
     show_facts(describe(constraints))
-    if png is not None:
-        from congrasp.services.viz.object_sheet import constraint_sheet
-        from congrasp.services.viz.sheets import save_png
-
-        best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
-        save_png(png, constraint_sheet(constraints, rest - 1 if rest else best, seed))
-        print(f"The picture is {png}.")
+    best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
+    save_picture(png, lambda: constraint_sheet(constraints, rest - 1 if rest else best, seed))
     return 0
 
 

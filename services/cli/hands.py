@@ -1,5 +1,6 @@
 """Available hands, pictures of them, and custom hands."""
 
+import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -187,78 +188,78 @@ def check(
     return int(checked.failed)
 
 
-def train(
-    hand: Annotated[str, tyro.conf.Positional],
-    name: str = "",
-    palm: str = "",
-    thumb: str = "",
-    object_scale: float = 0.0,
-    out: pathlib.Path | None = None,
-    anyway: bool = False,
-    physics: PhysicsName = "auto",
-    episodes: int = 0,
-    pool: int = 0,
-    training: str = "",
-    patience: int = 240,
-) -> int:
+@dataclasses.dataclass(frozen=True)
+class Train:
     """Train a hand from a URDF or MJCF to a policy and a report: import, self-check, training, evaluation.
 
     On a GPU it trains the full task by the recipe for all hands; afterwards grasp, serve, evaluate and view take the
     policy as --hand NAME. Without a GPU the training is short and of an easier task. It stops if the self-check fails.
     Repeat the command to resume a stopped one.
 
-    Args:
-      hand: The hand's URDF or MJCF, which is imported unless there is a custom hand of its name; or a hand's name or
-        file.
-      name: As in 'congrasp hands import', like the next three.
-      palm: Body of the palm.
-      thumb: The last body of the finger that opposes the others.
-      object_scale: Factor on the objects that it learns to grasp.
-      out: Folder for the self-check, the run and the report; runs/hands/NAME by default.
-      anyway: Train it although its self-check failed.
-      physics: Engine of the full task and of the evaluation.
-      episodes: Episodes of each row of the report; 0 uses 200, without a GPU 24.
-      pool: Objects of the report; 0 uses 64, without a GPU 12.
-      training: Further options of 'congrasp train', as one text.
-      patience: Minutes after which the training is stopped, to be resumed by the next 'congrasp hands train'.
-
     Examples:
       congrasp hands train my_hand.urdf
       congrasp hands train my_hand --training="--updates 900"
     """
-    import shlex
 
-    import jax
+    hand: Annotated[str, tyro.conf.Positional]
+    """The hand's URDF or MJCF, which is imported unless there is a custom hand of its name; or a hand's name or
+    file."""
+    name: str = ""
+    """As in 'congrasp hands import', like the next three."""
+    palm: str = ""
+    """Body of the palm."""
+    thumb: str = ""
+    """The last body of the finger that opposes the others."""
+    object_scale: float = 0.0
+    """Factor on the objects that it learns to grasp."""
+    out: pathlib.Path | None = None
+    """Folder for the self-check, the run and the report; runs/hands/NAME by default."""
+    anyway: bool = False
+    """Train it although its self-check failed."""
+    physics: PhysicsName = "auto"
+    """Engine of the full task and of the evaluation."""
+    episodes: int = 0
+    """Episodes of each row of the report; 0 uses 200, without a GPU 24."""
+    pool: int = 0
+    """Objects of the report; 0 uses 64, without a GPU 12."""
+    training: str = ""
+    """Further options of 'congrasp train', as one text."""
+    patience: int = 240
+    """Minutes after which the training is stopped, to be resumed by the next 'congrasp hands train'."""
 
-    from congrasp.common.hands import get_hand
-    from congrasp.services.assets.hands.model_files import Choices
-    from congrasp.services.cli.console import at_least
-    from congrasp.services.train.launch import accelerators
-    from congrasp.services.train.own_hand import Request, train_hand
+    def __call__(self) -> int:
+        """Imports, checks, trains and evaluates."""
+        import shlex
 
-    at_least(0, episodes=episodes, pool=pool)
-    at_least(1, patience=patience)
-    full = accelerators()[0] != "cpu"
-    jax.config.update(
-        "jax_platforms", "cpu"
-    )  # the stages are separate processes, so that each has the whole GPU memory
-    reference = _taken(hand, Choices(name, palm, thumb, object_scale))
-    found = get_hand(reference)
-    request = Request(
-        hand=found,
-        reference=reference,
-        out=out or pathlib.Path("runs", "hands", found.name),
-        full=full,
-        anyway=anyway,
-        physics=physics,
-        episodes=episodes or (200 if full else 24),
-        pool=pool or (64 if full else 12),
-        options=shlex.split(training),
-        patience=60.0 * patience,
-    )
-    train_hand(request, lambda text: print(text, flush=True))
-    print(f"Try: congrasp grasp examples/mug.obj --hand {reference}")
-    return 0
+        import jax
+
+        from congrasp.common.hands import get_hand
+        from congrasp.services.assets.hands.model_files import Choices
+        from congrasp.services.cli.console import in_range
+        from congrasp.services.train.launch import accelerators
+        from congrasp.services.train.own_hand import Request, train_hand
+
+        in_range(0, episodes=self.episodes, pool=self.pool)
+        in_range(1, patience=self.patience)
+        full = accelerators()[0] != "cpu"
+        jax.config.update("jax_platforms", "cpu")  # the stages are separate processes, each with the whole GPU memory
+        reference = _taken(self.hand, Choices(self.name, self.palm, self.thumb, self.object_scale))
+        found = get_hand(reference)
+        request = Request(
+            hand=found,
+            reference=reference,
+            out=self.out or pathlib.Path("runs", "hands", found.name),
+            full=full,
+            anyway=self.anyway,
+            physics=self.physics,
+            episodes=self.episodes or (200 if full else 24),
+            pool=self.pool or (64 if full else 12),
+            options=shlex.split(self.training),
+            patience=60.0 * self.patience,
+        )
+        train_hand(request, lambda text: print(text, flush=True))
+        print(f"Try: congrasp grasp examples/mug.obj --hand {reference}")
+        return 0
 
 
 def _taken(hand: str, choices: "Choices") -> str:
@@ -278,4 +279,4 @@ def _taken(hand: str, choices: "Choices") -> str:
     return name
 
 
-COMMANDS = {"list": list_hands, "sheet": sheet, "import": import_hand, "check": check, "train": train}
+COMMANDS = {"list": list_hands, "sheet": sheet, "import": import_hand, "check": check, "train": Train}

@@ -90,7 +90,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
             if rank == 0 and (options.resume or (options.or_resume and (run_dir / CONFIG_FILE).exists())):
                 continue_run(run_dir, config)
             elif rank == 0:
-                create_run(run_dir, config, options.initial and bundles.load(options.initial))
+                create_run(run_dir, config, bundles.load(options.initial) if options.initial else None)
             ranks = Ranks.join(rank, options.ranks, options.coordinator)
             config = run_config_from_json(ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
             with (

@@ -14,6 +14,7 @@ import docstring_parser
 import tyro
 
 Command = Callable[..., Any]
+"""A function, or a frozen dataclass with `__call__`, whose fields' docstrings are the help."""
 Parser = Callable[[list[str]], Callable[[], Any]]
 """From the arguments to the requested call."""
 _QUIET = ("", "None", "False")
@@ -75,7 +76,7 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     """Returns the command with its arguments bound, to be called once they are valid."""
 
     def bind(*args: Any, **options: Any) -> Callable[[], Any]:
-        return functools.partial(command, *args, **options)
+        return functools.partial(_run, command, *args, **options)
 
     hints = {
         name: _described(name, hint, *([tyro.conf.arg(name="")] if dataclasses.is_dataclass(hint) else []))
@@ -85,8 +86,16 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     taken = [value.replace(annotation=hints[name]) for name, value in signature.parameters.items()]
     vars(bind)["__signature__"] = signature.replace(parameters=taken)
     bind.__name__, bind.__annotations__ = command.__name__, {**hints, "return": Any}
-    bind.__doc__ = re.sub(r"\n    (?=\S)", " ", inspect.getdoc(command) or "")  # a parameter's text on one line
+    text = re.sub(r"\n    (?=\S)", " ", inspect.getdoc(command) or "")  # a parameter's text on one line
+    fields = [f"  {name}: {help}" for name, help in _meanings(command).items()] if isinstance(command, type) else []
+    bind.__doc__ = "\n".join([text, "", "Args:", *fields] if fields else [text])
     return bind
+
+
+def _run(command: Command, *args: Any, **options: Any) -> Any:
+    """Calls a function, or a command whose fields are its options."""
+    made = command(*args, **options)
+    return made() if isinstance(command, type) else made
 
 
 def _described(name: str, hint: Any, *more: Any) -> Any:

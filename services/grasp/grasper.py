@@ -6,9 +6,8 @@ import functools
 import os
 import pathlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
 import numpy as np
 
 from congrasp.actors.attempts import PLAIN, Attempts, Outcome, Phases
@@ -26,17 +25,16 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime.parallel import cores
-from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional, require_known
+from congrasp.common.task.constraints import CONSTRAINTS, require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
-from congrasp.common.task.types import Goal, Surface
-from congrasp.common.wire.codec import Message
+from congrasp.common.wire.codec import Message, encode
+from congrasp.services.arm.options import ArmOptions
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.client.left import mirrored_request
 from congrasp.services.export.motion_file import GraspMotion, motion_of_episode
-from congrasp.services.grasp.approaches import headings, prescribed, valid_rests
+from congrasp.services.grasp.approaches import prescribed, surface_of, to_attempt, with_avoid
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.grasp.reach import NoReachError, with_planned_reach
 
@@ -130,6 +128,34 @@ class Grasp:
         }
 
 
+class _Round(NamedTuple):
+    """Attempts at an object, all at once; the first n of B are different."""
+
+    obj: GraspObject
+    """The object with the regions of the request."""
+    request: GraspRequest
+    episodes: RequestedEpisodes
+    rests: np.ndarray
+    """(B,) resting poses."""
+    outcome: Outcome
+    cost: np.ndarray
+    """(n,)."""
+    holds: np.ndarray
+    """(n,) bool: held to the end."""
+
+    @property
+    def best(self) -> int:
+        """The attempt of least cost."""
+        return int(self.cost.argmin())
+
+    @property
+    def meets(self) -> np.ndarray:
+        """(n,) bool: holds that meet the request, which one by the avoid region does not."""
+        if self.request.avoid is None:
+            return self.holds
+        return self.holds & (self.outcome.metrics["affordance_ratio"][: len(self.holds)] < _TOUCHED)
+
+
 class Grasper:
     """A policy that grasps one object after another; what it compiles serves all of them."""
 
@@ -165,6 +191,13 @@ class Grasper:
         self._compiled = False
         self._attempts = Attempts(self._hand, self.task, policy, threads=threads or cores(), phases=phases)
 
+    @functools.cached_property
+    def identity(self) -> tuple[Any, ...]:
+        """What a grasp depends on, in addition to object and request."""
+        policy, (approach, lift, *_) = bundles.content_hash(encode(self._policy.to_message())), self._attempts.phases
+        arm = self._arm.identity if self._arm else ""
+        return policy, self._attempts_count, self._seed, approach, lift, self._left, arm
+
     def grasp(
         self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
     ) -> Grasp:
@@ -185,48 +218,48 @@ class Grasper:
         require_known(request.constraints, self.task)
         if self._left:
             obj, request = obj.mirrored(), mirrored_request(request)
-        best: tuple[float, Outcome, Goal, int, np.ndarray] | None = None
+        best: _Round | None = None
         refused: collections.Counter[str] = collections.Counter()
-        held = attempted = 0
-        for round_ in range(self._rounds):
-            episodes, rests, different = self._episodes(obj, request, np.random.default_rng((self._seed, round_)))
-            progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
-            self._compiled = True
-            what = f"Attempting others ({round_ + 1})" if round_ else "Attempting"
-            outcome = self._attempts.run(obj, episodes, functools.partial(self._attempting, progress, what))
-            _check_aligned(outcome)
-            removal = self.task.approach_steps - 1
-            cost = costs(outcome, tuple(request.constraints), removal, self._attempts.phases.lift)
-            cost = (cost + _UNLIKELY * _places(obj, rests, request))[:different]
-            attempted += different
-            holds = outcome.metrics["held"][:different] > 0
-            held += int(holds.sum())
-            if request.avoid is not None:  # a hold by the avoid region does not meet the request
-                holds &= outcome.metrics["affordance_ratio"][:different] < _TOUCHED
+        held = attempts = 0
+        for number in range(self._rounds):
+            tried = self._attempt(obj, request, number, progress)
+            attempts, held = attempts + len(tried.holds), held + int(tried.holds.sum())
             if self._arm:
-                make = functools.partial(self._result, obj, request, outcome, episodes.goal, rests, attempted, held)
-                order = [i for i in cost.argsort().tolist() if holds[i]]
-                if (found := self._on_arm(self._arm, obj, make, order, refused, progress)) is not None:
+                found = self._on_arm(self._arm, tried, attempts, held, refused, progress)
+                if found is not None:
                     return found
-                if prescribed(request) is not None:  # further rounds would repeat these attempts
-                    break
-                continue
-            index = int(cost.argmin())
-            if best is None or cost[index] < best[0]:
-                best = (float(cost[index]), outcome, episodes.goal, index, rests)
-            if holds.any() or prescribed(request) is not None:
-                break
+            elif best is None or tried.cost.min() < best.cost.min():
+                best = tried
+            if prescribed(request) is not None or (best is not None and tried.meets.any()):
+                break  # further rounds would repeat these attempts, or are not needed
         if self._arm:
-            raise _no_motion(obj, self._arm.name, attempted, refused)
+            raise _no_motion(obj, self._arm.name, attempts, refused)
         assert best is not None
-        _, outcome, wanted, index, rests = best
-        cause = "" if held else self._cause(obj, request, progress)
-        found = self._result(obj, request, outcome, wanted, rests, attempted, held, index)
-        return dataclasses.replace(found, cause=cause)
+        found = self._motion(best, best.best, attempts, held)
+        return found if held else dataclasses.replace(found, cause=self._cause(obj, request, progress))
 
     def close(self) -> None:
         """Ends the threads of the physics."""
         self._attempts.close()
+
+    def _attempt(self, obj: GraspObject, request: GraspRequest, number: int, progress: Progress) -> _Round:
+        """A round of attempts."""
+        labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
+        rng = np.random.default_rng((self._seed, number))
+        episodes, rests, different = to_attempt(self._hand, self.task, labelled, request, self._attempts_count, rng)
+        progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
+        self._compiled = True
+        what = f"Attempting others ({number + 1})" if number else "Attempting"
+        outcome = self._attempts.run(obj, episodes, functools.partial(self._attempting, progress, what))
+        if not outcome.aligned.all():
+            raise ContradictionError(
+                "The trajectory ends nearer to the avoid region than to the graspable part.",
+                "Let it end at the graspable part, or leave out --affordance and --avoid.",
+            )
+        removal, lift = self.task.approach_steps - 1, self._attempts.phases.lift
+        cost = costs(outcome, tuple(request.constraints), removal, lift) + _UNLIKELY * _places(obj, rests, request)
+        holds = outcome.metrics["held"] > 0
+        return _Round(labelled, request, episodes, rests, outcome, cost[:different], holds[:different])
 
     def _attempting(self, progress: Progress, what: str, step: int) -> None:
         """Reports a control step of attempts."""
@@ -243,32 +276,34 @@ class Grasper:
             smaller = obj.scaled(_SMALLER, constant_mass=True)
             trials.append((smaller, "width", f"{100 * _SMALLER:.0f} % of its size"))
         for changed, cause, how in trials:
+            labelled = changed if request.avoid is None else with_avoid(changed, request.avoid)
+            rng, what = np.random.default_rng(self._seed), f"Looking whether its {cause} is the cause"
             try:
-                episodes, _, different = self._episodes(changed, request, np.random.default_rng(self._seed))
+                episodes, _, n = to_attempt(self._hand, self.task, labelled, request, self._attempts_count, rng)
             except CongraspError:
                 continue
-            what = f"Looking whether its {cause} is the cause"
             outcome = self._attempts.run(changed, episodes, functools.partial(self._attempting, progress, what))
-            holds = int((outcome.metrics["held"][:different] > 0).sum())
-            if holds >= _ENOUGH * different:
-                return f"Its {cause} is the cause: with {how} {holds} of {different} attempts hold it."
+            holds = int((outcome.metrics["held"][:n] > 0).sum())
+            if holds >= _ENOUGH * n:
+                return f"Its {cause} is the cause: with {how} {holds} of {n} attempts hold it."
         return ""
 
     def _on_arm(
         self,
         arm: "ArmPlanner",
-        obj: GraspObject,
-        make: Callable[[int], Grasp],
-        order: list[int],
+        tried: _Round,
+        attempts: int,
+        held: int,
         refused: collections.Counter[str],
         progress: Progress,
     ) -> Grasp | None:
-        """The first attempt in `order` that the arm can do, made by `make`; counts the limits that forbid others."""
+        """The best attempt that the arm can do; counts the limits that forbid better ones."""
+        order = [i for i in tried.cost.argsort().tolist() if tried.meets[i]]
         for number, index in enumerate(order):
             progress(f"Moving {arm.name}", number + 1, len(order))
             try:
-                found = make(index)
-                planned = arm.plan(obj, found.motion)
+                found = self._motion(tried, index, attempts, held)
+                planned = arm.plan(tried.obj, found.motion)
                 episode = planned.moved.recorded(found.episode)
                 return dataclasses.replace(found, episode=episode, motion=motion_of_episode(episode), arm=planned)
             except Infeasible as limit:
@@ -277,45 +312,9 @@ class Grasper:
                 refused["contact of every reach"] += 1
         return None
 
-    def _episodes(
-        self, obj: GraspObject, request: GraspRequest, rng: np.random.Generator
-    ) -> tuple[RequestedEpisodes, np.ndarray, int]:
-        """Attempts under the constraints, (B,) the resting pose of each, and how many of them are different."""
-        batch = self._attempts_count
-        labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
-        episodes = repeated(self._hand, self.task, labelled, request, batch)
-        path = prescribed(request)
-        if path is None:
-            position, direction, cross, rests = headings(self._hand, labelled, request, batch, rng)
-            found = {"position": position, "direction": direction, "cross": cross}
-            found = {name: value.astype(np.float32) for name, value in found.items()}
-            episodes = episodes._replace(goal=episodes.goal.replace("heading", **found))
-            different = batch
-        else:
-            reference = valid_rests(self._hand, obj, *path)
-            if request.rest is not None:
-                reference = reference[reference == request.rest]
-            if not len(reference):
-                raise CongraspError(
-                    f"With this reference the hand would be in the table in resting pose {(request.rest or 0) + 1}.",
-                    "Leave out --rest.",
-                )
-            rests, different = np.resize(reference, batch), min(batch, len(reference))
-        return episodes._replace(rest=np.asarray(obj.rest_poses, np.float32)[rests]), rests, different
-
-    def _result(
-        self,
-        obj: GraspObject,
-        request: GraspRequest,
-        outcome: Outcome,
-        wanted: Goal,
-        rests: np.ndarray,
-        attempts: int,
-        held: int,
-        index: int,
-    ) -> Grasp:
-        """One attempt of an outcome, with its episode, motion and the constraints that were active."""
-        labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
+    def _motion(self, tried: _Round, index: int, attempts: int, held: int) -> Grasp:
+        """One attempt, with its episode, motion and the constraints that were active."""
+        obj, given = tried.obj, tried.request.constraints
         about = {
             "actor": "grasp",
             "attempts": attempts,
@@ -323,18 +322,51 @@ class Grasper:
             "object_file_scale": obj.file_scale,
             "object_file_origin": [-x for x in obj.origin],
         }
-        episode = self._attempts.episode(outcome, index, surface_of(self.task, labelled), obj, about)
+        episode = self._attempts.episode(tried.outcome, index, surface_of(self.task, obj), obj, about)
         if approach := self._attempts.phases.approach:
             side = self._arm.side if self._arm else None
             episode = with_planned_reach(episode, self._hand, obj, approach, self._attempts.speed, side)
         if self._left:
             episode = _mirrored(episode, self.hand)
-        asked = tuple(request.constraints)
-        active = explain(asked, bool(outcome.redirected[index]))
-        written = [name for name in asked if name != "heading" or "direction" in request.constraints[name]]
-        avoid = labelled.non_graspable_points
-        active += [found.message for found in contradictions(self._hand, obj.points, avoid, wanted.row(index), written)]
-        return Grasp(episode, motion_of_episode(episode), attempts, held, int(rests[index]), tuple(active))
+        active = explain(tuple(given), bool(tried.outcome.redirected[index]))
+        written = [name for name in given if name != "heading" or "direction" in given[name]]
+        goal = tried.episodes.goal.row(index)
+        against = contradictions(self._hand, obj.points, obj.non_graspable_points, goal, written)
+        active += [found.message for found in against]
+        rest = int(tried.rests[index])
+        return Grasp(episode, motion_of_episode(episode), attempts, held, rest, tuple(active))
+
+
+def open_grasper(
+    policy: pathlib.Path | None,
+    hand: str,
+    attempts: int = ATTEMPTS,
+    seed: int = 0,
+    phases: Phases = PLAIN,
+    arm: ArmOptions = ArmOptions(),  # noqa: B008
+) -> Grasper:
+    """A grasper with a policy file, or the pretrained policy of a hand.
+
+    Args:
+      policy: the file, or None.
+      hand: name of the hand; `human:left` is the left one of `human`.
+      attempts: grasps simulated in parallel.
+      seed: seed of the attempts.
+      phases: approach, lift and hold.
+      arm: the arm that carries the hand, if it names one.
+
+    Raises:
+      CongraspError: there is no such policy, hand or arm, or the arm should carry a left hand.
+    """
+    right, left = right_name(hand)
+    if left and arm.arm:
+        raise CongraspError("An arm carries right hands alone.", "Leave out --arm or :left.")
+    bundle, planner = bundles.load(policy_file(policy, right)), None
+    if arm.arm:
+        from congrasp.services.arm.planner import ArmPlanner
+
+        planner = ArmPlanner(arm, get_hand(bundle.spec.hand), seed)
+    return Grasper(bundle, attempts=attempts, phases=phases, seed=seed, arm=planner, left=left)
 
 
 def grasp(
@@ -370,43 +402,17 @@ def grasp(
     Raises:
       CongraspError: the object cannot be imported, or a constraint cannot be read or kept.
     """
-    right, left = right_name(hand)
-    file = policy_file(None if policy is None else pathlib.Path(policy), right)
-    grasper = _grasper(file, file.stat().st_mtime_ns, attempts, seed, left)
+    file = policy_file(None if policy is None else pathlib.Path(policy), right_name(hand)[0])
+    grasper = _grasper(file, file.stat().st_mtime_ns, hand, attempts, seed)
     obj = mesh if isinstance(mesh, GraspObject) else one_object(pathlib.Path(mesh), options or ImportOptions("guess"))
     request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **constraints)
     return grasper.grasp(obj, request, progress)
 
 
 @functools.lru_cache(maxsize=2)
-def _grasper(file: pathlib.Path, changed: int, attempts: int, seed: int, left: bool) -> Grasper:
+def _grasper(file: pathlib.Path, changed: int, hand: str, attempts: int, seed: int) -> Grasper:
     """The grasper of a policy file, by its time of modification `changed`."""
-    return Grasper(bundles.load(file), attempts=attempts, seed=seed, left=left)
-
-
-def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int) -> RequestedEpisodes:
-    """Request for a labelled object, repeated `batch` times, in the requested resting pose."""
-    rest = np.asarray(obj.rest_poses[request.rest or 0], np.float32)
-    goal, surface, rest = jax.tree.map(
-        lambda array: np.broadcast_to(array, (batch, *np.shape(array))),
-        (goal_of(hand, task, request), surface_of(task, obj), rest),
-    )
-    asked = {c.name: np.full(batch, c.name in request.constraints) for c in optional(task)}
-    return RequestedEpisodes(goal, asked, surface, rest)
-
-
-def surface_of(task: TaskConfig, obj: GraspObject) -> Surface:
-    """Labelled points of an object, as many as the policy observes, with their normals if it observes them."""
-    points = task.surface_points
-    normals = np.asarray(obj.normals[:points], np.float32) if task.surface_normals else None
-    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points], normals)
-
-
-def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
-    """The object with another avoid region, (512,) bool."""
-    return dataclasses.replace(
-        obj, part_names=("graspable", "non-graspable"), graspable=np.array([True, False]), labels=avoid.astype(np.int32)
-    )
+    return open_grasper(file, hand, attempts, seed)
 
 
 def _mirrored(episode: Message, hand: Hand) -> Message:
@@ -456,12 +462,3 @@ def _places(obj: GraspObject, rests: np.ndarray, request: GraspRequest) -> np.nd
         return np.zeros_like(rests)
     upright = upright_rest(obj)
     return rests if upright is None else np.where(rests == upright, 0, rests + (rests < upright))
-
-
-def _check_aligned(outcome: Outcome) -> None:
-    """Raises a ContradictionError if trajectory and affordance exclude each other."""
-    if not outcome.aligned.all():
-        raise ContradictionError(
-            "The trajectory ends nearer to the avoid region than to the graspable part.",
-            "Let it end at the graspable part, or leave out --affordance and --avoid.",
-        )

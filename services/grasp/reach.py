@@ -22,7 +22,7 @@ from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.hands.kinematics import mujoco_link_poses
-from congrasp.services.viz.shapes import upright
+from congrasp.services.viz.shapes import link_frames, upright
 
 SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
 """Limits of the wrist: m/s, m/s^2 and rad/s."""
@@ -262,16 +262,8 @@ def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:
     for name in before:
         if name.startswith("reward/") or name in ("action", "contact_force"):
             before[name] = np.zeros_like(before[name])
-    local = [mujoco_link_poses(hand, q) for q in reach.q]
-    before["link_position"] = np.stack(
-        [turn.apply(links) + at for (links, _), turn, at in zip(local, reach.rotation, reach.position, strict=True)]
-    )
-    before["link_quaternion"] = np.stack(
-        [
-            (turn * Rotation.from_quat(links, scalar_first=True)).as_quat(scalar_first=True)
-            for (_, links), turn in zip(local, reach.rotation, strict=True)
-        ]
-    )
+    frames = [link_frames(hand, *pose) for pose in zip(reach.q, reach.position, reach.rotation, strict=True)]
+    before["link_position"], before["link_quaternion"] = map(np.stack, zip(*frames, strict=True))
     before["q"] = before["q_target"] = reach.q
     before["u"] = before["u_target"] = _wrist_joints(episode, reach)
     joined = {name: np.concatenate([part.astype(arrays[name].dtype), arrays[name]]) for name, part in before.items()}

@@ -21,7 +21,8 @@ from congrasp.common.task.constraints import get_constraint, known, require_know
 from congrasp.common.task.constraints.priority import explain
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.pictures import cause
-from congrasp.services.grasp.grasper import costs, repeated, surface_of
+from congrasp.services.grasp.approaches import repeated, surface_of
+from congrasp.services.grasp.grasper import costs
 from congrasp.services.grasp.reach import with_planned_reach
 from congrasp.services.serve.server import Source
 from congrasp.services.studio.session import SECONDS, Progress

@@ -22,7 +22,7 @@ from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.run_directory import POLICY_FILE, create_run, listening
 from congrasp.services.cli.status import status
-from congrasp.services.cli.view import _of_folder, view
+from congrasp.services.cli.view import View
 from congrasp.services.ops.status import ask, tables, warnings
 from tests.rollouts import ACTION, OBSERVATION, SCHEMA, bundle, rollout
 from tests.waits import eventually
@@ -73,20 +73,22 @@ def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
     with listening(tmp_path / "run", endpoint):
         assert status(tmp_path / "run", json=True) == 0
         assert json.loads(capsys.readouterr().out)["roles"][0]["id"] == "worker-7"
-        connect, run, policy, recordings = _of_folder(tmp_path / "run", None)
-        assert (connect, run, policy, recordings) == (endpoint, "r", None, tmp_path / "run")
+        page = View()._of_folder(tmp_path / "run")
+        assert page == View(connect=endpoint, run="r", recordings=tmp_path / "run")
     (tmp_path / "run" / POLICY_FILE).touch()
-    assert _of_folder(tmp_path / "run", None) == ("", "r", tmp_path / "run" / POLICY_FILE, tmp_path / "run")
+    page = View()._of_folder(tmp_path / "run")
+    assert page == View(run="r", policy=tmp_path / "run" / POLICY_FILE, recordings=tmp_path / "run")
 
 
 def test_a_folder_beside_what_it_stands_for_is_refused(tmp_path):
     folder, other = tmp_path / "run", {"connect": "tcp/127.0.0.1:1"}
     for command, named in (
         *((status, named) for named in (other, {"run": "r"})),
-        *((view, named) for named in (other, {"run": "r"}, {"policy": tmp_path}, {"recordings": tmp_path})),
+        *((View, named) for named in (other, {"run": "r"}, {"policy": tmp_path}, {"recordings": tmp_path})),
     ):
         with pytest.raises(CongraspError, match=r"run is in place of --connect.*\. Give either the folder or these\."):
-            command(folder, **named)
+            called = command(folder, **named)
+            called()  # a page begins when it is called
 
 
 def test_counters_that_do_not_add_up_are_named(endpoint):
