@@ -5,25 +5,29 @@ import pathlib
 import shutil
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
+from rich.console import Console
 
-from congrasp.actors.physics import PhysicsName
+from congrasp.actors.physics import PhysicsName, resolve_physics
 from congrasp.common.config import Split
 from congrasp.common.errors import CongraspError, need_package
+from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import engine_title
+from congrasp.common.task.methods import get_method
+from congrasp.services.assets.objects.named import objects_of
+from congrasp.services.cli.console import in_range, say, tracked
+from congrasp.services.evaluate.experiment import Experiment, Variation
+from congrasp.services.evaluate.lineup import Lineup, Table, facts, line_up, read_entrants
+from congrasp.services.evaluate.plan import objects_label
+from congrasp.services.evaluate.pools import MANY, Exam, exam_pool, folder_pools, procedural_pools
+from congrasp.services.evaluate.results import provenance
+from congrasp.services.evaluate.scores import Row, write_json
+from congrasp.services.evaluate.table import object_table, tables_of
+from congrasp.services.evaluate.tables import Found, Noise, captured, evaluate_tables
+from congrasp.services.viz.sheets import save_png
 
-if TYPE_CHECKING:
-    from congrasp.common.objects.spec import GraspObject
-    from congrasp.services.evaluate.lineup import Lineup
-    from congrasp.services.evaluate.scores import Row
-    from congrasp.services.evaluate.tables import Found
-
-Table = Literal[
-    "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
-]
-Exam = Literal["figures", "development"]
 _PICTURED = 4
 
 
@@ -93,13 +97,6 @@ class Evaluate:
 
     def __call__(self) -> int:
         """Evaluates, and prints and writes the results."""
-        from congrasp.actors.physics import resolve_physics
-        from congrasp.services.assets.objects.named import objects_of
-        from congrasp.services.cli.console import in_range, tracked
-        from congrasp.services.evaluate.experiment import Experiment
-        from congrasp.services.evaluate.lineup import line_up, read_entrants
-        from congrasp.services.evaluate.pools import MANY, exam_pool, folder_pools, procedural_pools
-        from congrasp.services.evaluate.tables import captured, evaluate_tables
 
         in_range(1, episodes=self.episodes)
         in_range(0, pool=self.pool, batch=self.batch)
@@ -151,19 +148,14 @@ class Evaluate:
         """Settings of all episodes."""
         return {"physics": engine, "batch": self.batch, "seed": self.seed, "friction": self.friction}
 
-    def _source(self, lineup: "Lineup") -> str:
+    def _source(self, lineup: Lineup) -> str:
         """Label of the objects, with their scale for the hand if there is one."""
-        from congrasp.services.evaluate.plan import objects_label
 
         labels = list(dict.fromkeys(objects_label(one.policy, self.objects, self.exam) for one, _ in lineup.entrants))
         return labels[0] if len(labels) == 1 else f"{labels[0].partition(',')[0]} in each hand's size"
 
-    def _show(self, results: "Sequence[Found]", lineup: "Lineup", engine: str) -> None:
+    def _show(self, results: Sequence[Found], lineup: Lineup, engine: str) -> None:
         """Prints the tables, the effect of the rules for headings, the references' source, and skipped rows."""
-        from rich.console import Console
-
-        from congrasp.services.cli.console import say
-        from congrasp.services.evaluate.table import object_table, tables_of
 
         console, rows = Console(highlight=False, width=None if sys.stdout.isatty() else 160), _rows(results)
         what = f"{_who(lineup)}, on {self._source(lineup)}, {engine_title(engine)}, friction {self.friction:g}"
@@ -175,11 +167,8 @@ class Evaluate:
         say(*dict.fromkeys(found.references for found in results if found.references))
         say(*dict.fromkeys(f"Left out: {error}" for found in results for error in found.left_out))
 
-    def _write(self, results: "Sequence[Found]", lineup: "Lineup", engine: str) -> None:
+    def _write(self, results: Sequence[Found], lineup: Lineup, engine: str) -> None:
         """Writes the rows, with policies, settings and provenance, to the JSON file."""
-        from congrasp.services.evaluate.lineup import facts
-        from congrasp.services.evaluate.results import provenance
-        from congrasp.services.evaluate.scores import write_json
 
         policies = [facts(one) for one, _ in lineup.entrants]
         rules = {
@@ -204,7 +193,7 @@ class Evaluate:
         write_json(_rows(results), self.json, about)
 
 
-def _rows(results: "Sequence[Found]") -> "list[Row]":
+def _rows(results: Sequence[Found]) -> list[Row]:
     """The rows of all policies."""
     return [row for found in results for row in found.rows]
 
@@ -219,9 +208,8 @@ def _check_hand(made_for: str, hands: Sequence[str]) -> None:
             )
 
 
-def _who(lineup: "Lineup") -> str:
+def _who(lineup: Lineup) -> str:
     """Describes what was evaluated: a policy, a method without one, or several."""
-    from congrasp.common.task.methods import get_method
 
     if len(lineup.entrants) > 1:
         return f"{len(lineup.entrants)} policies"
@@ -232,13 +220,10 @@ def _who(lineup: "Lineup") -> str:
     return f"method {one.method}, {what}" if get_method(one.method).learns else f"method {one.method}"
 
 
-def _draw(found: "Found", pictures: pathlib.Path) -> None:
+def _draw(found: Found, pictures: pathlib.Path) -> None:
     """Draws curves and examples of noisy references, and episodes of the rows without a change."""
-    from congrasp.services.evaluate.experiment import Variation
     from congrasp.services.evaluate.pictures import failure_sheets, save_noise_examples
     from congrasp.services.evaluate.plots import draw_noise
-    from congrasp.services.evaluate.tables import Noise
-    from congrasp.services.viz.sheets import save_png
 
     policy = found.experiment.policy
     if noisy := found.of(Noise):

@@ -2,14 +2,30 @@
 
 import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, Annotated, Literal
+import shlex
+from typing import Annotated, Literal
 
+import jax
 import tyro
 
 from congrasp.actors.physics import PhysicsName
-
-if TYPE_CHECKING:
-    from congrasp.services.assets.hands.model_files import Choices, Proposal
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder, own_hands
+from congrasp.common.hands.files import hand_text
+from congrasp.common.hands.meshes import load_meshes, save_meshes
+from congrasp.common.hands.skin import skin_of_meshes
+from congrasp.common.io.files import write_atomically
+from congrasp.common.policy.pretrained import pretrained_file
+from congrasp.common.runtime.parallel import cores
+from congrasp.services.assets.hands.check import check_hand, write_findings
+from congrasp.services.assets.hands.model_files import Choices, Proposal, describe
+from congrasp.services.assets.hands.model_files import import_hand as proposed
+from congrasp.services.cli.console import in_range, say, show_table
+from congrasp.services.train import launch
+from congrasp.services.train.own_hand import Request, train_hand
+from congrasp.services.train.presets import recipe
+from congrasp.services.viz.hand_sheets import check_sheet, hands_sheet, joints_sheet
+from congrasp.services.viz.sheets import save_png
 
 
 def list_hands() -> int:
@@ -18,11 +34,6 @@ def list_hands() -> int:
     Examples:
       congrasp hands list
     """
-
-    from congrasp.common.errors import CongraspError
-    from congrasp.common.hands import HANDS, get_hand, hands_folder, own_hands
-    from congrasp.common.policy.pretrained import pretrained_file
-    from congrasp.services.cli.console import show_table
 
     rows, missing = [], []
     own, folder = own_hands(), hands_folder()
@@ -61,11 +72,6 @@ def sheet(
       congrasp hands sheet human
       congrasp hands sheet allegro sharpa --out robot-hands.png
     """
-    from congrasp.common.hands import get_hand, own_hands
-    from congrasp.common.hands.meshes import load_meshes
-    from congrasp.common.hands.skin import skin_of_meshes
-    from congrasp.services.viz.hand_sheets import hands_sheet
-    from congrasp.services.viz.sheets import save_png
 
     found = [get_hand(name) for name in hands]
     files = [own_hands().get(name, pathlib.Path(name)) for name in hands]
@@ -108,10 +114,6 @@ def import_hand(
       congrasp hands import hand.urdf
       congrasp hands import hand.xml --name mine --palm palm_link
     """
-    from congrasp.common.errors import CongraspError
-    from congrasp.common.hands import SUFFIX
-    from congrasp.services.assets.hands.model_files import Choices
-    from congrasp.services.assets.hands.model_files import import_hand as proposed
 
     proposal = proposed(file, Choices(name, palm, thumb, object_scale, collision == "own"))
     if out is not None and out.suffix != SUFFIX:
@@ -122,17 +124,8 @@ def import_hand(
     return 0
 
 
-def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | None) -> None:
+def _keep(proposal: Proposal, out: pathlib.Path | None, png: pathlib.Path | None) -> None:
     """Writes a hand's file and picture, by default to the folder of custom hands, and prints a description."""
-    from congrasp.common.errors import CongraspError
-    from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder
-    from congrasp.common.hands.files import hand_text
-    from congrasp.common.hands.meshes import save_meshes
-    from congrasp.common.io.files import write_atomically
-    from congrasp.services.assets.hands.model_files import describe
-    from congrasp.services.cli.console import say
-    from congrasp.services.viz.hand_sheets import joints_sheet
-    from congrasp.services.viz.sheets import save_png
 
     hand = proposal.hand
     if hand.name in HANDS:
@@ -169,12 +162,6 @@ def check(
       congrasp hands check allegro
       congrasp hands check my_hand --png check.png --json check.json
     """
-    from congrasp.common.hands import get_hand
-    from congrasp.common.runtime.parallel import cores
-    from congrasp.services.assets.hands.check import check_hand, write_findings
-    from congrasp.services.train.presets import recipe
-    from congrasp.services.viz.hand_sheets import check_sheet
-    from congrasp.services.viz.sheets import save_png
 
     found = get_hand(hand)
     checked = check_hand(found, recipe(found).task, cores())
@@ -229,19 +216,10 @@ class Train:
 
     def __call__(self) -> int:
         """Imports, checks, trains and evaluates."""
-        import shlex
-
-        import jax
-
-        from congrasp.common.hands import get_hand
-        from congrasp.services.assets.hands.model_files import Choices
-        from congrasp.services.cli.console import in_range
-        from congrasp.services.train.launch import accelerators
-        from congrasp.services.train.own_hand import Request, train_hand
 
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
-        full = accelerators()[0] != "cpu"
+        full = launch.accelerators()[0] != "cpu"
         jax.config.update("jax_platforms", "cpu")  # the stages are separate processes, each with the whole GPU memory
         reference = _taken(self.hand, Choices(self.name, self.palm, self.thumb, self.object_scale))
         found = get_hand(reference)
@@ -262,10 +240,8 @@ class Train:
         return 0
 
 
-def _taken(hand: str, choices: "Choices") -> str:
+def _taken(hand: str, choices: Choices) -> str:
     """Name of a hand in commands; that of a URDF or MJCF is imported, unless it was before."""
-    from congrasp.common.hands import SUFFIX, own_hands
-    from congrasp.services.assets.hands.model_files import import_hand as proposed
 
     file = pathlib.Path(hand)
     if not file.is_file() or file.suffix == SUFFIX:

@@ -6,6 +6,7 @@ import pathlib
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.config import MetricWriter, RunConfig, run_config_from_json, to_json
+from congrasp.common.errors import CongraspError
 from congrasp.common.transport.ports import LEARNER_URL, rank_url, reachable_url
 from congrasp.services.cli.train import defaults as defaults
 from congrasp.services.ops.logs import Watch, log, logging_as
@@ -49,6 +50,16 @@ class Options:
     """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there, for `wandb
     sync`), wandb (needs an account); without a name, none."""
 
+    def prepare(self, config: RunConfig) -> None:
+        """Creates the directory of the run, or stores the configuration with which it continues."""
+        from congrasp.common.policy import bundle as bundles
+        from congrasp.learner.run_directory import CONFIG_FILE, continue_run, create_run
+
+        if self.resume or (self.or_resume and (self.run_dir / CONFIG_FILE).exists()):
+            continue_run(self.run_dir, config)
+        else:
+            create_run(self.run_dir, config, bundles.load(self.initial) if self.initial else None)
+
 
 def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:  # noqa: B008
     """Run only the learner; actors on this or other machines connect to it with `congrasp actor --connect`.
@@ -65,11 +76,9 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
       congrasp learner --preset human --run-dir runs/human --listen tls/0.0.0.0:7447 --certs certs
       congrasp learner --run-dir runs/human --resume
     """
-    from congrasp.common.errors import CongraspError
-    from congrasp.common.policy import bundle as bundles
     from congrasp.common.transport import urls
     from congrasp.learner.distributed.ranks import Ranks, end_process
-    from congrasp.learner.run_directory import CONFIG_FILE, continue_run, create_run, listening
+    from congrasp.learner.run_directory import listening
     from congrasp.services.ops.shutdown import on_signal
     from congrasp.services.train.learn import learn, longest_rollout
 
@@ -87,10 +96,8 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
                 longest_rollout=longest_rollout(config) if options.ranks == 1 else None,  # others use rank 0's settings
             ) as transport,
         ):
-            if rank == 0 and (options.resume or (options.or_resume and (run_dir / CONFIG_FILE).exists())):
-                continue_run(run_dir, config)
-            elif rank == 0:
-                create_run(run_dir, config, bundles.load(options.initial) if options.initial else None)
+            if rank == 0:
+                options.prepare(config)
             ranks = Ranks.join(rank, options.ranks, options.coordinator)
             config = run_config_from_json(ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
             with (

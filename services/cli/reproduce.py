@@ -4,14 +4,19 @@ import dataclasses
 import pathlib
 import shlex
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
-
-if TYPE_CHECKING:
-    from congrasp.services.evaluate.lineup import Entrant
-    from congrasp.services.reproduce.plan import RequiredPolicy
+from congrasp.common.hands import get_hand
+from congrasp.common.policy.pretrained import pretrained_hands
+from congrasp.services.cli.console import in_range, tracked
+from congrasp.services.evaluate.lineup import Entrant, read_entrants
+from congrasp.services.ops.children import command
+from congrasp.services.reproduce.comparison import summary
+from congrasp.services.reproduce.page import JSON, LATEX, PAGE
+from congrasp.services.reproduce.plan import BASELINES, RequiredPolicy, policies
+from congrasp.services.reproduce.run import Request, reproduce, to_train
+from congrasp.services.train import launch
 
 _QUICK, _FULL = (48, 24), (1000, 64)
 """Episodes of a row, and procedural objects."""
@@ -64,12 +69,6 @@ class Reproduce:
 
     def __call__(self) -> int:
         """Trains, evaluates, and prints a summary."""
-        from congrasp.common.policy.pretrained import pretrained_hands
-        from congrasp.services.cli.console import in_range, tracked
-        from congrasp.services.reproduce.comparison import summary
-        from congrasp.services.reproduce.page import JSON, LATEX, PAGE
-        from congrasp.services.reproduce.plan import BASELINES, policies
-        from congrasp.services.reproduce.run import Request, reproduce, to_train
 
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
@@ -103,18 +102,13 @@ class Reproduce:
 
     def _command(self) -> str:
         """The command line, with the options that are set."""
-        words = ["congrasp", "reproduce"]
-        for field in dataclasses.fields(self):
-            if (value := getattr(self, field.name)) != field.default:
-                values = value if isinstance(value, tuple) else () if value is True else (value,)
-                words += [f"--{field.name}", *map(str, values)]
-        return shlex.join(words)
+        usual = vars(Reproduce())
+        given = {name: value for name, value in vars(self).items() if value != usual[name]}
+        return shlex.join(command("congrasp", "reproduce", **given))
 
 
 def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
     """Raises a CongraspError for an unknown hand or method."""
-    from congrasp.common.hands import get_hand
-    from congrasp.services.reproduce.plan import BASELINES
 
     for name in hands:
         if get_hand(name).name != name:
@@ -123,10 +117,8 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
         raise CongraspError(f"There is no method '{min(unknown)}'.", f"Choose from: {', '.join(BASELINES)}.")
 
 
-def _given(texts: tuple[str, ...], needed: "list[RequiredPolicy]") -> "dict[RequiredPolicy, Entrant]":
+def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[RequiredPolicy, Entrant]:
     """Policies by hand and method; raises a CongraspError for one that no table needs."""
-    from congrasp.services.evaluate.lineup import read_entrants
-    from congrasp.services.reproduce.plan import RequiredPolicy
 
     found = {RequiredPolicy(one.hand, one.method): one for one in read_entrants(texts)}
     for policy, one in found.items():
@@ -140,9 +132,8 @@ def _given(texts: tuple[str, ...], needed: "list[RequiredPolicy]") -> "dict[Requ
 
 def _check_device(wanted: list[str]) -> None:
     """Raises a CongraspError if policies must be trained and there is no GPU."""
-    from congrasp.services.train.launch import accelerators
 
-    if wanted and accelerators()[0] == "cpu":
+    if wanted and launch.accelerators()[0] == "cpu":
         raise CongraspError(
             f"{', '.join(wanted)} must be trained first, and this machine has no GPU.",
             "Use --quick, which takes the pretrained policies, or name policies with --policy.",

@@ -22,6 +22,7 @@ Everything else is the same for all hands.
 
 import dataclasses
 import pathlib
+from typing import Any
 
 from congrasp.common.config import CurriculumConfig, NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, Split
 from congrasp.common.errors import CongraspError
@@ -183,13 +184,14 @@ def easier(config: RunConfig) -> list[str]:
     return words
 
 
-def get_preset(name: str, hand: str | None = None) -> RunConfig:
+def get_preset(name: str, hand: str | None = None, **sizes: int) -> RunConfig:
     """Returns the preset of this name for a hand, or for its default hand.
 
     Args:
       name: one of `PRESETS`.
       hand: the name, file or text of a hand. A full task depends on the hand (`services.train.presets`); in the others
         only the hand changes.
+      **sizes: other numbers of `environments` and `rollout_steps`; 0 keeps that of the preset.
 
     Raises:
       CongraspError: there is no such preset or hand; the message lists the available ones.
@@ -197,8 +199,11 @@ def get_preset(name: str, hand: str | None = None) -> RunConfig:
     if name not in PRESETS:
         raise CongraspError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(PRESETS)}.")
     if name in _SHORT:
-        return with_hand(_SHORT[name], hand)
-    return recipe(get_hand(hand or (name if name in FULL_FOR else "human")))
+        config = with_hand(_SHORT[name], hand)
+    else:
+        config = recipe(get_hand(hand or (name if name in FULL_FOR else "human")))
+    changed: dict[str, Any] = {size: value for size, value in sizes.items() if value}
+    return dataclasses.replace(config, **changed)
 
 
 def with_hand(config: RunConfig, hand: str | None) -> RunConfig:
