@@ -15,12 +15,10 @@ from congrasp.common.config import Split
 from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import engine_title
-from congrasp.common.task.methods import get_method
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.cli.console import in_range, say, tracked
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.evaluate.lineup import Lineup, Table, facts, line_up, read_entrants
-from congrasp.services.evaluate.plan import objects_label
 from congrasp.services.evaluate.pools import MANY, Exam, exam_pool, folder_pools, procedural_pools
 from congrasp.services.evaluate.results import provenance
 from congrasp.services.evaluate.scores import Row, write_json
@@ -122,7 +120,7 @@ class Evaluate:
             )
             if self.constraints is not None:
                 sets = captured(self.constraints, self.split, given)
-                _check_hand(sets.hand, [one.hand for one, _ in lineup.entrants])
+                lineup.require(sets.hand)
                 without = sorted({obj.name for obj in given} - {obj.name for obj in sets.objects})
                 experiment = dataclasses.replace(
                     experiment, objects=sets.objects, constraints=sets.bank, paper=sets.paper
@@ -148,17 +146,12 @@ class Evaluate:
         """Settings of all episodes."""
         return {"physics": engine, "batch": self.batch, "seed": self.seed, "friction": self.friction}
 
-    def _source(self, lineup: Lineup) -> str:
-        """Label of the objects, with their scale for the hand if there is one."""
-
-        labels = list(dict.fromkeys(objects_label(one.policy, self.objects, self.exam) for one, _ in lineup.entrants))
-        return labels[0] if len(labels) == 1 else f"{labels[0].partition(',')[0]} in each hand's size"
-
     def _show(self, results: Sequence[Found], lineup: Lineup, engine: str) -> None:
         """Prints the tables, the effect of the rules for headings, the references' source, and skipped rows."""
 
         console, rows = Console(highlight=False, width=None if sys.stdout.isatty() else 160), _rows(results)
-        what = f"{_who(lineup)}, on {self._source(lineup)}, {engine_title(engine)}, friction {self.friction:g}"
+        where = f"{lineup.objects(self.objects, self.exam)}, {engine_title(engine)}, friction {self.friction:g}"
+        what = f"{lineup.title}, on {where}"
         for shown in tables_of(rows, what, lineup.missing) + ([object_table(rows)] if self.by == "object" else []):
             console.print(shown.terminal())
         for (one, _), found in zip(lineup.entrants, results, strict=True):
@@ -183,7 +176,7 @@ class Evaluate:
             "missing": [one._asdict() for one in lineup.missing],
             "headings": lineup.entrants[0][0].policy.task.headings,
             "heading_rules": rules,
-            "objects": self._source(lineup),
+            "objects": lineup.objects(self.objects, self.exam),
             "exam": None if self.objects else self.exam,
             "constraints": str(self.constraints) if self.constraints else None,
             "split": self.split if self.constraints else None,
@@ -196,28 +189,6 @@ class Evaluate:
 def _rows(results: Sequence[Found]) -> list[Row]:
     """The rows of all policies."""
     return [row for found in results for row in found.rows]
-
-
-def _check_hand(made_for: str, hands: Sequence[str]) -> None:
-    """Raises a CongraspError unless captured constraints belong to these hands."""
-    for hand in hands:
-        if hand != made_for:
-            raise CongraspError(
-                f"The constraint sets are for the hand '{made_for}', the policy for '{hand}'.",
-                f"Generate them for it with 'congrasp constraints import … --hand {hand}'.",
-            )
-
-
-def _who(lineup: Lineup) -> str:
-    """Describes what was evaluated: a policy, a method without one, or several."""
-
-    if len(lineup.entrants) > 1:
-        return f"{len(lineup.entrants)} policies"
-    ((one, _),) = lineup.entrants
-    what = f"{one.file.name}, version {one.policy.version}"
-    if one.method == "ours":
-        return what
-    return f"method {one.method}, {what}" if get_method(one.method).learns else f"method {one.method}"
 
 
 def _draw(found: Found, pictures: pathlib.Path) -> None:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from typing_extensions import Doc
 
-from congrasp.common.errors import CongraspError, need_package, printable
+from congrasp.common.errors import CongraspError, printable
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.arm.options import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
@@ -18,7 +18,6 @@ from congrasp.services.cli.console import say
 
 if TYPE_CHECKING:
     from congrasp.services.grasp.jobs import Result
-    from congrasp.services.viz.render import Film
 
 NOT_HELD, BAD_INPUT = 1, 2
 _MOST_ATTEMPTS = 1024
@@ -105,6 +104,7 @@ class Grasp:
         from congrasp.services.cli.console import bars, in_range
         from congrasp.services.grasp.grasper import open_grasper
         from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
+        from congrasp.services.viz.render import film_of
         from congrasp.services.viz.views import view_of
 
         if not self.objects:
@@ -122,7 +122,7 @@ class Grasp:
             self.out,
             self.mesh,
             dataclasses.asdict(self.constraint),
-            _film(self.size, self.fps, self.overlays) if self.video else None,
+            film_of(self.size, self.fps, self.overlays) if self.video else None,
             view_of(self.camera),
             self.pictures,
             self.again,
@@ -172,21 +172,3 @@ def _conclude(results: "list[Result]", found: int, out: pathlib.Path) -> int:
 
 
 COMMAND = Grasp
-
-
-def _film(size: str, fps: float, overlays: bool) -> "Film":
-    """Style of the video."""
-    from congrasp.services.viz.render import Film
-
-    need_package("--video", "imageio_ffmpeg")
-    return Film(_pixels(size), fps, overlays)
-
-
-def _pixels(text: str) -> tuple[int, int]:
-    """Width and height of WIDTHxHEIGHT, even and from 64 to 4096 pixels."""
-    numbers = text.lower().split("x")
-    if len(numbers) == 2 and all(word.isdecimal() and len(word) < 5 for word in numbers):
-        width, height = map(int, numbers)
-        if all(64 <= side <= 4096 and side % 2 == 0 for side in (width, height)):
-            return width, height
-    raise CongraspError(f"--size is '{text}'.", "Write two even numbers from 64 to 4096: --size 1920x1080")

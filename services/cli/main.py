@@ -49,7 +49,9 @@ COMMANDS = {
     "certs": "certificates for mutual TLS between the processes of a run",
     "doctor": "what is wrong with this machine or installation",
 }
-"""Commands in the order of the help; `services.cli.<name>` is the module."""
+"""Commands in the order of the help."""
+_MODULES = {"audit": "ops.audit", "doctor": "ops.doctor"}
+"""Modules in `services` of commands that are not in `services.cli`."""
 
 _READ = {".obj", ".stl", ".ply", ".glb", ".npz", ".csv", ".bvh", ".mcap", ".safetensors", ".urdf", ".xml"}
 """Suffixes of files that commands read."""
@@ -188,12 +190,16 @@ def _is_there(path: pathlib.Path) -> bool:
     return True
 
 
+def module_of(name: str) -> Any:
+    """Returns the module of a command."""
+    return importlib.import_module(f"congrasp.services.{_MODULES.get(name, f'cli.{name}')}")
+
+
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
     """Returns the command's module as a function from its arguments to the requested call."""
-    module = importlib.import_module(f"congrasp.services.cli.{name}")
     from congrasp.services.cli import parser
 
-    prog = f"congrasp {name}"
+    module, prog = module_of(name), f"congrasp {name}"
     if hasattr(module, "COMMANDS"):
         return parser.of_group(module.COMMANDS, prog, inspect.getdoc(module))
     return parser.of_command(module.COMMAND, prog, getattr(module, "defaults", lambda rest: {}))

@@ -47,7 +47,7 @@ EPISODE = "episode.png"
 _EVALUATION_OBJECTS = 12
 _LINE_SECONDS = 10.0
 _SPACE = 64 << 10  # bytes below which a disk counts as full
-console = Console(highlight=False)
+console = Console(highlight=False, soft_wrap=True)
 
 
 def run_training(
@@ -90,7 +90,7 @@ def run_training(
                 with _full_disk_named(run_dir):
                     train(run_dir, config, plan, stop=stop, report=progress.show, notify=_warn)
         if stop.is_set():
-            console.print(f"Stopped. To resume: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
+            console.print(f"Stopped. To resume: {_command()} train --resume --run-dir {run_dir}")
             return stop.exit_code
         console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
         if evaluation:
@@ -101,7 +101,7 @@ def run_training(
 
 def _warn(text: str) -> None:
     """Prints a line about the run's processes."""
-    console.print(f"  {text}", style="yellow", markup=False, soft_wrap=True)
+    console.print(f"  {text}", style="yellow", markup=False)
 
 
 def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None, *, resume: bool) -> None:
@@ -110,7 +110,7 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
         continue_run(run_dir, config)
         if not has_checkpoints(run_dir):
             raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start again in another --run-dir.")
-        Checkpoints(run_dir / CHECKPOINTS).find(lambda level, text: console.print(text, markup=False, soft_wrap=True))
+        Checkpoints(run_dir / CHECKPOINTS).find(lambda level, text: console.print(text, markup=False))
         return
     if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / CONFIG_FILE).exists():
         raise CongraspError(f"{run_dir} is not empty and is not a run.", "Choose another --run-dir.")
@@ -121,7 +121,6 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
         console.print(
             f"The critic of {initial} has other privileged inputs than this run; the new ones start at zero weight.",
             markup=False,
-            soft_wrap=True,
         )
 
 
@@ -131,14 +130,12 @@ def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:
     console.print(
         f"[bold]{config.name}[/]: {config.updates} updates of {ranks * _steps_per_update(config)} steps, "
         f"{ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on '{plan.physics}' in "
-        f"{run_dir}",
-        soft_wrap=True,
+        f"{run_dir}"
     )
     simplifications = easier(config)
     if simplifications:
         console.print(
-            f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is --preset {FULL}, for a GPU.",
-            soft_wrap=True,
+            f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is --preset {FULL}, for a GPU."
         )
 
 
@@ -147,8 +144,7 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
     row = _evaluate(bundles.load(run_dir / POLICY_FILE), config, episodes, run_dir)
     console.print(
         f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval {100 * row.success_low:.1f} to "
-        f"{100 * row.success_high:.1f}): {row.links_at_removal:.1f} links touch the object when the table is removed.",
-        soft_wrap=True,
+        f"{100 * row.success_high:.1f}): {row.links_at_removal:.1f} links touch the object when the table is removed."
     )
     _live_query(run_dir, config.task.hand)
 
@@ -192,22 +188,20 @@ class _Progress:
         self._last = 0.0
         self._first: tuple[float, float] | None = None
         self._line = self._printed = ""
-        self._live = console.status("compiling, and filling the first batch") if console.is_terminal else None
+        self._live = console.status("compiling, and filling the first batch")  # of a terminal
 
     def __enter__(self) -> Self:
-        if self._live:
-            self._live.start()
+        self._live.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        if self._live:
-            self._live.stop()
+        self._live.stop()
         self._print()
 
     def update(self, values: dict[str, float]) -> None:
         """Shows the metrics of an update of this process's learner, and the duration of the start after the first."""
         if self._first is None:
-            console.print(f"  [dim]{first_update()}[/]", soft_wrap=True)
+            console.print(f"  [dim]{first_update()}[/]")
         self.show({"values": values, "actors": 1, "version": int(values["version"])})
 
     def show(self, status: dict[str, Any]) -> None:
@@ -219,16 +213,15 @@ class _Progress:
             self._line = (
                 f"compiling, and filling the first batch: {now - self._began:.0f} s, {status['actors']} actor(s)"
             )
-        if self._live:
-            self._live.update(self._line)
-        elif now - self._last >= _LINE_SECONDS:
+        self._live.update(self._line)
+        if not console.is_terminal and now - self._last >= _LINE_SECONDS:
             self._last = now
             self._print()
 
     def _print(self) -> None:
         """Prints the line if it has changed."""
         if self._line != self._printed:
-            console.print(f"  {self._line}", soft_wrap=True)
+            console.print(f"  {self._line}")
             self._printed = self._line
 
     def _progress(self, status: dict[str, Any], now: float) -> str:
@@ -285,7 +278,7 @@ def _live_query(run_dir: pathlib.Path, hand: str) -> None:
         episode = example_episode(HELD_OUT_SEED, hand)
         with PolicyClient(endpoint, hand=episode.hand, wait=180.0, timeout=5.0) as client:
             client.metadata()
-            console.print(one_answer(client, episode), markup=False, soft_wrap=True)
+            console.print(one_answer(client, episode), markup=False)
 
 
 def _next_steps(run_dir: pathlib.Path) -> None:
@@ -301,7 +294,7 @@ def _next_steps(run_dir: pathlib.Path) -> None:
     ]
     console.print("\n[bold]Next[/]")
     for what, why in rows:
-        console.print(f"  {what}\n      {why}", soft_wrap=True)
+        console.print(f"  {what}\n      {why}")
 
 
 def _command() -> str:

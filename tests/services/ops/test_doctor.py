@@ -18,9 +18,9 @@ from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
-from congrasp.services.cli.doctor import doctor as command
 from congrasp.services.ops import doctor
 from congrasp.services.ops.certificates import create_authority, issue
+from congrasp.services.ops.doctor import doctor as command
 
 ALWAYS = ("python", "mujoco", "mujoco-mjx", "jax", "flax", "eclipse-zenoh", "gpu", "ports", "disk", "clock")
 

@@ -24,7 +24,7 @@ CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=
 def said(monkeypatch):
     """What was printed so far, as lines."""
     output = io.StringIO()
-    monkeypatch.setattr(command, "console", Console(file=output, width=200))
+    monkeypatch.setattr(command, "console", Console(file=output, width=200, soft_wrap=True))
     return lambda: output.getvalue().splitlines()
 
 
