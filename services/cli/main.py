@@ -64,17 +64,8 @@ UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PATH = (
-    errno.ENOENT,
-    errno.ENOTDIR,
-    errno.EISDIR,
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.ENAMETOOLONG,
-    errno.ELOOP,
-    errno.EEXIST,
-)
+_UNUSABLE = "ENOENT ENOTDIR EISDIR EACCES EPERM EROFS ENAMETOOLONG ELOOP EEXIST"
+_PATH = [getattr(errno, name) for name in _UNUSABLE.split()]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -101,9 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
-    if code in SIGNALLED or (
-        alone and _late_threads()
-    ):  # native code of a daemon thread aborts in the interpreter's shutdown
+    # Native code of a daemon thread that is late, such as one that closes Zenoh, aborts in the interpreter's shutdown.
+    late = [thread for thread in threading.enumerate() if thread.daemon and thread.name != SIGNALS]
+    if code in SIGNALLED or (alone and late):
         _last_words(sys.stderr)
         os._exit(code)
     sys.exit(code)
@@ -150,11 +141,6 @@ def run(arguments: list[str]) -> int:
             result = None
             stop.wait(1.0)  # the thread that records the signal may be slightly late
         return stop.exit_code or (result if isinstance(result, int) else 0)
-
-
-def _late_threads() -> bool:
-    """True if a daemon thread, such as one that closes a Zenoh session, has missed its deadline and still runs."""
-    return any(thread.daemon and thread.name != SIGNALS for thread in threading.enumerate())
 
 
 def _check_files(arguments: Sequence[str]) -> None:

@@ -156,25 +156,18 @@ def _dataclass(info: tyro.constructors.StructTypeInfo) -> tyro.constructors.Stru
                 field.name,
                 _described(field.name, hints[field.name]),
                 getattr(source, field.name, tyro.MISSING),
-                functools.partial(_meaning, info.type, field.name),
+                functools.partial(_meanings(info.type).get, field.name),
             )
             for field in dataclasses.fields(info.type)
         ),
     )
 
 
-def _meaning(kind: type, field: str) -> str | None:
-    """Help of a field, on one line: the string under it."""
-    for base in kind.__mro__:
-        if found := _meanings(base).get(field):
-            return found
-    return None
-
-
 @functools.cache
 def _meanings(kind: type) -> Mapping[str, str]:
-    """Help of the fields of one class."""
-    if kind is object:
-        return types.MappingProxyType({})
-    params = docstring_parser.parse_from_object(kind).params
-    return {param.arg_name: _CONTINUED.sub(" ", param.description) for param in params if param.description}
+    """Help of the fields of a class, each on one line: the string under it."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__[:-1]):
+        params = docstring_parser.parse_from_object(base).params
+        found |= {one.arg_name: _CONTINUED.sub(" ", one.description) for one in params if one.description}
+    return types.MappingProxyType(found)

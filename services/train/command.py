@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator
 from typing import Any, Self
 
-import numpy as np
 from rich.console import Console
 
 from congrasp.common.config import ObjectsConfig, RunConfig
@@ -32,7 +31,6 @@ from congrasp.learner.run_directory import (
 )
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.experiment import Experiment, Variation
-from congrasp.services.evaluate.scores import Row
 from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.shutdown import on_signal
 from congrasp.services.serve.load import example_episode, one_answer, serving
@@ -139,16 +137,6 @@ def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:
         )
 
 
-def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
-    """Shows the results of the training: success, a picture, and a live query."""
-    row = _evaluate(bundles.load(run_dir / POLICY_FILE), config, episodes, run_dir)
-    console.print(
-        f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval {100 * row.success_low:.1f} to "
-        f"{100 * row.success_high:.1f}): {row.links_at_removal:.1f} links touch the object when the table is removed."
-    )
-    _live_query(run_dir, config.task.hand)
-
-
 def _check(config: RunConfig) -> None:
     """Raises a `CongraspError` for settings with which the run's processes would end at once."""
     make_algorithm(policy_spec(config.task, config.network), config)
@@ -230,14 +218,14 @@ class _Progress:
         update = values["transitions"] / self._steps
         self._first = self._first or (now, update)
         pace = (update - self._first[1]) / max(now - self._first[0], 1e-6)
-        left = (updates - update) / pace if pace > 0 else float("nan")
+        left = int((updates - update) / pace) if pace > 0 else -1
         return (
             f"update {update:4.0f}/{updates}  {values['steps_per_second']:6.0f} steps/s  "
             f"version {status['version']}  lag {values.get('staleness_mean', 0.0):.1f}  "
             f"success {100 * values.get('episode/success', float('nan')):5.1f} %  "
             f"links {values.get('episode/links_at_removal', float('nan')):4.1f}  "
             f"return {values.get('episode/return', float('nan')):6.1f}  actors {status['actors']}  "
-            f"left {_minutes(left)}"
+            f"left {f'{left // 60}:{left % 60:02d}' if left >= 0 else '?'}"
         )
 
 
@@ -252,30 +240,25 @@ def _steps_per_update(config: RunConfig) -> int:
     return config.rollout_steps * config.environments * config.rollouts_per_update
 
 
-def _minutes(seconds: float) -> str:
-    """Formats a duration as minutes and seconds; `?` if it is not known."""
-    return "?" if not np.isfinite(seconds) else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
-
-
-def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, run_dir: pathlib.Path) -> Row:
-    """Evaluates headings on held-out objects, and draws one of the episodes, a success if there is one."""
+def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
+    """Evaluates headings on held-out objects, draws an episode, a success if there is one, and queries a server."""
     objects = config.objects
     if not objects.folder:
         objects = ObjectsConfig(families=objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
     pool = load_pool(objects)
     console.print(f"Evaluating {episodes} episodes on {len(pool)} objects that no training sees …")
-    policy = dataclasses.replace(policy, task=config.task)
+    policy = dataclasses.replace(bundles.load(run_dir / POLICY_FILE), task=config.task)
     heading = Experiment(policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps)
     (result,) = heading.run([Variation()], keep=True)
     save_png(run_dir / EPISODE, episode_sheet(result.examples(1, 1)[-1]))
-    return result.row
-
-
-def _live_query(run_dir: pathlib.Path, hand: str) -> None:
-    """Starts a policy server in a separate process, and queries one action."""
+    row = result.row
+    console.print(
+        f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval {100 * row.success_low:.1f} to "
+        f"{100 * row.success_high:.1f}): {row.links_at_removal:.1f} links touch the object when the table is removed."
+    )
     console.print("\n[bold]One live query[/] of a policy server in a separate process:")
     with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
-        episode = example_episode(HELD_OUT_SEED, hand)
+        episode = example_episode(HELD_OUT_SEED, config.task.hand)
         with PolicyClient(endpoint, hand=episode.hand, wait=180.0, timeout=5.0) as client:
             client.metadata()
             console.print(one_answer(client, episode), markup=False)
