@@ -136,9 +136,4 @@ def startup(
     return 0
 
 
-COMMANDS = {
-    "physics": physics,
-    "query": query,
-    "scaling": scaling,
-    "startup": startup,
-}
+COMMANDS = {"physics": physics, "query": query, "scaling": scaling, "startup": startup}

@@ -58,7 +58,7 @@ def save_picture(path: pathlib.Path | None, draw: Callable[[], np.ndarray]) -> N
         print(f"The picture is {path}.")
 
 
-def report_error(error: CongraspError) -> None:
+def report_error(error: CongraspError | str) -> None:
     """Prints an error that does not end the command, in the format of `services.cli.main`."""
     print(f"congrasp: error: {error}", file=sys.stderr)
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import pathlib
-import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -12,9 +11,10 @@ from typing_extensions import Doc
 
 from congrasp.common.errors import CongraspError, printable
 from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.constraints.base import Option
 from congrasp.services.arm.options import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.cli.console import say
+from congrasp.services.cli.console import report_error, say
 
 if TYPE_CHECKING:
     from congrasp.services.grasp.jobs import Result
@@ -22,19 +22,15 @@ if TYPE_CHECKING:
 NOT_HELD, BAD_INPUT = 1, 2
 _MOST_ATTEMPTS = 1024
 
-Constraints: Any = dataclasses.make_dataclass(
-    "Constraints",
-    [
-        (option.name, Annotated[bool, Doc(option.help)], False)
-        if option.switch
-        else (option.name, Annotated[tuple[str, ...], Doc(option.help)], ())
-        if option.many
-        else (option.name, Annotated[str, Doc(option.help)], "")
-        for constraint in CONSTRAINTS
-        for option in constraint.options
-    ],
-    frozen=True,
-)
+
+def _field(option: Option) -> tuple[str, Any, Any]:
+    """Name, annotation and default of an option as the field of a dataclass."""
+    kind: Any = bool if option.switch else tuple[str, ...] if option.many else str
+    return option.name, Annotated[kind, Doc(option.help)], kind()
+
+
+_OPTIONS = [_field(option) for constraint in CONSTRAINTS for option in constraint.options]
+Constraints: Any = dataclasses.make_dataclass("Constraints", _OPTIONS, frozen=True)
 """The options of all constraints."""
 
 
@@ -150,7 +146,7 @@ class Grasp:
 def _show(result: "Result") -> None:
     """Prints the outcome for one object, and its notes."""
     if result.error:
-        print(f"congrasp: error: {result.error}", file=sys.stderr)
+        report_error(result.error)
         return
     done = " (done before)" if result.skipped else ""
     line = f"[bold]{escape(result.name)}[/]{done}: {escape(printable(result.line()))}"

@@ -66,15 +66,8 @@ class _Round(NamedTuple):
     rests: np.ndarray
     """(B,) resting poses."""
     outcome: Outcome
-    cost: np.ndarray
-    """(n,)."""
     holds: np.ndarray
     """(n,) bool: held to the end."""
-
-    @property
-    def best(self) -> int:
-        """The attempt of least cost."""
-        return int(self.cost.argmin())
 
     @property
     def meets(self) -> np.ndarray:
@@ -146,52 +139,54 @@ class Grasper:
         require_known(request.constraints, self.task)
         if self._left:
             obj, request = obj.mirrored(), mirrored_request(request)
-        best: _Round | None = None
+        best: tuple[_Round, np.ndarray] | None = None
         refused: collections.Counter[str] = collections.Counter()
         held = attempts = 0
         for number in range(self._rounds):
-            tried = self._attempt(obj, request, number, progress)
+            what = f"Attempting others ({number + 1})" if number else "Attempting"
+            tried = self._attempt(obj, request, (self._seed, number), what, progress)
+            if not tried.outcome.aligned.all():
+                raise ContradictionError(
+                    "The trajectory ends nearer to the avoid region than to the graspable part.",
+                    "Let it end at the graspable part, or leave out --affordance and --avoid.",
+                )
+            cost = self._cost(tried)
             attempts, held = attempts + len(tried.holds), held + int(tried.holds.sum())
             if self._arm:
-                found = self._on_arm(self._arm, tried, attempts, held, refused, progress)
+                found = self._on_arm(self._arm, tried, cost, attempts, held, refused, progress)
                 if found is not None:
                     return found
-            elif best is None or tried.cost.min() < best.cost.min():
-                best = tried
+            elif best is None or cost.min() < best[1].min():
+                best = tried, cost
             if prescribed(request) is not None or (best is not None and tried.meets.any()):
                 break  # further rounds would repeat these attempts, or are not needed
         if self._arm:
             raise _no_motion(obj, self._arm.name, attempts, refused)
         assert best is not None
-        found = self._motion(best, best.best, attempts, held)
+        found = self._motion(best[0], int(best[1].argmin()), attempts, held)
         return found if held else dataclasses.replace(found, cause=self._cause(obj, request, progress))
 
     def close(self) -> None:
         """Ends the threads of the physics."""
         self._attempts.close()
 
-    def _attempt(self, obj: GraspObject, request: GraspRequest, number: int, progress: Progress) -> _Round:
-        """A round of attempts."""
+    def _attempt(
+        self, obj: GraspObject, request: GraspRequest, seed: int | tuple[int, int], what: str, progress: Progress
+    ) -> _Round:
+        """A round of attempts, which is called `what` in its progress."""
         labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
-        rng = np.random.default_rng((self._seed, number))
-        episodes, rests, different = to_attempt(self._hand, self.task, labelled, request, self._attempts_count, rng)
+        rng, count = np.random.default_rng(seed), self._attempts_count
+        episodes, rests, different = to_attempt(self._hand, self.task, labelled, request, count, rng)
         progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
         self._compiled = True
-        what = f"Attempting others ({number + 1})" if number else "Attempting"
-        outcome = self._attempts.run(obj, episodes, functools.partial(self._attempting, progress, what))
-        if not outcome.aligned.all():
-            raise ContradictionError(
-                "The trajectory ends nearer to the avoid region than to the graspable part.",
-                "Let it end at the graspable part, or leave out --affordance and --avoid.",
-            )
-        removal, lift = self.task.approach_steps - 1, self._attempts.phases.lift
-        cost = costs(outcome, tuple(request.constraints), removal, lift) + _UNLIKELY * _places(obj, rests, request)
-        holds = outcome.metrics["held"] > 0
-        return _Round(labelled, request, episodes, rests, outcome, cost[:different], holds[:different])
+        outcome = self._attempts.run(obj, episodes, lambda step: progress(what, step, self._attempts.steps))
+        return _Round(labelled, request, episodes, rests, outcome, outcome.metrics["held"][:different] > 0)
 
-    def _attempting(self, progress: Progress, what: str, step: int) -> None:
-        """Reports a control step of attempts."""
-        progress(what, step, self._attempts.steps)
+    def _cost(self, tried: _Round) -> np.ndarray:
+        """(n,) cost of each attempt, with that of its resting pose."""
+        removal, lift = self.task.approach_steps - 1, self._attempts.phases.lift
+        cost = costs(tried.outcome, tuple(tried.request.constraints), removal, lift)
+        return (cost + _UNLIKELY * _places(tried.obj, tried.rests, tried.request))[: len(tried.holds)]
 
     def _cause(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> str:
         """A sentence on what makes every attempt fail, if attempts hold the object with one thing changed.
@@ -204,29 +199,27 @@ class Grasper:
             smaller = obj.scaled(_SMALLER, constant_mass=True)
             trials.append((smaller, "width", f"{100 * _SMALLER:.0f} % of its size"))
         for changed, cause, how in trials:
-            labelled = changed if request.avoid is None else with_avoid(changed, request.avoid)
-            rng, what = np.random.default_rng(self._seed), f"Looking whether its {cause} is the cause"
+            what = f"Looking whether its {cause} is the cause"
             try:
-                episodes, _, n = to_attempt(self._hand, self.task, labelled, request, self._attempts_count, rng)
+                holds = self._attempt(changed, request, self._seed, what, progress).holds
             except CongraspError:
                 continue
-            outcome = self._attempts.run(changed, episodes, functools.partial(self._attempting, progress, what))
-            holds = int((outcome.metrics["held"][:n] > 0).sum())
-            if holds >= _ENOUGH * n:
-                return f"Its {cause} is the cause: with {how} {holds} of {n} attempts hold it."
+            if holds.mean() >= _ENOUGH:
+                return f"Its {cause} is the cause: with {how} {holds.sum()} of {len(holds)} attempts hold it."
         return ""
 
     def _on_arm(
         self,
         arm: "ArmPlanner",
         tried: _Round,
+        cost: np.ndarray,
         attempts: int,
         held: int,
         refused: collections.Counter[str],
         progress: Progress,
     ) -> Grasp | None:
         """The best attempt that the arm can do; counts the limits that forbid better ones."""
-        order = [i for i in tried.cost.argsort().tolist() if tried.meets[i]]
+        order = [i for i in cost.argsort().tolist() if tried.meets[i]]
         for number, index in enumerate(order):
             progress(f"Moving {arm.name}", number + 1, len(order))
             try:
