@@ -114,7 +114,7 @@ class Grasper:
 
     @functools.cached_property
     def identity(self) -> tuple[Any, ...]:
-        """What a grasp depends on, in addition to object and request."""
+        """Inputs of a grasp other than object and request."""
         policy, (approach, lift, *_) = bundles.content_hash(encode(self._policy.to_message())), self._attempts.phases
         arm = self._arm.identity if self._arm else ""
         return policy, self._attempts_count, self._seed, approach, lift, self._left, arm

@@ -1,4 +1,4 @@
-"""The best of some attempts: what it costs among them, its motion, and its facts."""
+"""The best of some attempts: its cost among them, its motion, and its facts."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any

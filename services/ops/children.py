@@ -17,12 +17,12 @@ CHILD_GRACE = 2.0
 
 def command(*words: object, **options: object) -> list[str]:
     """Arguments of congrasp: words, then options by name; None and False leave one out, and a tuple has many values."""
-    found = list(map(str, words))
+    arguments = list(map(str, words))
     for name, value in options.items():
         if value is not None and value is not False:
             values = value if isinstance(value, tuple) else () if value is True else (value,)
-            found += [f"--{name.replace('_', '-')}", *map(str, values)]
-    return found
+            arguments += [f"--{name.replace('_', '-')}", *map(str, values)]
+    return arguments
 
 
 @dataclasses.dataclass

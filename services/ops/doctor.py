@@ -40,14 +40,14 @@ class Finding(NamedTuple):
 
     what: str
     fine: bool
-    found: str
+    state: str
     remedy: str = ""
-    """What is wrong, and how to repair it."""
+    """Problem and repair, for a failure."""
 
     @property
     def text(self) -> str:
         """One line, with the remedy of a failure."""
-        return self.found if self.fine or not self.remedy else f"{self.found}: {self.remedy}"
+        return self.state if self.fine or not self.remedy else f"{self.state}: {self.remedy}"
 
 
 def examine(
