@@ -17,14 +17,14 @@ from congrasp.common.hands.skin import skin_of_meshes
 from congrasp.common.io.files import write_atomically
 from congrasp.common.policy.pretrained import pretrained_file
 from congrasp.common.runtime.parallel import cores
-from congrasp.services.assets.hands.check import check_hand, write_findings
+from congrasp.services.assets.hands import check as self_check
 from congrasp.services.assets.hands.model_files import Choices, Proposal, describe
 from congrasp.services.assets.hands.model_files import import_hand as proposed
 from congrasp.services.cli.console import in_range, say, show_table
 from congrasp.services.train import launch
 from congrasp.services.train.own_hand import Request, train_hand
 from congrasp.services.train.presets import recipe
-from congrasp.services.viz.hand_sheets import check_sheet, hands_sheet, joints_sheet
+from congrasp.services.viz import hand_sheets
 from congrasp.services.viz.sheets import save_png
 
 
@@ -77,7 +77,7 @@ def sheet(
     files = [own_hands().get(name, pathlib.Path(name)) for name in hands]
     meshes = [load_meshes(file, hand) if hand.text else {} for file, hand in zip(files, found, strict=True)]
     skins = [skin_of_meshes(hand, own) if own else None for hand, own in zip(found, meshes, strict=True)]
-    save_png(out, hands_sheet(found, skins))
+    save_png(out, hand_sheets.hands_sheet(found, skins))
     print(out)
     return 0
 
@@ -138,7 +138,7 @@ def _keep(proposal: Proposal, out: pathlib.Path | None, png: pathlib.Path | None
     save_meshes(path, proposal.meshes)
     get_hand.cache_clear()
     picture = png or path.with_suffix(".png")
-    save_png(picture, joints_sheet(hand))
+    save_png(picture, hand_sheets.joints_sheet(hand))
     say(*describe(proposal), "", path, picture)
 
 
@@ -164,13 +164,13 @@ def check(
     """
 
     found = get_hand(hand)
-    checked = check_hand(found, recipe(found).task, cores())
+    checked = self_check.check_hand(found, recipe(found).task, cores())
     for finding in checked.findings:
         print(finding)
     picture = png or pathlib.Path(f"{found.name}-check.png")
-    save_png(picture, check_sheet(found, checked.grips))
+    save_png(picture, hand_sheets.check_sheet(found, checked.grips))
     if json is not None:
-        write_findings(json, checked.findings)
+        self_check.write_findings(json, checked.findings)
     print(picture)
     return int(checked.failed)
 
