@@ -15,15 +15,14 @@ from congrasp.common.config import Split
 from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import engine_title
-from congrasp.services.assets.objects.named import objects_of
+from congrasp.services.assets.objects import named
 from congrasp.services.cli.console import in_range, say, tracked
+from congrasp.services.evaluate import pools, tables
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.evaluate.lineup import Lineup, Table, facts, line_up, read_entrants
-from congrasp.services.evaluate.pools import MANY, Exam, exam_pool, folder_pools, procedural_pools
 from congrasp.services.evaluate.results import provenance
 from congrasp.services.evaluate.scores import Row, write_json
 from congrasp.services.evaluate.table import object_table, tables_of
-from congrasp.services.evaluate.tables import Found, Noise, captured, evaluate_tables
 from congrasp.services.viz.sheets import save_png
 
 _PICTURED = 4
@@ -57,7 +56,7 @@ class Evaluate:
     targets, a student and the pretrained policy; payload: the heading alone by the objects' mass, from 0.05 to 2 kg;
     peers: the heading alone at the masses and frictions of RobustDexGrasp and of Isaac Lab's dexsuite; all: every table
     of one policy. Several may be named."""
-    exam: Exam = "figures"
+    exam: pools.Exam = "figures"
     """Procedural objects of all families: figures has seeds from 2,000,000, to be used only for published figures;
     development has seeds from 1,000,000. Training uses neither."""
     objects: pathlib.Path | None = None
@@ -95,7 +94,6 @@ class Evaluate:
 
     def __call__(self) -> int:
         """Evaluates, and prints and writes the results."""
-
         in_range(1, episodes=self.episodes)
         in_range(0, pool=self.pool, batch=self.batch)
         in_range(0.05, 10.0, friction=self.friction)
@@ -106,30 +104,36 @@ class Evaluate:
             raise CongraspError("--constraints needs the sets' objects.", "Pass their folder with --objects.")
         engine = resolve_physics(self.physics)
         kept = self.json and self.json.with_name(f"{self.json.name}.pools")
-        pools = None
+        divided = None
         if {"objects", "all"} & set(self.table):
-            many = self.pool or min(self.episodes, MANY)
-            pools = folder_pools(self.objects, engine) if self.objects else procedural_pools(many, engine, self.exam)
+            many = self.pool or min(self.episodes, pools.MANY)
+            if self.objects:
+                divided = pools.folder_pools(self.objects, engine)
+            else:
+                divided = pools.procedural_pools(many, engine, self.exam)
         without: list[str] = []
         with tracked() as track:
             given: list[GraspObject] = []
             if self.constraints is not None or set(self.table) != {"objects"}:
-                given = objects_of(self.objects, track=track) if self.objects else exam_pool(self.exam, self.pool)
+                if self.objects:
+                    given = named.objects_of(self.objects, track=track)
+                else:
+                    given = pools.exam_pool(self.exam, self.pool)
             experiment = Experiment(
                 lineup.entrants[0][0].policy, given, episodes=self.episodes, track=track, **self._settings(engine)
             )
             if self.constraints is not None:
-                sets = captured(self.constraints, self.split, given)
+                sets = tables.captured(self.constraints, self.split, given)
                 lineup.require(sets.hand)
                 without = sorted({obj.name for obj in given} - {obj.name for obj in sets.objects})
                 experiment = dataclasses.replace(
                     experiment, objects=sets.objects, constraints=sets.bank, paper=sets.paper
                 )
             results = []
-            for one, tables in lineup.entrants:
+            for one, wanted in lineup.entrants:
                 own = dataclasses.replace(experiment, policy=one.policy)
                 folder = kept and kept / f"{one.hand}-{one.method}"
-                results.append(evaluate_tables(own, tables, pools, folder, keep=self.pictures is not None))
+                results.append(tables.evaluate_tables(own, wanted, divided, folder, keep=self.pictures is not None))
         self._show(results, lineup, engine)
         if without:
             words = f"objects without a constraint set, or a heading in it ({self.split})"
@@ -146,7 +150,7 @@ class Evaluate:
         """Settings of all episodes."""
         return {"physics": engine, "batch": self.batch, "seed": self.seed, "friction": self.friction}
 
-    def _show(self, results: Sequence[Found], lineup: Lineup, engine: str) -> None:
+    def _show(self, results: Sequence[tables.Found], lineup: Lineup, engine: str) -> None:
         """Prints the tables, the effect of the rules for headings, the references' source, and skipped rows."""
 
         console, rows = Console(highlight=False, width=None if sys.stdout.isatty() else 160), _rows(results)
@@ -160,7 +164,7 @@ class Evaluate:
         say(*dict.fromkeys(found.references for found in results if found.references))
         say(*dict.fromkeys(f"Left out: {error}" for found in results for error in found.left_out))
 
-    def _write(self, results: Sequence[Found], lineup: Lineup, engine: str) -> None:
+    def _write(self, results: Sequence[tables.Found], lineup: Lineup, engine: str) -> None:
         """Writes the rows, with policies, settings and provenance, to the JSON file."""
 
         policies = [facts(one) for one, _ in lineup.entrants]
@@ -186,18 +190,18 @@ class Evaluate:
         write_json(_rows(results), self.json, about)
 
 
-def _rows(results: Sequence[Found]) -> list[Row]:
+def _rows(results: Sequence[tables.Found]) -> list[Row]:
     """The rows of all policies."""
     return [row for found in results for row in found.rows]
 
 
-def _draw(found: Found, pictures: pathlib.Path) -> None:
+def _draw(found: tables.Found, pictures: pathlib.Path) -> None:
     """Draws curves and examples of noisy references, and episodes of the rows without a change."""
     from congrasp.services.evaluate.pictures import failure_sheets, save_noise_examples
     from congrasp.services.evaluate.plots import draw_noise
 
     policy = found.experiment.policy
-    if noisy := found.of(Noise):
+    if noisy := found.of(tables.Noise):
         who = f"{policy.spec.hand_name} hand, version {policy.version}"
         title = f"{who}: {found.experiment.episodes} episodes a level"
         draw_noise([result.row for result in noisy], pictures / "noise.png", title)
