@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from congrasp.services.client.policy import Answer, Policy
     from congrasp.services.client.policy_client import PolicyClient
     from congrasp.services.export.motion_file import GraspMotion, load_motion, save_motion
-    from congrasp.services.grasp.grasper import Grasp, Grasper, grasp
+    from congrasp.services.grasp.grasper import Grasper, grasp
+    from congrasp.services.grasp.motion import Grasp
     from congrasp.services.gym.vector_env import make_vec
     from congrasp.services.serve.inference import load_policy
 
@@ -71,7 +72,7 @@ __all__ = [
 _MODULES = {
     "Answer": "congrasp.services.client.policy",
     "Command": "congrasp.services.client.guard",
-    "Grasp": "congrasp.services.grasp.grasper",
+    "Grasp": "congrasp.services.grasp.motion",
     "GraspMotion": "congrasp.services.export.motion_file",
     "GraspRequest": "congrasp.common.request",
     "Grasper": "congrasp.services.grasp.grasper",

@@ -27,8 +27,8 @@ from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
-from congrasp.services.cli.audit import FAULTS
-from congrasp.services.cli.audit import compare as audit
+from congrasp.services.ops.audit import FAULTS
+from congrasp.services.ops.audit import compare as audit
 from tests.rollouts import FORM, bundle, learner_hub, rollout
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]

@@ -1,8 +1,10 @@
 """Benchmarks of this machine, as ratios against a reference in the same run."""
 
+import dataclasses
 import pathlib
 
 from congrasp.actors.physics import PhysicsName
+from congrasp.services.train.presets import get_preset
 
 
 def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines: tuple[str, ...] = ()) -> int:
@@ -49,7 +51,6 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
     from congrasp.services.client.policy_client import PolicyClient
     from congrasp.services.serve.load import example_episode, measure, serving
     from congrasp.services.train.command import untrained
-    from congrasp.services.train.presets import get_preset
 
     with tempfile.TemporaryDirectory() as folder:
         policy = pathlib.Path(folder, "policy.safetensors")
@@ -97,13 +98,9 @@ def scaling(
       congrasp bench scaling --ranks 1 2 4 8
       congrasp bench scaling --preset quickstart --physics native --seconds 30
     """
-    import dataclasses
-
     from congrasp.services.bench.training import bench_scaling
-    from congrasp.services.train.presets import get_preset
 
-    config = get_preset(preset)
-    config = dataclasses.replace(config, physics=physics, environments=environments or config.environments)
+    config = dataclasses.replace(get_preset(preset, environments=environments), physics=physics)
     bench_scaling(config, ranks, seconds=seconds, actors=actors, deadline=deadline, out=out)
     return 0
 
@@ -131,21 +128,12 @@ def startup(
       congrasp bench startup
       congrasp bench startup --preset human --environments 1024
     """
-    import dataclasses
-
     from congrasp.services.bench.training import bench_startup
-    from congrasp.services.train.presets import get_preset
 
-    config = get_preset(preset)
+    config = get_preset(preset, environments=environments)
     pool = dataclasses.replace(config.objects, count=objects or config.objects.count)
-    config = dataclasses.replace(config, environments=environments or config.environments, objects=pool)
-    bench_startup(config, physics, deadline)
+    bench_startup(dataclasses.replace(config, objects=pool), physics, deadline)
     return 0
 
 
-COMMANDS = {
-    "physics": physics,
-    "query": query,
-    "scaling": scaling,
-    "startup": startup,
-}
+COMMANDS = {"physics": physics, "query": query, "scaling": scaling, "startup": startup}

@@ -2,9 +2,12 @@
 
 import contextlib
 import functools
+import math
+import pathlib
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -16,18 +19,12 @@ Track = Callable[[str, int | None], Callable[[int], None]]
 """(label, total if known) -> function to call with the number done."""
 
 
-def at_least(least: float, **counts: float) -> None:
-    """Raises a CongraspError for the first option that is below the minimum."""
-    for name, value in counts.items():
-        if value < least:
-            raise CongraspError(f"--{name} is {value}.", f"It must be at least {least:g}.")
-
-
-def at_most(most: float, unit: str, **amounts: float) -> None:
-    """Raises a CongraspError for the first option that is negative or above the maximum."""
-    for name, value in amounts.items():
-        if not 0 <= value <= most:
-            raise CongraspError(f"--{name} is {value}.", f"It must be from 0 to {most:g} {unit}.")
+def in_range(least: float, most: float = math.inf, unit: str = "", **options: float) -> None:
+    """Raises a CongraspError for the first option that is not from the minimum to the maximum."""
+    for name, value in options.items():
+        if not least <= value <= most:
+            bounds = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g} {unit}".rstrip()
+            raise CongraspError(f"--{name.replace('_', '-')} is {value}.", f"It must be {bounds}.")
 
 
 def say(*lines: object) -> None:
@@ -52,7 +49,16 @@ def show_facts(facts: Mapping[str, str]) -> None:
     Console(markup=False, highlight=False).print(table)
 
 
-def report_error(error: CongraspError) -> None:
+def save_picture(path: pathlib.Path | None, draw: Callable[[], np.ndarray]) -> None:
+    """Draws a picture into a file that an option names, if it does."""
+    if path is not None:
+        from congrasp.services.viz.sheets import save_png
+
+        save_png(path, draw())
+        print(f"The picture is {path}.")
+
+
+def report_error(error: CongraspError | str) -> None:
     """Prints an error that does not end the command, in the format of `services.cli.main`."""
     print(f"congrasp: error: {error}", file=sys.stderr)
 

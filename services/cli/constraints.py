@@ -13,7 +13,6 @@ from congrasp.services.assets.captures import IMPORTERS
 if TYPE_CHECKING:
     from congrasp.common.hands.spec import Hand
     from congrasp.common.objects.spec import GraspObject
-    from congrasp.common.wire.codec import Message
     from congrasp.services.assets.captures.build import Report
     from congrasp.services.cli.console import Track
 
@@ -21,72 +20,74 @@ REPORT = "import.json"
 """File next to imported sets with the outcome of each sequence."""
 
 
-def generate(
-    objects: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
-    count: int = 0,
-    families: tuple[str, ...] = (),
-    first_seed: int = 0,
-    hand: str = "human",
-    references: Literal["closed", "policy"] = "closed",
-    policy: pathlib.Path | None = None,
-    folder: str = "objects",
-    out: pathlib.Path = pathlib.Path("constraints"),
-    seed: int = 0,
-) -> int:
+@dataclasses.dataclass(frozen=True)
+class Generate:
     """Generate the constraint sets of objects, one self-describing file each.
 
     For the whole surface and for the graspable region: 256 headings by the paper's rules, 20 reference poses, and wrist
     trajectories that end at them, from 15 to 25 cm away, replayed through the wrist's controller. 80 % of them are for
     training, and the others are held out.
 
-    Args:
-      objects: Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7.
-      count: Number of additional procedural objects.
-      families: Their families, in turn, or groups of them: basic (if none is named), household, all, scans.
-      first_seed: Seed of the first of them; the others follow.
-      hand: Name of the hand, or its file.
-      references: closed: poses that close the hand around the object; policy: final states of a policy's grasps under
-        headings, as in the paper.
-      policy: Policy file for its references; by default the hand's reference policy, which was trained without any.
-      folder: Folder of objects.
-      out: Folder for the files.
-      seed: Seed of the constraints.
-
     Examples:
       congrasp constraints generate mug:7 box:0
       congrasp constraints generate my-objects --references policy
     """
-    from congrasp.common.hands import get_hand
-    from congrasp.common.io.inputs import distinct_names
-    from congrasp.common.objects.procedural import generate_many
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.common.task.sampling.write_sets import make_sets, save
-    from congrasp.services.assets.objects.named import find_object, objects_of
-    from congrasp.services.cli.console import tracked
 
-    if not objects and count < 1:
-        raise CongraspError("There is no object for which to generate constraints.", "Pass objects, or --count.")
-    known = get_hand(hand)
-    with tracked() as track:
-        track("Preparing objects", None)
-        found: list[GraspObject] = []
-        for text in objects:
-            path = pathlib.Path(text)
-            found += objects_of(path) if path.exists() else [find_object(text, folder)]
-        found += generate_many(count, first_seed, families)
-        for obj, name in zip(found, distinct_names(obj.name for obj in found), strict=True):
-            if obj.name != name:
-                raise CongraspError(
-                    f"Several of the objects are called '{obj.name}'.",
-                    "Name each once; 'congrasp objects import A B --out DIR' gives different ones different names.",
-                )
-        bank = _references(known, policy, found, seed, track) if references == "policy" else None
-        track("Generating constraints", None)
-        for constraints in make_sets(known, TaskConfig(hand=known.name), found, seed, bank):
-            save(constraints, out)
-    what = "The constraint set of 1 object is" if len(found) == 1 else f"The sets of {len(found)} objects are"
-    print(f"{what} in {out}.")
-    return 0
+    objects: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names in the folder of objects, object files or folders of them, meshes, or FAMILY:SEED such as mug:7."""
+    count: int = 0
+    """Number of additional procedural objects."""
+    families: tuple[str, ...] = ()
+    """Their families, in turn, or groups of them: basic (if none is named), household, all, scans."""
+    first_seed: int = 0
+    """Seed of the first of them; the others follow."""
+    hand: str = "human"
+    """Name of the hand, or its file."""
+    references: Literal["closed", "policy"] = "closed"
+    """closed: poses that close the hand around the object; policy: final states of a policy's grasps under headings, as
+    in the paper."""
+    policy: pathlib.Path | None = None
+    """Policy file for its references; by default the hand's reference policy, which was trained without any."""
+    folder: str = "objects"
+    """Folder of objects."""
+    out: pathlib.Path = pathlib.Path("constraints")
+    """Folder for the files."""
+    seed: int = 0
+    """Seed of the constraints."""
+
+    def __call__(self) -> int:
+        """Generates the sets, and prints where they are."""
+        from congrasp.common.hands import get_hand
+        from congrasp.common.io.inputs import distinct_names
+        from congrasp.common.objects.procedural import generate_many
+        from congrasp.common.task.config import TaskConfig
+        from congrasp.common.task.sampling.write_sets import make_sets, save
+        from congrasp.services.assets.objects.named import find_object, objects_of
+        from congrasp.services.cli.console import tracked
+
+        if not self.objects and self.count < 1:
+            raise CongraspError("There is no object for which to generate constraints.", "Pass objects, or --count.")
+        hand = get_hand(self.hand)
+        with tracked() as track:
+            track("Preparing objects", None)
+            found: list[GraspObject] = []
+            for text in self.objects:
+                path = pathlib.Path(text)
+                found += objects_of(path) if path.exists() else [find_object(text, self.folder)]
+            found += generate_many(self.count, self.first_seed, self.families)
+            for obj, name in zip(found, distinct_names(obj.name for obj in found), strict=True):
+                if obj.name != name:
+                    raise CongraspError(
+                        f"Several of the objects are called '{obj.name}'.",
+                        "Name each once; 'congrasp objects import A B --out DIR' gives different ones different names.",
+                    )
+            bank = _references(hand, self.policy, found, self.seed, track) if self.references == "policy" else None
+            track("Generating constraints", None)
+            for constraints in make_sets(hand, TaskConfig(hand=hand.name), found, self.seed, bank):
+                save(constraints, self.out)
+        what = "The constraint set of 1 object is" if len(found) == 1 else f"The sets of {len(found)} objects are"
+        print(f"{what} in {self.out}.")
+        return 0
 
 
 def _references(
@@ -111,98 +112,88 @@ def _references(
     return made.bank
 
 
-def import_captures(
-    format: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar=f"{{{','.join(IMPORTERS)}}}")],
-    path: Annotated[pathlib.Path, tyro.conf.Positional],
-    meshes: tuple[pathlib.Path, ...] = (),
-    mano: pathlib.Path | None = None,
-    hand: str = "human",
-    headings: Literal["sampled", "demonstrated"] = "sampled",
-    affordance: Literal["auto", "parts", "contacts", "none"] = "auto",
-    beyond: float = 0.1,
-    out: pathlib.Path = pathlib.Path("constraints"),
-    objects: pathlib.Path = pathlib.Path("objects"),
-    seed: int = 0,
-) -> int:
+@dataclasses.dataclass(frozen=True)
+class Import:
     """Make constraint sets of captured grasps by the paper's rules, and report what was dropped and why.
 
     From each sequence come a reference pose (the `human` hand's finger angles in the grasping frame) and a wrist
     trajectory to it of 15 waypoints, and, where the object's parts are labelled, those that may be touched. Only right
     hands are used. Objects are imported from the data set's meshes.
 
-    Args:
-      format: Data set of the files.
-      path: The data set's folder, or one of its files.
-      meshes: Folders with the objects' meshes, if they are not in the data set.
-      mano: Your MANO_RIGHT.pkl, or CONGRASP_MANO; dexycb needs it, and grab and oakink are more exact with it.
-      hand: Hand of the sets. Human finger angles do not fit another hand: it follows the captured wrist by its grasp
-        axes, with the captured headings and affordance, and closes its fingers around the object at the end.
-      headings: sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps.
-      affordance: Graspable are parts that fingers touch; whatever they touch; or everything. auto: parts where they are
-        labelled.
-      beyond: Radians by which a captured joint may exceed the human hand's limits; it is then clamped. Not used for
-        other hands.
-      out: Folder for the sets, and for import.json, which holds the outcome of each sequence.
-      objects: Folder for the objects.
-      seed: Seed of sampled headings and of the split into training and held-out.
-
     Examples:
       congrasp constraints import grab GRAB/
       congrasp constraints import myohand data/ --meshes object_sim/
     """
-    import importlib
 
-    from congrasp.common.hands import get_hand
-    from congrasp.common.hands.mano import own_mano_model
-    from congrasp.services.assets.captures.build import Options, import_sets
-    from congrasp.services.assets.captures.sequence import Meshes
-    from congrasp.services.cli.console import bars
+    format: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar=f"{{{','.join(IMPORTERS)}}}")]
+    """Data set of the files."""
+    path: Annotated[pathlib.Path, tyro.conf.Positional]
+    """The data set's folder, or one of its files."""
+    meshes: tuple[pathlib.Path, ...] = ()
+    """Folders with the objects' meshes, if they are not in the data set."""
+    mano: pathlib.Path | None = None
+    """Your MANO_RIGHT.pkl, or CONGRASP_MANO; dexycb needs it, and grab and oakink are more exact with it."""
+    hand: str = "human"
+    """Hand of the sets. Human finger angles do not fit another hand: it follows the captured wrist by its grasp axes,
+    with the captured headings and affordance, and closes its fingers around the object at the end."""
+    headings: Literal["sampled", "demonstrated"] = "sampled"
+    """sampled: 256 an object by the paper's rules; demonstrated: those of the captured grasps."""
+    affordance: Literal["auto", "parts", "contacts", "none"] = "auto"
+    """Graspable are parts that fingers touch; whatever they touch; or everything. auto: parts where they are
+    labelled."""
+    beyond: float = 0.1
+    """Radians by which a captured joint may exceed the human hand's limits; it is then clamped. Not used for other
+    hands."""
+    out: pathlib.Path = pathlib.Path("constraints")
+    """Folder for the sets, and for import.json, which holds the outcome of each sequence."""
+    objects: pathlib.Path = pathlib.Path("objects")
+    """Folder for the objects."""
+    seed: int = 0
+    """Seed of sampled headings and of the split into training and held-out."""
 
-    if format not in IMPORTERS:
-        raise CongraspError(f"There is no format '{format}'.", f"Choose one of: {', '.join(IMPORTERS)}.")
-    if not path.exists():
-        raise CongraspError(f"There is no file or folder {path}.", "Pass the data set's folder.")
-    if not beyond >= 0:
-        raise CongraspError(f"--beyond is {beyond}.", "It must be in radians, and not negative.")
-    known, options = get_hand(hand), Options(headings, affordance, beyond, seed=seed)
-    importer = importlib.import_module(IMPORTERS[format])
-    with bars() as progress:
-        task = progress.add_task("Reading", total=None)
-        made = import_sets(
-            importer.read(path, Meshes(meshes), own_mano_model(mano)),
-            known,
-            options,
-            format,
-            lambda doing: progress.update(task, description=doing, advance=1),
-        )
-    report = made[-1]
-    if not report.kept and not report.dropped:
-        raise CongraspError(f"{path} holds no sequence of {format}.", f"Pass the folder with {importer.HOLDS}.")
-    about = {"format": format, "path": str(path), "hand": known.name, **dataclasses.asdict(options)}
-    _save(*made, about, out, objects)
-    _print_report(report, known.name, out, objects)
-    return 0 if report.kept else 2
+    def __call__(self) -> int:
+        """Imports the sets, and prints what was dropped."""
+        import importlib
 
+        from congrasp.common.hands import get_hand
+        from congrasp.common.hands.mano import own_mano_model
+        from congrasp.common.io.files import write_atomically
+        from congrasp.common.objects.store import Catalogue
+        from congrasp.common.task.sampling.write_sets import save
+        from congrasp.services.assets.captures.build import Options, import_sets
+        from congrasp.services.assets.captures.sequence import Meshes
+        from congrasp.services.cli.console import bars, in_range
 
-def _save(
-    objects: "list[GraspObject]",
-    sets: "list[Message]",
-    report: "Report",
-    about: dict[str, Any],
-    out: pathlib.Path,
-    folder: pathlib.Path,
-) -> None:
-    """Writes objects to their folder, and their sets and the outcome of each sequence to `out`."""
-    from congrasp.common.io.files import write_atomically
-    from congrasp.common.objects.store import Catalogue
-    from congrasp.common.task.sampling.write_sets import save
-
-    catalogue = Catalogue(folder)
-    for obj, made in zip(objects, sets, strict=True):
-        catalogue.add(obj)
-        save(made, out)
-    rows = {**about, "kept": report.kept, "dropped": report.dropped}
-    write_atomically(out / REPORT, json.dumps(rows, indent=2).encode())
+        if self.format not in IMPORTERS:
+            raise CongraspError(f"There is no format '{self.format}'.", f"Choose one of: {', '.join(IMPORTERS)}.")
+        if not self.path.exists():
+            raise CongraspError(f"There is no file or folder {self.path}.", "Pass the data set's folder.")
+        in_range(0.0, beyond=self.beyond)
+        hand, options = get_hand(self.hand), Options(self.headings, self.affordance, self.beyond, seed=self.seed)
+        importer = importlib.import_module(IMPORTERS[self.format])
+        with bars() as progress:
+            task = progress.add_task("Reading", total=None)
+            sequences = importer.read(self.path, Meshes(self.meshes), own_mano_model(self.mano))
+            objects, sets, report = import_sets(
+                sequences,
+                hand,
+                options,
+                self.format,
+                lambda doing: progress.update(task, description=doing, advance=1),
+            )
+        if not report.kept and not report.dropped:
+            raise CongraspError(
+                f"{self.path} holds no sequence of {self.format}.", f"Pass the folder with {importer.HOLDS}."
+            )
+        catalogue = Catalogue(self.objects)
+        for obj, made in zip(objects, sets, strict=True):
+            catalogue.add(obj)
+            save(made, self.out)
+        about = {"format": self.format, "path": str(self.path), "hand": hand.name, **dataclasses.asdict(options)}
+        rows = {**about, "kept": report.kept, "dropped": report.dropped}
+        write_atomically(self.out / REPORT, json.dumps(rows, indent=2).encode())
+        _print_report(report, hand.name, self.out, self.objects)
+        return 0 if report.kept else 2
 
 
 def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathlib.Path) -> None:
@@ -272,21 +263,15 @@ def show(
     """
     from congrasp.common.task.sampling.sets import load
     from congrasp.common.task.sampling.write_sets import describe
-    from congrasp.services.cli.console import show_facts
+    from congrasp.services.cli.console import in_range, save_picture, show_facts
+    from congrasp.services.viz.object_sheet import constraint_sheet
 
     constraints = load(file)
-    rests = len(constraints.arrays["rest"])
-    if not 0 <= rest <= rests:
-        raise CongraspError(f"--rest is {rest}.", f"The object has the resting poses 1 to {rests}.")
+    in_range(0, len(constraints.arrays["rest"]), rest=rest)
     show_facts(describe(constraints))
-    if png is not None:
-        from congrasp.services.viz.object_sheet import constraint_sheet
-        from congrasp.services.viz.sheets import save_png
-
-        best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
-        save_png(png, constraint_sheet(constraints, rest - 1 if rest else best, seed))
-        print(f"The picture is {png}.")
+    best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
+    save_picture(png, lambda: constraint_sheet(constraints, rest - 1 if rest else best, seed))
     return 0
 
 
-COMMANDS = {"generate": generate, "import": import_captures, "show": show}
+COMMANDS = {"generate": Generate, "import": Import, "show": show}

@@ -1,5 +1,6 @@
 """`congrasp dataset`: verified grasps of many objects, in shards."""
 
+import dataclasses
 import pathlib
 from typing import Annotated, Literal
 
@@ -12,104 +13,105 @@ from congrasp.services.assets.objects.options import ImportOptions
 Verdict = Literal["all", "success", "held", "clean", "lifted", "pushed_weight", "pushed"]
 
 
-def dataset(
-    objects: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
-    out: pathlib.Path = pathlib.Path("dataset"),
-    per_object: int = 100,
-    constraints: tuple[str, ...] = (),
-    keep: tuple[Verdict, ...] = ("held",),
-    part: str = "1/1",
-    shard: int = 0,
-    policy: pathlib.Path | None = None,
-    hand: str = "human",
-    physics: PhysicsName = "auto",
-    batch: int = 0,
-    seed: int = 0,
-    licence: str = "Apache-2.0",
-    folder: str = "objects",
-    mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess"),  # noqa: B008
-) -> int:
+@dataclasses.dataclass(frozen=True)
+class Dataset:
     """Make a dataset of verified grasps: Parquet shards with a schema, and a card with counts and rates.
 
     Every episode is simulated to its end: held for two seconds without the table, lifted by 15 cm, pushed. A second run
     of the same command makes the missing shards. The same policy, objects, seed, engine and batch give the same shards.
 
-    Args:
-      objects: Meshes (STL, OBJ, PLY, GLB), object files, folders of them, names in --folder, or objects of the
-        generator as FAMILY:FIRST-LAST (mug:0-99, all:0-9999).
-      out: Folder of the dataset.
-      per_object: Episodes of each object, evenly over the constraints; those that an object does not allow are left
-        out.
-      constraints: Sampled sets of constraints, with + between those of a set, such as: heading pose+trajectory. By
-        default every constraint of the policy, and the paper's compositions.
-      keep: Outcomes that an episode needs to be written; all writes every episode.
-      part: K/N makes every N-th shard from the K-th on. Different parts may run anywhere: copy their shards together,
-        and run the command once more for the card.
-      shard: Largest number of objects in a shard; 0 chooses by --per-object.
-      policy: A policy file; by default the pretrained one of the hand.
-      hand: Hand of the pretrained policy.
-      physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
-      batch: Number of parallel worlds; 0 uses the engine's default.
-      seed: Seed of constraints and episodes.
-      licence: Licence of the data, for the card (an SPDX name).
-      folder: Folder of objects, which can be named in place of files.
-      mesh: Conversion of meshes to objects.
-
     Examples:
       congrasp dataset meshes/ --out grasps --per-object 100
       congrasp dataset all:0-9999 --out grasps --keep clean pushed --part 3/20
     """
-    import hashlib
 
-    from congrasp.actors.physics import resolve_physics
-    from congrasp.common.policy import bundle as bundles
-    from congrasp.common.policy.pretrained import policy_file
-    from congrasp.common.task.constraints import require_known
-    from congrasp.services.cli.console import at_least, at_most, tracked
-    from congrasp.services.dataset.make import Recipe, make, pools_of, shard_objects
-    from congrasp.services.dataset.shards import Shards, write_card
-    from congrasp.services.evaluate.experiment import Experiment
-    from congrasp.services.evaluate.plan import ALIGNED
-    from congrasp.services.evaluate.pools import most_objects
-    from congrasp.services.evaluate.results import provenance
-    from congrasp.services.evaluate.scores import known_rows
-    from congrasp.services.grasp.jobs import find_objects
+    objects: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
+    """Meshes (STL, OBJ, PLY, GLB), object files, folders of them, names in --folder, or objects of the generator as
+    FAMILY:FIRST-LAST (mug:0-99, all:0-9999)."""
+    out: pathlib.Path = pathlib.Path("dataset")
+    """Folder of the dataset."""
+    per_object: int = 100
+    """Episodes of each object, evenly over the constraints; those that an object does not allow are left out."""
+    constraints: tuple[str, ...] = ()
+    """Sampled sets of constraints, with + between those of a set, such as: heading pose+trajectory. By default every
+    constraint of the policy, and the paper's compositions."""
+    keep: tuple[Verdict, ...] = ("held",)
+    """Outcomes that an episode needs to be written; all writes every episode."""
+    part: str = "1/1"
+    """K/N makes every N-th shard from the K-th on. Different parts may run anywhere: copy their shards together, and
+    run the command once more for the card."""
+    shard: int = 0
+    """Largest number of objects in a shard; 0 chooses by --per-object."""
+    policy: pathlib.Path | None = None
+    """A policy file; by default the pretrained one of the hand."""
+    hand: str = "human"
+    """Hand of the pretrained policy."""
+    physics: PhysicsName = "auto"
+    """Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
+    batch: int = 0
+    """Number of parallel worlds; 0 uses the engine's default."""
+    seed: int = 0
+    """Seed of constraints and episodes."""
+    licence: str = "Apache-2.0"
+    """Licence of the data, for the card (an SPDX name)."""
+    folder: str = "objects"
+    """Folder of objects, which can be named in place of files."""
+    mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(unit="guess")  # noqa: RUF009
+    """Conversion of meshes to objects."""
 
-    at_least(1, **{"per-object": per_object})
-    at_least(0, shard=shard, batch=batch)
-    turn, parts = _part(part)
-    found, errors = find_objects(objects, folder)
-    if errors or not found:
-        raise CongraspError(
-            errors[0].error if errors else "No objects were named.", "Name meshes, folders or mug:0-99."
+    def __call__(self) -> int:
+        """Makes the missing shards, and the card."""
+        import hashlib
+
+        from congrasp.actors.physics import resolve_physics
+        from congrasp.common.policy import bundle as bundles
+        from congrasp.common.policy.pretrained import policy_file
+        from congrasp.common.task.constraints import require_known
+        from congrasp.services.cli.console import in_range, tracked
+        from congrasp.services.dataset.make import Recipe, make, pools_of, shard_objects
+        from congrasp.services.dataset.shards import Shards, write_card
+        from congrasp.services.evaluate.experiment import Experiment
+        from congrasp.services.evaluate.plan import ALIGNED
+        from congrasp.services.evaluate.pools import most_objects
+        from congrasp.services.evaluate.results import provenance
+        from congrasp.services.evaluate.scores import known_rows
+        from congrasp.services.grasp.jobs import find_objects
+
+        in_range(1, per_object=self.per_object)
+        in_range(0, shard=self.shard, batch=self.batch)
+        turn, parts = _part(self.part)
+        found, errors = find_objects(self.objects, self.folder)
+        if errors or not found:
+            raise CongraspError(
+                errors[0].error if errors else "No objects were named.", "Name meshes, folders or mug:0-99."
+            )
+        file = policy_file(self.policy, self.hand)
+        bundle, engine = bundles.load(file), resolve_physics(self.physics)
+        in_range(0, most_objects(engine), "objects", shard=self.shard)
+        asked = tuple(dict.fromkeys(self.constraints)) or tuple(known_rows(("single", "composed"), bundle.task))
+        require_known([name for one in asked for name in one.removesuffix(ALIGNED).split("+")], bundle.task)
+        recipe = Recipe(
+            experiment=Experiment(bundle, [], physics=engine, seed=self.seed, batch=self.batch),
+            policy_sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
+            objects=found,
+            options=self.mesh,
+            per_object=self.per_object,
+            constraints=asked,
+            keep=tuple(name for name in dict.fromkeys(self.keep) if name != "all"),
+            shard=self.shard or shard_objects(self.per_object),
         )
-    file = policy_file(policy, hand)
-    bundle, engine = bundles.load(file), resolve_physics(physics)
-    at_most(most_objects(engine), "objects", shard=shard)
-    asked = tuple(dict.fromkeys(constraints)) or tuple(known_rows(("single", "composed"), bundle.task))
-    require_known([name for one in asked for name in one.removesuffix(ALIGNED).split("+")], bundle.task)
-    recipe = Recipe(
-        experiment=Experiment(bundle, [], physics=engine, seed=seed, batch=batch),
-        policy_sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
-        objects=found,
-        options=mesh,
-        per_object=per_object,
-        constraints=asked,
-        keep=tuple(name for name in dict.fromkeys(keep) if name != "all"),
-        shard=shard or shard_objects(per_object),
-    )
-    pools = pools_of(recipe)
-    shards = Shards(out, len(pools.make))
-    finished = shards.finished(recipe.about)
-    wanted = [number for number in range(turn, shards.total, parts) if number not in finished]
-    with tracked() as track:
-        total = min(len(found), pools.size * len(wanted)) * per_object
-        make(recipe, shards, pools, wanted, track("Episodes", total))
-    card = write_card(shards, recipe.about, {"licence": licence, **provenance()})
-    episodes, kept = (sum(own[name] for own in card["counts"].values()) for name in ("episodes", "kept"))
-    made = card["shards"]["finished"]
-    print(f"{kept:,} of {episodes:,} episodes are kept, in {made} of {shards.total} shards in {out}.")
-    return 0
+        pools = pools_of(recipe)
+        shards = Shards(self.out, len(pools.make))
+        finished = shards.finished(recipe.about)
+        wanted = [number for number in range(turn, shards.total, parts) if number not in finished]
+        with tracked() as track:
+            total = min(len(found), pools.size * len(wanted)) * self.per_object
+            make(recipe, shards, pools, wanted, track("Episodes", total))
+        card = write_card(shards, recipe.about, {"licence": self.licence, **provenance()})
+        episodes, kept = (sum(own[name] for own in card["counts"].values()) for name in ("episodes", "kept"))
+        made = card["shards"]["finished"]
+        print(f"{kept:,} of {episodes:,} episodes are kept, in {made} of {shards.total} shards in {self.out}.")
+        return 0
 
 
 def _part(text: str) -> tuple[int, int]:
@@ -120,4 +122,4 @@ def _part(text: str) -> tuple[int, int]:
     raise CongraspError(f"--part is '{text}'.", "Write K/N with K from 1 to N: --part 3/20")
 
 
-COMMAND = dataset
+COMMAND = Dataset

@@ -1,14 +1,31 @@
 """Available hands, pictures of them, and custom hands."""
 
+import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, Annotated, Literal
+import shlex
+from typing import Annotated, Literal
 
+import jax
 import tyro
 
 from congrasp.actors.physics import PhysicsName
-
-if TYPE_CHECKING:
-    from congrasp.services.assets.hands.model_files import Choices, Proposal
+from congrasp.common.errors import CongraspError
+from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder, own_hands
+from congrasp.common.hands.files import hand_text
+from congrasp.common.hands.meshes import load_meshes, save_meshes
+from congrasp.common.hands.skin import skin_of_meshes
+from congrasp.common.io.files import write_atomically
+from congrasp.common.policy.pretrained import pretrained_file
+from congrasp.common.runtime.parallel import cores
+from congrasp.services.assets.hands import check as self_check
+from congrasp.services.assets.hands.model_files import Choices, Proposal, describe
+from congrasp.services.assets.hands.model_files import import_hand as proposed
+from congrasp.services.cli.console import in_range, say, show_table
+from congrasp.services.train import launch
+from congrasp.services.train.own_hand import Request, train_hand
+from congrasp.services.train.presets import recipe
+from congrasp.services.viz import hand_sheets
+from congrasp.services.viz.sheets import save_png
 
 
 def list_hands() -> int:
@@ -17,11 +34,6 @@ def list_hands() -> int:
     Examples:
       congrasp hands list
     """
-
-    from congrasp.common.errors import CongraspError
-    from congrasp.common.hands import HANDS, get_hand, hands_folder, own_hands
-    from congrasp.common.policy.pretrained import pretrained_file
-    from congrasp.services.cli.console import show_table
 
     rows, missing = [], []
     own, folder = own_hands(), hands_folder()
@@ -60,17 +72,12 @@ def sheet(
       congrasp hands sheet human
       congrasp hands sheet allegro sharpa --out robot-hands.png
     """
-    from congrasp.common.hands import get_hand, own_hands
-    from congrasp.common.hands.meshes import load_meshes
-    from congrasp.common.hands.skin import skin_of_meshes
-    from congrasp.services.viz.hand_sheets import hands_sheet
-    from congrasp.services.viz.sheets import save_png
 
     found = [get_hand(name) for name in hands]
     files = [own_hands().get(name, pathlib.Path(name)) for name in hands]
     meshes = [load_meshes(file, hand) if hand.text else {} for file, hand in zip(files, found, strict=True)]
     skins = [skin_of_meshes(hand, own) if own else None for hand, own in zip(found, meshes, strict=True)]
-    save_png(out, hands_sheet(found, skins))
+    save_png(out, hand_sheets.hands_sheet(found, skins))
     print(out)
     return 0
 
@@ -107,10 +114,6 @@ def import_hand(
       congrasp hands import hand.urdf
       congrasp hands import hand.xml --name mine --palm palm_link
     """
-    from congrasp.common.errors import CongraspError
-    from congrasp.common.hands import SUFFIX
-    from congrasp.services.assets.hands.model_files import Choices
-    from congrasp.services.assets.hands.model_files import import_hand as proposed
 
     proposal = proposed(file, Choices(name, palm, thumb, object_scale, collision == "own"))
     if out is not None and out.suffix != SUFFIX:
@@ -121,17 +124,8 @@ def import_hand(
     return 0
 
 
-def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | None) -> None:
+def _keep(proposal: Proposal, out: pathlib.Path | None, png: pathlib.Path | None) -> None:
     """Writes a hand's file and picture, by default to the folder of custom hands, and prints a description."""
-    from congrasp.common.errors import CongraspError
-    from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder
-    from congrasp.common.hands.files import hand_text
-    from congrasp.common.hands.meshes import save_meshes
-    from congrasp.common.io.files import write_atomically
-    from congrasp.services.assets.hands.model_files import describe
-    from congrasp.services.cli.console import say
-    from congrasp.services.viz.hand_sheets import joints_sheet
-    from congrasp.services.viz.sheets import save_png
 
     hand = proposal.hand
     if hand.name in HANDS:
@@ -144,7 +138,7 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     save_meshes(path, proposal.meshes)
     get_hand.cache_clear()
     picture = png or path.with_suffix(".png")
-    save_png(picture, joints_sheet(hand))
+    save_png(picture, hand_sheets.joints_sheet(hand))
     say(*describe(proposal), "", path, picture)
 
 
@@ -168,103 +162,86 @@ def check(
       congrasp hands check allegro
       congrasp hands check my_hand --png check.png --json check.json
     """
-    from congrasp.common.hands import get_hand
-    from congrasp.common.runtime.parallel import cores
-    from congrasp.services.assets.hands.check import check_hand, write_findings
-    from congrasp.services.train.presets import recipe
-    from congrasp.services.viz.hand_sheets import check_sheet
-    from congrasp.services.viz.sheets import save_png
 
     found = get_hand(hand)
-    checked = check_hand(found, recipe(found).task, cores())
+    checked = self_check.check_hand(found, recipe(found).task, cores())
     for finding in checked.findings:
         print(finding)
     picture = png or pathlib.Path(f"{found.name}-check.png")
-    save_png(picture, check_sheet(found, checked.grips))
+    save_png(picture, hand_sheets.check_sheet(found, checked.grips))
     if json is not None:
-        write_findings(json, checked.findings)
+        self_check.write_findings(json, checked.findings)
     print(picture)
     return int(checked.failed)
 
 
-def train(
-    hand: Annotated[str, tyro.conf.Positional],
-    name: str = "",
-    palm: str = "",
-    thumb: str = "",
-    object_scale: float = 0.0,
-    out: pathlib.Path | None = None,
-    anyway: bool = False,
-    physics: PhysicsName = "auto",
-    episodes: int = 0,
-    pool: int = 0,
-    training: str = "",
-    patience: int = 240,
-) -> int:
+@dataclasses.dataclass(frozen=True)
+class Train:
     """Train a hand from a URDF or MJCF to a policy and a report: import, self-check, training, evaluation.
 
     On a GPU it trains the full task by the recipe for all hands; afterwards grasp, serve, evaluate and view take the
     policy as --hand NAME. Without a GPU the training is short and of an easier task. It stops if the self-check fails.
     Repeat the command to resume a stopped one.
 
-    Args:
-      hand: The hand's URDF or MJCF, which is imported unless there is a custom hand of its name; or a hand's name or
-        file.
-      name: As in 'congrasp hands import', like the next three.
-      palm: Body of the palm.
-      thumb: The last body of the finger that opposes the others.
-      object_scale: Factor on the objects that it learns to grasp.
-      out: Folder for the self-check, the run and the report; runs/hands/NAME by default.
-      anyway: Train it although its self-check failed.
-      physics: Engine of the full task and of the evaluation.
-      episodes: Episodes of each row of the report; 0 uses 200, without a GPU 24.
-      pool: Objects of the report; 0 uses 64, without a GPU 12.
-      training: Further options of 'congrasp train', as one text.
-      patience: Minutes after which the training is stopped, to be resumed by the next 'congrasp hands train'.
-
     Examples:
       congrasp hands train my_hand.urdf
       congrasp hands train my_hand --training="--updates 900"
     """
-    import shlex
 
-    import jax
+    hand: Annotated[str, tyro.conf.Positional]
+    """The hand's URDF or MJCF, which is imported unless there is a custom hand of its name; or a hand's name or
+    file."""
+    name: str = ""
+    """As in 'congrasp hands import', like the next three."""
+    palm: str = ""
+    """Body of the palm."""
+    thumb: str = ""
+    """The last body of the finger that opposes the others."""
+    object_scale: float = 0.0
+    """Factor on the objects that it learns to grasp."""
+    out: pathlib.Path | None = None
+    """Folder for the self-check, the run and the report; runs/hands/NAME by default."""
+    anyway: bool = False
+    """Train it although its self-check failed."""
+    physics: PhysicsName = "auto"
+    """Engine of the full task and of the evaluation."""
+    episodes: int = 0
+    """Episodes of each row of the report; 0 uses 200, without a GPU 24."""
+    pool: int = 0
+    """Objects of the report; 0 uses 64, without a GPU 12."""
+    training: str = ""
+    """Further options of 'congrasp train', as one text."""
+    patience: int = 240
+    """Minutes after which the training is stopped, to be resumed by the next 'congrasp hands train'."""
 
-    from congrasp.common.hands import get_hand
-    from congrasp.services.assets.hands.model_files import Choices
-    from congrasp.services.cli.console import at_least
-    from congrasp.services.train.launch import accelerators
-    from congrasp.services.train.own_hand import Request, train_hand
+    def __call__(self) -> int:
+        """Imports, checks, trains and evaluates."""
 
-    at_least(0, episodes=episodes, pool=pool)
-    at_least(1, patience=patience)
-    full = accelerators()[0] != "cpu"
-    jax.config.update(
-        "jax_platforms", "cpu"
-    )  # the stages are separate processes, so that each has the whole GPU memory
-    reference = _taken(hand, Choices(name, palm, thumb, object_scale))
-    found = get_hand(reference)
-    request = Request(
-        hand=found,
-        reference=reference,
-        out=out or pathlib.Path("runs", "hands", found.name),
-        full=full,
-        anyway=anyway,
-        physics=physics,
-        episodes=episodes or (200 if full else 24),
-        pool=pool or (64 if full else 12),
-        options=shlex.split(training),
-        patience=60.0 * patience,
-    )
-    train_hand(request, lambda text: print(text, flush=True))
-    print(f"Try: congrasp grasp examples/mug.obj --hand {reference}")
-    return 0
+        in_range(0, episodes=self.episodes, pool=self.pool)
+        in_range(1, patience=self.patience)
+        full = launch.accelerators()[0] != "cpu"
+        jax.config.update("jax_platforms", "cpu")  # the stages are separate processes, each with the whole GPU memory
+        reference = _taken(self.hand, Choices(self.name, self.palm, self.thumb, self.object_scale))
+        found = get_hand(reference)
+        request = Request(
+            hand=found,
+            reference=reference,
+            out=self.out or pathlib.Path("runs", "hands", found.name),
+            full=full,
+            anyway=self.anyway,
+            physics=self.physics,
+            episodes=self.episodes or (200 if full else 24),
+            pool=self.pool or (64 if full else 12),
+            options=shlex.split(self.training),
+            patience=60.0 * self.patience,
+        )
+        train_hand(request, lambda text: print(text, flush=True))
+        print(f"Try: congrasp grasp examples/mug.obj --hand {reference}")
+        return 0
 
 
-def _taken(hand: str, choices: "Choices") -> str:
+def _taken(hand: str, choices: Choices) -> str:
     """Name of a hand in commands; that of a URDF or MJCF is imported, unless it was before."""
-    from congrasp.common.hands import SUFFIX, own_hands
-    from congrasp.services.assets.hands.model_files import import_hand as proposed
 
     file = pathlib.Path(hand)
     if not file.is_file() or file.suffix == SUFFIX:
@@ -278,4 +255,4 @@ def _taken(hand: str, choices: "Choices") -> str:
     return name
 
 
-COMMANDS = {"list": list_hands, "sheet": sheet, "import": import_hand, "check": check, "train": train}
+COMMANDS = {"list": list_hands, "sheet": sheet, "import": import_hand, "check": check, "train": Train}

@@ -1,169 +1,131 @@
 """`congrasp learner`: the learner alone."""
 
 import contextlib
+import dataclasses
 import pathlib
-import threading
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
 
-import tyro
-
+import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.config import MetricWriter, RunConfig, run_config_from_json, to_json
+from congrasp.common.errors import CongraspError
 from congrasp.common.transport.ports import LEARNER_URL, rank_url, reachable_url
 from congrasp.services.cli.train import defaults as defaults
-from congrasp.services.cli.watch import Watch, Watched
+from congrasp.services.ops.logs import Watch, log, logging_as
 from congrasp.services.train.presets import with_hand
 
-if TYPE_CHECKING:
-    from congrasp.common.transport.base import Transport
-    from congrasp.learner.distributed.ranks import Ranks
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of a learner's process."""
+
+    run_dir: pathlib.Path
+    """Directory of the run."""
+    preset: str = "quickstart"
+    """Named initial configuration."""
+    hand: str | None = None
+    """The hand, by its name or its file; by default the preset's."""
+    listen: str = LEARNER_URL
+    """Endpoint for the actors, which takes four ports from this one on. Other machines need tls/0.0.0.0:PORT."""
+    certs: pathlib.Path | None = None
+    """Folder of a learner's certificate (congrasp certs): enables mutual TLS, and restricts each role to its rights."""
+    insecure: bool = False
+    """Listen beyond loopback without certificates."""
+    initial: pathlib.Path | None = None
+    """A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run."""
+    teacher: str | None = None
+    """A policy file, or the hand of a pretrained policy, to distil, as for `congrasp train`; ranks read it."""
+    resume: bool = False
+    """Resume the run in --run-dir from its newest intact checkpoint; a run without a checkpoint starts again."""
+    or_resume: bool = False
+    """Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command every time."""
+    rank: int = 0
+    """Number of this process among several that train together; each needs a separate GPU (CUDA_VISIBLE_DEVICES)."""
+    ranks: int = 1
+    """Learner processes that train together: data parallel, each with separate actors. The run is in the --run-dir of
+    rank 0; rank r listens 4 r ports above --listen."""
+    coordinator: str = "127.0.0.1:7440"
+    """Host and port of rank 0; this port and the next must be free there."""
+    inside: bool = False
+    """Also run an actor in this process, so that its rollouts never leave the device."""
+    metric_writers: tuple[MetricWriter, ...] = ("tensorboard",)
+    """Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there, for `wandb
+    sync`), wandb (needs an account); without a name, none."""
+
+    def prepare(self, config: RunConfig) -> None:
+        """Creates the directory of the run, or stores the configuration with which it continues."""
+        from congrasp.common.policy import bundle as bundles
+        from congrasp.learner.run_directory import CONFIG_FILE, continue_run, create_run
+
+        if self.resume or (self.or_resume and (self.run_dir / CONFIG_FILE).exists()):
+            continue_run(self.run_dir, config)
+        else:
+            create_run(self.run_dir, config, bundles.load(self.initial) if self.initial else None)
 
 
-def learner(
-    config: Annotated[RunConfig, tyro.conf.arg(name="")],
-    run_dir: pathlib.Path,
-    preset: str = "quickstart",
-    hand: str | None = None,
-    listen: str = LEARNER_URL,
-    certs: pathlib.Path | None = None,
-    insecure: bool = False,
-    initial: pathlib.Path | None = None,
-    teacher: str | None = None,
-    resume: bool = False,
-    or_resume: bool = False,
-    rank: int = 0,
-    ranks: int = 1,
-    coordinator: str = "127.0.0.1:7440",
-    inside: bool = False,
-    metric_writers: tuple[MetricWriter, ...] = ("tensorboard",),
-    watch: Watched = Watch(),  # noqa: B008
-) -> int:
+def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:  # noqa: B008
     """Run only the learner; actors on this or other machines connect to it with `congrasp actor --connect`.
 
     A new run takes its configuration from the preset and the command line; a directory with a run keeps its
     configuration, except for --updates, --ppo.… and others that only the learner uses.
 
     Args:
+      options: This process.
       config: The run.
-      run_dir: Directory of the run.
-      preset: Named initial configuration.
-      hand: The hand, by its name or its file; by default the preset's.
-      listen: Endpoint for the actors, which takes four ports from this one on. Other machines need tls/0.0.0.0:PORT.
-      certs: Folder of a learner's certificate (congrasp certs): enables mutual TLS, and restricts each role to its
-        rights.
-      insecure: Listen beyond loopback without certificates.
-      initial: A policy to begin with instead of random weights, of the same networks: `policy.safetensors` of a run.
-      teacher: A policy file, or the hand of a pretrained policy, to distil, as for `congrasp train`; ranks read it.
-      resume: Resume the run in --run-dir from its newest intact checkpoint; a run without a checkpoint starts again.
-      or_resume: Begin the run, or resume it if --run-dir holds one: for supervisors that give the same command every
-        time.
-      rank: Number of this process among several that train together; each needs a separate GPU (CUDA_VISIBLE_DEVICES).
-      ranks: Learner processes that train together: data parallel, each with separate actors. The run is in the
-        --run-dir of rank 0; rank r listens 4 r ports above --listen.
-      coordinator: Host and port of rank 0; this port and the next must be free there.
-      inside: Also run an actor in this process, so that its rollouts never leave the device.
-      metric_writers: Additional metric writers: tensorboard (files in the run's folder), wandb-offline (files there,
-        for `wandb sync`), wandb (needs an account); without a name, none.
       watch: Monitoring.
 
     Examples:
       congrasp learner --preset human --run-dir runs/human --listen tls/0.0.0.0:7447 --certs certs
       congrasp learner --run-dir runs/human --resume
     """
-    from congrasp.common.errors import CongraspError
-    from congrasp.common.policy import bundle as bundles
     from congrasp.common.transport import urls
     from congrasp.learner.distributed.ranks import Ranks, end_process
-    from congrasp.learner.run_directory import CONFIG_FILE, continue_run, create_run, listening
+    from congrasp.learner.run_directory import listening
     from congrasp.services.ops.shutdown import on_signal
+    from congrasp.services.train.learn import learn, longest_rollout
 
-    resume = resume or (or_resume and (run_dir / CONFIG_FILE).exists())
+    run_dir, rank = options.run_dir, options.rank
     try:
-        config, url = with_hand(config, hand), rank_url(listen, rank)
+        config, url = with_hand(config, options.hand), rank_url(options.listen, rank)
         with (
             on_signal() as stop,
             urls.listen(
                 url,
                 "learner",
-                certs=certs,
-                insecure=insecure,
+                certs=options.certs,
+                insecure=options.insecure,
                 run=config.name,
-                longest_rollout=_longest_rollout(config)
-                if ranks == 1
-                else None,  # other ranks use rank 0's configuration
+                longest_rollout=longest_rollout(config) if options.ranks == 1 else None,  # others use rank 0's settings
             ) as transport,
         ):
-            if rank == 0 and resume:
-                continue_run(run_dir, config)
-            elif rank == 0:
-                create_run(run_dir, config, None if initial is None else bundles.load(initial))
-            joined = Ranks.join(rank, ranks, coordinator)
-            config = run_config_from_json(joined.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
-            with listening(run_dir, reachable_url(url)) if rank == 0 else contextlib.nullcontext():
-                _learn(
+            if rank == 0:
+                options.prepare(config)
+            ranks = Ranks.join(rank, options.ranks, options.coordinator)
+            config = run_config_from_json(ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
+            with (
+                listening(run_dir, reachable_url(url)) if rank == 0 else contextlib.nullcontext(),
+                logging_as(watch.log_format, role="learner", id=str(rank), run=config.name),
+            ):
+                learn(
                     run_dir,
                     config,
-                    transport,
-                    stop,
-                    joined,
-                    resume=resume,
-                    inside=inside,
-                    writers=metric_writers,
+                    wire=transport,
+                    inside=config.physics if options.inside else None,
+                    stop=stop,
+                    ranks=ranks,
+                    writers=options.metric_writers,
                     watch=watch,
+                    on_update=_log_update,
+                    on_event=log,
                 )
             return stop.exit_code
     except CongraspError as error:
-        if ranks > 1:
+        if options.ranks > 1:
             end_process(str(error), error.exit_code)
         raise
 
 
-def _longest_rollout(config: RunConfig) -> int:
-    """Limit of rollout messages: twice the size of the run's rollouts, bytes."""
-    from congrasp.common.policy.bundle import policy_spec
-    from congrasp.learner.algorithms import make_algorithm
-    from congrasp.learner.batch import rollout_form
-
-    spec = policy_spec(config.task, config.network)
-    form = rollout_form(config, spec, make_algorithm(spec, config).batch_schema)
-    return 2 * sum(array.nbytes for array in form.zeros().values())
-
-
-def _learn(
-    run_dir: pathlib.Path,
-    config: RunConfig,
-    transport: "Transport",
-    stop: threading.Event,
-    ranks: "Ranks",
-    *,
-    resume: bool,
-    inside: bool,
-    writers: Sequence[MetricWriter],
-    watch: Watch,
-) -> None:
-    """Runs the learner until it is finished or stopped."""
-    from congrasp.learner.run_directory import has_checkpoints
-    from congrasp.services.ops.logs import log
-    from congrasp.services.train.learn import learn
-
-    def updated(values: dict[str, float]) -> None:
-        log("info", f"Update {values['update']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
-
-    with watch.watched("learner", str(ranks.rank), config.name):
-        learn(
-            run_dir,
-            config,
-            wire=transport,
-            inside=config.physics if inside else None,
-            stop=stop,
-            resume=resume and ranks.rank == 0 and has_checkpoints(run_dir),
-            ranks=ranks,
-            writers=writers,
-            metrics_port=watch.metrics_port,
-            metrics_host=watch.metrics_host,
-            on_update=updated,
-            on_event=log,
-        )
+def _log_update(values: dict[str, float]) -> None:
+    """Logs the metrics of an update."""
+    log("info", f"Update {values['update']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
 
 
 COMMAND = learner

@@ -49,7 +49,9 @@ COMMANDS = {
     "certs": "certificates for mutual TLS between the processes of a run",
     "doctor": "what is wrong with this machine or installation",
 }
-"""Commands in the order of the help; `services.cli.<name>` is the module."""
+"""Commands in the order of the help."""
+_MODULES = {"audit": "ops.audit", "doctor": "ops.doctor"}
+"""Modules in `services` of commands that are not in `services.cli`."""
 
 _READ = {".obj", ".stl", ".ply", ".glb", ".npz", ".csv", ".bvh", ".mcap", ".safetensors", ".urdf", ".xml"}
 """Suffixes of files that commands read."""
@@ -62,17 +64,8 @@ UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PATH = (
-    errno.ENOENT,
-    errno.ENOTDIR,
-    errno.EISDIR,
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.ENAMETOOLONG,
-    errno.ELOOP,
-    errno.EEXIST,
-)
+_UNUSABLE = "ENOENT ENOTDIR EISDIR EACCES EPERM EROFS ENAMETOOLONG ELOOP EEXIST"
+_PATH = [getattr(errno, name) for name in _UNUSABLE.split()]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -99,9 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
-    if code in SIGNALLED or (
-        alone and _late_threads()
-    ):  # native code of a daemon thread aborts in the interpreter's shutdown
+    # Native code of a daemon thread that is late, such as one that closes Zenoh, aborts in the interpreter's shutdown.
+    late = [thread for thread in threading.enumerate() if thread.daemon and thread.name != SIGNALS]
+    if code in SIGNALLED or (alone and late):
         _last_words(sys.stderr)
         os._exit(code)
     sys.exit(code)
@@ -150,11 +143,6 @@ def run(arguments: list[str]) -> int:
         return stop.exit_code or (result if isinstance(result, int) else 0)
 
 
-def _late_threads() -> bool:
-    """True if a daemon thread, such as one that closes a Zenoh session, has missed its deadline and still runs."""
-    return any(thread.daemon and thread.name != SIGNALS for thread in threading.enumerate())
-
-
 def _check_files(arguments: Sequence[str]) -> None:
     """Raises a CongraspError for a missing input file, before the slow imports."""
     option = ""
@@ -188,12 +176,16 @@ def _is_there(path: pathlib.Path) -> bool:
     return True
 
 
+def module_of(name: str) -> Any:
+    """Returns the module of a command."""
+    return importlib.import_module(f"congrasp.services.{_MODULES.get(name, f'cli.{name}')}")
+
+
 def load(name: str) -> Callable[[list[str]], Callable[[], Any]]:
     """Returns the command's module as a function from its arguments to the requested call."""
-    module = importlib.import_module(f"congrasp.services.cli.{name}")
     from congrasp.services.cli import parser
 
-    prog = f"congrasp {name}"
+    module, prog = module_of(name), f"congrasp {name}"
     if hasattr(module, "COMMANDS"):
         return parser.of_group(module.COMMANDS, prog, inspect.getdoc(module))
     return parser.of_command(module.COMMAND, prog, getattr(module, "defaults", lambda rest: {}))

@@ -31,9 +31,9 @@ def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tup
     """
     from congrasp.common.objects import procedural
     from congrasp.common.objects.store import Catalogue
-    from congrasp.services.cli.console import at_least, tracked
+    from congrasp.services.cli.console import in_range, tracked
 
-    at_least(1, count=count)
+    in_range(1, count=count)
     catalogue = Catalogue(out)
     turns = procedural.family_turns(count, seed, families)
     with tracked() as track:
@@ -122,7 +122,7 @@ def list_objects(
     """
     from congrasp.common.objects.procedural import FAMILIES
     from congrasp.common.objects.store import Catalogue
-    from congrasp.services.cli.console import report_error, show_table
+    from congrasp.services.cli.console import report_error, save_picture, show_table
 
     if families:
         print("\n".join(FAMILIES))
@@ -145,10 +145,8 @@ def list_objects(
         print(f"{folder} holds no object.")
     if png is not None and found:
         from congrasp.services.viz.object_sheet import overview
-        from congrasp.services.viz.sheets import save_png
 
-        save_png(png, overview(found))
-        print(f"The picture is {png}.")
+        save_picture(png, lambda: overview(found))
     return 2 if failures else 0
 
 
@@ -169,7 +167,8 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     from congrasp.common.objects.store import digest
     from congrasp.common.task.sampling.headings import sample_headings
     from congrasp.services.assets.objects.named import find_object
-    from congrasp.services.cli.console import say, show_facts
+    from congrasp.services.cli.console import save_picture, say, show_facts
+    from congrasp.services.viz.object_sheet import object_sheet
 
     obj = find_object(object, folder)
     share = obj.graspable[obj.labels].mean()
@@ -196,13 +195,8 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
         )
     say(obj.name)
     show_facts(facts)
-    if png is not None:
-        from congrasp.services.viz.object_sheet import object_sheet
-        from congrasp.services.viz.sheets import save_png
-
-        assert free is not None, "only the graspable region may be out of reach"
-        save_png(png, object_sheet(obj, free))
-        print(f"The picture is {png}.")
+    if free is not None:
+        save_picture(png, lambda: object_sheet(obj, free))
     return 0
 
 
@@ -224,7 +218,8 @@ def rests(
 
     from congrasp.common.objects.resting import rest_tilts
     from congrasp.services.assets.objects.named import find_object
-    from congrasp.services.cli.console import show_table
+    from congrasp.services.cli.console import save_picture, show_table
+    from congrasp.services.viz.object_sheet import rests_sheet
 
     obj = find_object(object, folder)
     tilts = np.degrees(rest_tilts(obj))
@@ -233,12 +228,7 @@ def rests(
         for i, (pose, tilt) in enumerate(zip(obj.rest_poses, tilts, strict=True), 1)
     ]
     show_table(("--rest", "centre of mass (cm)", "z axis from up (°)"), rows)
-    if png is not None:
-        from congrasp.services.viz.object_sheet import rests_sheet
-        from congrasp.services.viz.sheets import save_png
-
-        save_png(png, rests_sheet(obj))
-        print(f"The picture is {png}.")
+    save_picture(png, lambda: rests_sheet(obj))
     return 0
 
 

@@ -14,6 +14,7 @@ import docstring_parser
 import tyro
 
 Command = Callable[..., Any]
+"""A function, or a frozen dataclass with `__call__`, whose fields' docstrings are the help."""
 Parser = Callable[[list[str]], Callable[[], Any]]
 """From the arguments to the requested call."""
 _QUIET = ("", "None", "False")
@@ -75,18 +76,29 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     """Returns the command with its arguments bound, to be called once they are valid."""
 
     def bind(*args: Any, **options: Any) -> Callable[[], Any]:
-        return functools.partial(command, *args, **options)
+        return functools.partial(_run, command, *args, **options)
 
-    hints = {name: _described(name, hint) for name, hint in typing.get_type_hints(command, include_extras=True).items()}
+    hints = {
+        name: _described(name, hint, *([tyro.conf.arg(name="")] if dataclasses.is_dataclass(hint) else []))
+        for name, hint in typing.get_type_hints(command, include_extras=True).items()
+    }
     signature = inspect.signature(command)
     taken = [value.replace(annotation=hints[name]) for name, value in signature.parameters.items()]
     vars(bind)["__signature__"] = signature.replace(parameters=taken)
     bind.__name__, bind.__annotations__ = command.__name__, {**hints, "return": Any}
-    bind.__doc__ = re.sub(r"\n    (?=\S)", " ", inspect.getdoc(command) or "")  # a parameter's text on one line
+    text = re.sub(r"\n    (?=\S)", " ", inspect.getdoc(command) or "")  # a parameter's text on one line
+    fields = [f"  {name}: {help}" for name, help in _meanings(command).items()] if isinstance(command, type) else []
+    bind.__doc__ = "\n".join([text, "", "Args:", *fields] if fields else [text])
     return bind
 
 
-def _described(name: str, hint: Any) -> Any:
+def _run(command: Command, *args: Any, **options: Any) -> Any:
+    """Calls a function, or a command whose fields are its options."""
+    made = command(*args, **options)
+    return made() if isinstance(command, type) else made
+
+
+def _described(name: str, hint: Any, *more: Any) -> Any:
     """Returns a parameter's type, with the display of its values and default, and the range of seeds."""
     kind, *marks = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
     marks += [_SEED] if name == "seed" or name.endswith("_seed") else []
@@ -95,7 +107,7 @@ def _described(name: str, hint: Any) -> Any:
     metavar = None
     if typing.get_origin(kind) is tuple and typing.get_args(kind)[-1] is Ellipsis:
         metavar = f"{_value(typing.get_args(kind)[0])} ..."
-    return Annotated[(kind, *marks, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint))]
+    return Annotated[(kind, *marks, *more, tyro.conf.arg(metavar=metavar, help_behavior_hint=_hint))]
 
 
 def _seed(words: list[str]) -> int:
@@ -133,35 +145,29 @@ _REGISTRY = tyro.constructors.ConstructorRegistry()
 @_REGISTRY.struct_rule
 def _dataclass(info: tyro.constructors.StructTypeInfo) -> tyro.constructors.StructConstructorSpec | None:
     """Options of a dataclass: tyro's own rule, with each field's text on one line and described as parameters are."""
-    if not dataclasses.is_dataclass(info.type) or not dataclasses.is_dataclass(info.default):
+    if not dataclasses.is_dataclass(info.type):
         return None
     hints = typing.get_type_hints(info.type, include_extras=True)
+    source = info.default if dataclasses.is_dataclass(info.default) else info.type
     return tyro.constructors.StructConstructorSpec(
         instantiate=info.type,
         fields=tuple(
             tyro.constructors.StructFieldSpec(
                 field.name,
                 _described(field.name, hints[field.name]),
-                getattr(info.default, field.name),
-                functools.partial(_meaning, info.type, field.name),
+                getattr(source, field.name, tyro.MISSING),
+                functools.partial(_meanings(info.type).get, field.name),
             )
             for field in dataclasses.fields(info.type)
         ),
     )
 
 
-def _meaning(kind: type, field: str) -> str | None:
-    """Help of a field, on one line: the string under it."""
-    for base in kind.__mro__:
-        if found := _meanings(base).get(field):
-            return found
-    return None
-
-
 @functools.cache
 def _meanings(kind: type) -> Mapping[str, str]:
-    """Help of the fields of one class."""
-    if kind is object:
-        return types.MappingProxyType({})
-    params = docstring_parser.parse_from_object(kind).params
-    return {param.arg_name: _CONTINUED.sub(" ", param.description) for param in params if param.description}
+    """Help of the fields of a class, each on one line: the string under it."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__[:-1]):
+        params = docstring_parser.parse_from_object(base).params
+        found |= {one.arg_name: _CONTINUED.sub(" ", one.description) for one in params if one.description}
+    return types.MappingProxyType(found)

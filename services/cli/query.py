@@ -40,11 +40,11 @@ def query(
     """
     import json as json_module
 
-    from congrasp.services.cli.console import at_least
+    from congrasp.services.cli.console import in_range
     from congrasp.services.client.policy_client import PolicyClient
     from congrasp.services.serve.load import example_episode, measure, one_answer
 
-    at_least(1, repeat=repeat, concurrency=concurrency, states=states)
+    in_range(1, repeat=repeat, concurrency=concurrency, states=states)
     if health:
         with PolicyClient(connect, name, timeout=timeout, wait=timeout, certs=certs) as client:
             print(json_module.dumps(client.health()))

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import math
 import pathlib
 import secrets
 import time
@@ -47,55 +48,21 @@ def record(
       congrasp record --run human --out recordings --live 8765
     """
     structured = log_format == "json"
-    with logging_as(log_format, role="recorder", id=process_name("recorder"), run=run):
-        return record_run(connect, run, out, live=live, duration=duration, structured=structured, certs=certs)
-
-
-COMMAND = record
-
-
-def record_run(
-    connect: str,
-    run: str,
-    out: pathlib.Path,
-    *,
-    live: int | None = None,
-    duration: float | None = None,
-    structured: bool = False,
-    certs: urls.Certs = None,
-) -> int:
-    """Records until `duration` seconds have passed, Ctrl-C is pressed or, without a live view, the disk fails.
-
-    Args:
-      connect: endpoint of the learner.
-      run: name of the run.
-      out: folder for the files.
-      live: port of the live view, or None.
-      duration: seconds, or None.
-      structured: writes only to the log, without a progress line.
-      certs: folder of an observer's certificate, or None.
-
-    Returns:
-      Zero.
-
-    Raises:
-      CongraspError: there is no connection, the live view cannot listen, or recording stopped.
-    """
+    end = math.inf if duration is None else time.monotonic() + duration
     console = Console(stderr=True, quiet=structured)
     warn = functools.partial(log, "warning") if structured else lambda text: console.print(f"congrasp: {text}")
-    end = time.monotonic() + duration if duration is not None else None
     with contextlib.ExitStack() as stack:
+        stack.enter_context(logging_as(log_format, role="recorder", id=process_name("recorder"), run=run))
         transport = stack.enter_context(urls.connect(connect, "observer", certs=certs, run=run))
-        server = stack.enter_context(LiveServer(live)) if live is not None else None
-        if server is not None:
+        sinks = [] if live is None else [stack.enter_context(LiveServer(live))]
+        for server in sinks:
             console.print(f"Live view: open ws://127.0.0.1:{server.port} in Foxglove.")
-        sinks = [server] if server else []
         recorder = stack.enter_context(Recorder(transport, run, out, name="record", sinks=sinks, warn=warn))
         transport.declare_alive(Keys(run).alive("recorder", process_name("recorder"), secrets.token_hex(4)))
         try:
             with console.status(_state(recorder)) as status:
-                while (end is None or time.monotonic() < end) and (server is not None or not recorder.error):
-                    time.sleep(_REFRESH if end is None else max(0.0, min(_REFRESH, end - time.monotonic())))
+                while time.monotonic() < end and (sinks or not recorder.error):
+                    time.sleep(max(0.0, min(_REFRESH, end - time.monotonic())))
                     status.update(_state(recorder))
         finally:
             recorder.close(_CLOSE)
@@ -105,10 +72,10 @@ def record_run(
                 else:
                     print(file)
             console.print(_state(recorder))
-    if recorder.error:
-        raise CongraspError(recorder.error, "Free space and restart the recorder, which begins a new file.")
-    if not recorder.messages:
-        console.print(f"No messages from the run '{run}'. Check its name; 'congrasp status' lists its processes.")
+        if recorder.error:
+            raise CongraspError(recorder.error, "Free space and restart the recorder, which begins a new file.")
+        if not recorder.messages:
+            console.print(f"No messages from the run '{run}'. Check its name; 'congrasp status' lists its processes.")
     return 0
 
 
@@ -119,3 +86,6 @@ def _state(recorder: Recorder) -> str:
         f"{recorder.messages} messages recorded, {size / 1e6:.1f} MB; "
         f"lost {recorder.dropped}, damaged {recorder.damaged}"
     )
+
+
+COMMAND = record

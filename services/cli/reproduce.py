@@ -1,38 +1,31 @@
 """`congrasp reproduce`: the paper's tables, from training to comparison."""
 
+import dataclasses
 import pathlib
 import shlex
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.policy.pretrained import pretrained_hands
+from congrasp.services.cli.console import in_range, tracked
+from congrasp.services.evaluate.lineup import Entrant, read_entrants
+from congrasp.services.ops.children import command
+from congrasp.services.reproduce.comparison import summary
+from congrasp.services.reproduce.page import JSON, LATEX, PAGE
+from congrasp.services.reproduce.plan import BASELINES, RequiredPolicy, policies
+from congrasp.services.reproduce.run import Request, reproduce, to_train
+from congrasp.services.train import launch
 
-if TYPE_CHECKING:
-    from congrasp.services.evaluate.lineup import Entrant
-    from congrasp.services.reproduce.plan import RequiredPolicy
-
-_OUT = "reproduction"
 _QUICK, _FULL = (48, 24), (1000, 64)
 """Episodes of a row, and procedural objects."""
 _MANY = {True: 2, False: 50}
 """Episodes of the table of many objects per episode of a row, by --quick."""
 
 
-def reproduce(
-    out: pathlib.Path = pathlib.Path(_OUT),
-    quick: bool = False,
-    hands: tuple[str, ...] = (),
-    methods: tuple[str, ...] = (),
-    policy: tuple[str, ...] = (),
-    captured: tuple[pathlib.Path, ...] = (),
-    episodes: int = 0,
-    pool: int = 0,
-    physics: PhysicsName = "auto",
-    seed: int = 0,
-    training: str = "",
-    patience: int = 240,
-) -> int:
+@dataclasses.dataclass(frozen=True)
+class Reproduce:
     """Reproduce the paper's tables: train missing policies, evaluate, and write a page, JSON and LaTeX.
 
     On a GPU it trains the full system for each hand, then the baselines and ablations that learn, each as 'congrasp
@@ -41,72 +34,81 @@ def reproduce(
     the reason. Repeat the command to resume a stopped one: trainings resume from their last checkpoint, and finished
     tables are only repeated if policy or settings changed.
 
-    Args:
-      out: Folder for reproduction.html, reproduction.json and tables.tex, and for runs, rows and pictures.
-      quick: Take the pretrained policies, train nothing, and evaluate 48 episodes a row: minutes on two CPU cores.
-      hands: Hands whose full system is evaluated; the other tables use the first one. By default all with a pretrained
-        policy.
-      methods: Methods to compare with it: pd, graspxl, dgrasp, no-dynamic-center, no-feedforward, two-phase,
-        single-stage; by default all.
-      policy: Policies that need no training, in the form of 'congrasp evaluate --policy'.
-      captured: Folders of captured data sets, each with the folders 'objects' and 'constraints' that 'congrasp
-        constraints import' makes; most of the paper's tables need them.
-      episodes: Episodes of a row; 0 takes 1,000, with --quick 48.
-      pool: Procedural objects of a row; 0 takes 64, with --quick 24.
-      physics: Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU.
-      seed: Seed of constraints and episodes.
-      training: Further options of every 'congrasp train', as one text.
-      patience: Minutes after which a training is stopped, to be resumed by the next 'congrasp reproduce'.
-
     Examples:
       congrasp reproduce --quick
       congrasp reproduce --captured grab oakink dexycb
     """
-    from congrasp.common.policy.pretrained import pretrained_hands
-    from congrasp.services.cli.console import at_least, tracked
-    from congrasp.services.reproduce.comparison import summary
-    from congrasp.services.reproduce.page import JSON, LATEX, PAGE
-    from congrasp.services.reproduce.plan import BASELINES, policies
-    from congrasp.services.reproduce.run import Request, reproduce, to_train
 
-    at_least(0, episodes=episodes, pool=pool)
-    at_least(1, patience=patience)
-    if out.exists() and not out.is_dir():
-        raise CongraspError(f"--out is the file {out}.", "Pass a folder.")
-    options: dict[str, Any] = {"quick": quick, "hands": hands, "methods": methods, "policy": policy}
-    options |= {"captured": captured, "episodes": episodes, "pool": pool, "seed": seed, "training": training}
-    options |= {"physics": "" if physics == "auto" else physics, "out": "" if str(out) == _OUT else out}
-    chosen, compared = tuple(dict.fromkeys(hands)) or tuple(pretrained_hands()), methods or BASELINES
-    _check_names(chosen, compared)
-    usual_episodes, usual_pool = _QUICK if quick else _FULL
-    request = Request(
-        out=out,
-        hands=chosen,
-        methods=compared,
-        given=_given(policy, policies(chosen, compared)),
-        captured=captured,
-        quick=quick,
-        options=tuple(shlex.split(training)),
-        patience=60.0 * patience,
-        command=_command(options),
-        episodes=episodes or usual_episodes,
-        pool=pool or usual_pool,
-        many=_MANY[quick] * (episodes or usual_episodes),
-        physics=physics,
-        seed=seed,
-    )
-    _check_device([one.name for one in to_train(request)])
-    with tracked() as track:
-        account = reproduce(request, track, lambda text: print(text, flush=True))
-    print(summary(account.cells))
-    print(f"The page is {out / PAGE}, next to {JSON} and {LATEX}.")
-    return 1 if account.failures else 0
+    out: pathlib.Path = pathlib.Path("reproduction")
+    """Folder for reproduction.html, reproduction.json and tables.tex, and for runs, rows and pictures."""
+    quick: bool = False
+    """Take the pretrained policies, train nothing, and evaluate 48 episodes a row: minutes on two CPU cores."""
+    hands: tuple[str, ...] = ()
+    """Hands whose full system is evaluated; the other tables use the first one. By default all with a pretrained
+    policy."""
+    methods: tuple[str, ...] = ()
+    """Methods to compare with it: pd, graspxl, dgrasp, no-dynamic-center, no-feedforward, two-phase, single-stage; by
+    default all."""
+    policy: tuple[str, ...] = ()
+    """Policies that need no training, in the form of 'congrasp evaluate --policy'."""
+    captured: tuple[pathlib.Path, ...] = ()
+    """Folders of captured data sets, each with the folders 'objects' and 'constraints' that 'congrasp constraints
+    import' makes; most of the paper's tables need them."""
+    episodes: int = 0
+    """Episodes of a row; 0 takes 1,000, with --quick 48."""
+    pool: int = 0
+    """Procedural objects of a row; 0 takes 64, with --quick 24."""
+    physics: PhysicsName = "auto"
+    """Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
+    seed: int = 0
+    """Seed of constraints and episodes."""
+    training: str = ""
+    """Further options of every 'congrasp train', as one text."""
+    patience: int = 240
+    """Minutes after which a training is stopped, to be resumed by the next 'congrasp reproduce'."""
+
+    def __call__(self) -> int:
+        """Trains, evaluates, and prints a summary."""
+
+        in_range(0, episodes=self.episodes, pool=self.pool)
+        in_range(1, patience=self.patience)
+        if self.out.exists() and not self.out.is_dir():
+            raise CongraspError(f"--out is the file {self.out}.", "Pass a folder.")
+        chosen, compared = tuple(dict.fromkeys(self.hands)) or tuple(pretrained_hands()), self.methods or BASELINES
+        _check_names(chosen, compared)
+        usual_episodes, usual_pool = _QUICK if self.quick else _FULL
+        request = Request(
+            out=self.out,
+            hands=chosen,
+            methods=compared,
+            given=_given(self.policy, policies(chosen, compared)),
+            captured=self.captured,
+            quick=self.quick,
+            options=tuple(shlex.split(self.training)),
+            patience=60.0 * self.patience,
+            command=self._command(),
+            episodes=self.episodes or usual_episodes,
+            pool=self.pool or usual_pool,
+            many=_MANY[self.quick] * (self.episodes or usual_episodes),
+            physics=self.physics,
+            seed=self.seed,
+        )
+        _check_device([one.name for one in to_train(request)])
+        with tracked() as track:
+            account = reproduce(request, track, lambda text: print(text, flush=True))
+        print(summary(account.cells))
+        print(f"The page is {self.out / PAGE}, next to {JSON} and {LATEX}.")
+        return 1 if account.failures else 0
+
+    def _command(self) -> str:
+        """The command line, with the options that are set."""
+        usual = vars(Reproduce())
+        given = {name: value for name, value in vars(self).items() if value != usual[name]}
+        return shlex.join(command("congrasp", "reproduce", **given))
 
 
 def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
     """Raises a CongraspError for an unknown hand or method."""
-    from congrasp.common.hands import get_hand
-    from congrasp.services.reproduce.plan import BASELINES
 
     for name in hands:
         if get_hand(name).name != name:
@@ -115,10 +117,8 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
         raise CongraspError(f"There is no method '{min(unknown)}'.", f"Choose from: {', '.join(BASELINES)}.")
 
 
-def _given(texts: tuple[str, ...], needed: "list[RequiredPolicy]") -> "dict[RequiredPolicy, Entrant]":
+def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[RequiredPolicy, Entrant]:
     """Policies by hand and method; raises a CongraspError for one that no table needs."""
-    from congrasp.services.evaluate.lineup import read_entrants
-    from congrasp.services.reproduce.plan import RequiredPolicy
 
     found = {RequiredPolicy(one.hand, one.method): one for one in read_entrants(texts)}
     for policy, one in found.items():
@@ -132,23 +132,12 @@ def _given(texts: tuple[str, ...], needed: "list[RequiredPolicy]") -> "dict[Requ
 
 def _check_device(wanted: list[str]) -> None:
     """Raises a CongraspError if policies must be trained and there is no GPU."""
-    from congrasp.services.train.launch import accelerators
 
-    if wanted and accelerators()[0] == "cpu":
+    if wanted and launch.accelerators()[0] == "cpu":
         raise CongraspError(
             f"{', '.join(wanted)} must be trained first, and this machine has no GPU.",
             "Use --quick, which takes the pretrained policies, or name policies with --policy.",
         )
 
 
-def _command(options: dict[str, Any]) -> str:
-    """The command line, with the options that are set."""
-    words = ["congrasp", "reproduce"]
-    for name, value in options.items():
-        if value:
-            values = value if isinstance(value, tuple) else () if value is True else (value,)
-            words += [f"--{name}", *map(str, values)]
-    return shlex.join(words)
-
-
-COMMAND = reproduce
+COMMAND = Reproduce

@@ -1,11 +1,8 @@
 """`congrasp train`: a learner and its actors on this machine."""
 
-import dataclasses
 import pathlib
 import time
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.config import RunConfig, Split
@@ -15,12 +12,12 @@ from congrasp.common.io.inputs import file_name
 from congrasp.common.task.methods import STUDENT, STUDENTS, with_method
 from congrasp.learner.run_directory import CONFIG_FILE, open_run
 from congrasp.services.train.launch import Launch
-from congrasp.services.train.presets import get_preset, student_of, with_hand
+from congrasp.services.train.presets import get_preset, student_of, with_hand, with_sets
 
 
 def train(
-    config: Annotated[RunConfig, tyro.conf.arg(name="")],
-    launch: Annotated[Launch, tyro.conf.arg(name="")] = Launch(),  # noqa: B008
+    config: RunConfig,
+    launch: Launch = Launch(),  # noqa: B008
     preset: str = "quickstart",
     method: str | None = None,
     hand: str | None = None,
@@ -68,13 +65,8 @@ def train(
     from congrasp.services.train.command import run_training
 
     config = with_hand(config if method is None else with_method(config, method), hand)
-    if constraints is not None or split is not None:
-        objects = config.objects
-        folder = objects.constraints if constraints is None else str(constraints)
-        objects = dataclasses.replace(objects, constraints=folder, split=split or objects.split)
-        config = dataclasses.replace(config, objects=objects)
     return run_training(
-        config,
+        with_sets(config, constraints, split),
         run_dir or pathlib.Path("runs") / f"{file_name(config.name, 'a run')}-{time.strftime('%Y%m%d-%H%M%S')}",
         launch,
         resume=resume,
@@ -84,7 +76,7 @@ def train(
 
 
 def defaults(arguments: list[str]) -> dict[str, Any]:
-    """Defaults that depend on a command line: the preset, and its configuration for the given hand and teacher.
+    """Defaults that depend on a command line: the configuration of the preset for the given hand and teacher.
 
     With --resume the configuration is that of the run, and a preset for another hand is rejected.
     """
@@ -97,12 +89,12 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
                 f"{run_dir} is a run of '{get_hand(config.task.hand).name}', which --preset {named} is not for.",
                 "Leave out --preset, or choose another --run-dir.",
             )
-        return {"preset": preset, "config": config}
+        return {"config": config}
     config = get_preset(preset, hand)
     if teacher := _value("--teacher", arguments):
         method = _value("--method", arguments)
         config = student_of(config, teacher, method if method in STUDENTS else STUDENT)
-    return {"preset": preset, "config": config}
+    return {"config": config}
 
 
 def _value(option: str, arguments: list[str]) -> str:

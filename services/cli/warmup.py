@@ -1,7 +1,5 @@
 """`congrasp warmup`: compiled programs ahead of time."""
 
-import dataclasses
-
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.runtime.engines import PhysicsName
 
@@ -43,12 +41,7 @@ def warmup(
 
     imported()
     console = Console(highlight=False)
-    config = get_preset(preset, hand)
-    config = dataclasses.replace(
-        config,
-        environments=environments or config.environments,
-        rollout_steps=rollout_steps or config.rollout_steps,
-    )
+    config = get_preset(preset, hand, environments=environments, rollout_steps=rollout_steps)
     with on_signal() as stop, console.status("compiling"):
         until_first_update(config, physics, stop, lambda: console.print(first_update(), soft_wrap=True))
     return stop.exit_code

@@ -10,7 +10,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands
-from congrasp.common.task.methods import STUDENTS, evaluated_as
+from congrasp.common.task.methods import STUDENTS, evaluated_as, get_method
+from congrasp.services.evaluate.plan import objects_label
 
 Table = Literal[
     "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
@@ -50,6 +51,31 @@ class Lineup(NamedTuple):
 
     entrants: list[tuple[Entrant, tuple[Table, ...]]]
     missing: list[Missing]
+
+    @property
+    def title(self) -> str:
+        """Describes what is evaluated: a policy, a method without one, or several."""
+        if len(self.entrants) > 1:
+            return f"{len(self.entrants)} policies"
+        one = self.entrants[0][0]
+        what = f"{one.file.name}, version {one.policy.version}"
+        if one.method == "ours":
+            return what
+        return f"method {one.method}, {what}" if get_method(one.method).learns else f"method {one.method}"
+
+    def objects(self, folder: pathlib.Path | None, exam: str) -> str:
+        """Label of the objects, with their scale for the hand if there is one."""
+        labels = list(dict.fromkeys(objects_label(one.policy, folder, exam) for one, _ in self.entrants))
+        return labels[0] if len(labels) == 1 else f"{labels[0].partition(',')[0]} in each hand's size"
+
+    def require(self, hand: str) -> None:
+        """Raises a CongraspError unless captured constraints of this hand belong to all policies."""
+        for one, _ in self.entrants:
+            if one.hand != hand:
+                raise CongraspError(
+                    f"The constraint sets are for the hand '{hand}', the policy for '{one.hand}'.",
+                    f"Generate them for it with 'congrasp constraints import … --hand {one.hand}'.",
+                )
 
 
 def read_entrant(file: pathlib.Path, method: str | None = None) -> Entrant:

@@ -1,4 +1,4 @@
-"""Approaches to attempt: headings and resting poses that the table leaves room for."""
+"""Episodes to attempt for a request: headings and resting poses that the table leaves room for."""
 
 import dataclasses
 import functools
@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from scipy.spatial import cKDTree
 
+from congrasp.actors.initial import RequestedEpisodes
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.closure import outline
 from congrasp.common.hands.spec import Hand
@@ -14,12 +15,62 @@ from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.objects.surface import DENSE, balanced, sample_union
 from congrasp.common.request import GraspRequest
-from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional
 from congrasp.common.task.sampling.build import clear_of_table
 from congrasp.common.task.sampling.headings import INWARD, above, max_width, sample_headings, within_reach
+from congrasp.common.task.types import Surface
 
 _clear_of_table = jax.jit(clear_of_table, static_argnums=0)
 _ACROSS = 0.02  # m per unit of normal difference: the two sides of a thin wall may belong to different regions
+
+
+def to_attempt(
+    hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int, rng: np.random.Generator
+) -> tuple[RequestedEpisodes, np.ndarray, int]:
+    """Attempts under a request at an object with its regions.
+
+    Returns:
+      The episodes, (B,) the resting pose of each, and how many of them are different: the first ones.
+
+    Raises:
+      CongraspError: no approach fits the request, or its reference leads through the table.
+    """
+    episodes, path, different = repeated(hand, task, obj, request, batch), prescribed(request), batch
+    if path is None:
+        position, direction, cross, rests = headings(hand, obj, request, batch, rng)
+        found = {"position": position, "direction": direction, "cross": cross}
+        found = {name: value.astype(np.float32) for name, value in found.items()}
+        episodes = episodes._replace(goal=episodes.goal.replace("heading", **found))
+    else:
+        valid = valid_rests(hand, obj, *path, request.rest)
+        rests, different = np.resize(valid, batch), min(batch, len(valid))
+    return episodes._replace(rest=np.asarray(obj.rest_poses, np.float32)[rests]), rests, different
+
+
+def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int) -> RequestedEpisodes:
+    """Request for a labelled object, repeated `batch` times, in the requested resting pose."""
+    rest = np.asarray(obj.rest_poses[request.rest or 0], np.float32)
+    goal, surface, rest = jax.tree.map(
+        lambda array: np.broadcast_to(array, (batch, *np.shape(array))),
+        (goal_of(hand, task, request), surface_of(task, obj), rest),
+    )
+    asked = {c.name: np.full(batch, c.name in request.constraints) for c in optional(task)}
+    return RequestedEpisodes(goal, asked, surface, rest)
+
+
+def surface_of(task: TaskConfig, obj: GraspObject) -> Surface:
+    """Labelled points of an object, as many as the policy observes, with their normals if it observes them."""
+    points = task.surface_points
+    normals = np.asarray(obj.normals[:points], np.float32) if task.surface_normals else None
+    return Surface(np.asarray(obj.points[:points], np.float32), obj.non_graspable_points[:points], normals)
+
+
+def with_avoid(obj: GraspObject, avoid: np.ndarray) -> GraspObject:
+    """The object with another avoid region, (512,) bool."""
+    return dataclasses.replace(
+        obj, part_names=("graspable", "non-graspable"), graspable=np.array([True, False]), labels=avoid.astype(np.int32)
+    )
 
 
 def headings(
@@ -129,11 +180,11 @@ def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
     return None
 
 
-def valid_rests(hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def valid_rests(hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray, rest: int | None) -> np.ndarray:
     """Resting poses in which a wrist path (n, 3) stays over the table and its last orientation (4,) is not from below.
 
     Raises:
-      CongraspError: there is none.
+      CongraspError: there is none, or the requested one, `rest`, is not among them.
     """
     valid = np.flatnonzero(_clear_of_table(hand, turn[None], path[None], obj.rest_poses[None])[0])
     if not len(valid):
@@ -141,4 +192,8 @@ def valid_rests(hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray
             f"With this reference the hand would be in the table in every resting pose of '{obj.name}'.",
             "Its wrist must stay 2 cm over the table, and the hand come from above or level.",
         )
-    return valid
+    if rest is not None and rest not in valid:
+        raise CongraspError(
+            f"With this reference the hand would be in the table in resting pose {rest + 1}.", "Leave out --rest."
+        )
+    return valid if rest is None else np.array([rest])

@@ -14,7 +14,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.arm.files import PICTURE as ARM_PICTURE
 from congrasp.services.arm.files import save_picture, save_robot_video, save_trajectories
 from congrasp.services.export.motion_file import save_motion
-from congrasp.services.grasp.grasper import Grasp
+from congrasp.services.grasp.motion import Grasp
 from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.scene import episode_entries
 from congrasp.services.record.writer import LogWriter

@@ -38,8 +38,6 @@ class Settings(NamedTuple):
     options: ImportOptions
     constraints: dict[str, Any]
     """See `services.grasp.parse.read_request`."""
-    identity: tuple[Any, ...]
-    """Further identity of a grasp: policy, seed, attempts."""
     film: Film | None
     """Style of a video; None for no video."""
     view: View | None
@@ -128,7 +126,7 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
             if text
         }
         options = dataclasses.asdict(dataclasses.replace(settings.options, cache_dir=""))
-        key = key_of(at.digest(), options, given, settings.identity, settings.rest)
+        key = key_of(at.digest(), options, given, grasper.identity, settings.rest)
         before = None if settings.again else finished(folder, key)
         drawn = [settings.film and [*settings.film], settings.view and [*settings.view]]
         filmed = settings.film is None or (before and json.loads(json.dumps(drawn)) == before.get("drawn"))

@@ -40,8 +40,9 @@ _FAR = 1.0  # m from an object; places beyond it have another unit or origin
 
 
 class Target(NamedTuple):
-    """Context of constraints: the hand and the object they apply to."""
+    """Context of an option: its name, the hand and the object."""
 
+    name: str
     obj: GraspObject
     hand: Hand
     waypoints: int
@@ -57,6 +58,14 @@ class Target(NamedTuple):
             return quaternions
         w, x, y, z = np.moveaxis(np.asarray(quaternions) / np.sqrt(2), -1, 0)
         return np.stack([w - x, x + w, y - z, z + y], -1)  # after a quarter turn about x
+
+    def check_near(self, position: np.ndarray, what: str) -> None:
+        """Raises a CongraspError if a place (3,), object frame, is so far away that its unit must be wrong."""
+        with np.errstate(over="ignore"):
+            away = float(np.linalg.norm(self.obj.points - position, axis=-1).min())
+        if away > _FAR:
+            remedy = "Give metres, in the axes and with the origin of its file."
+            raise CongraspError(f"{what} lies {away:.3g} m from '{self.obj.name}'.", remedy)
 
 
 def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> GraspRequest:
@@ -75,8 +84,10 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
     options = {option.name: option for constraint in CONSTRAINTS for option in constraint.options}
     if unknown := sorted(set(texts) - set(options)):
         raise CongraspError(f"There is no constraint option '{unknown[0]}'.", f"Known: {', '.join(options)}.")
-    target = Target(obj, hand, waypoints)
-    given = {name: _read(option, _plain(option, texts.get(name, "")), target) for name, option in options.items()}
+    given = {
+        name: _read(option, _plain(option, texts.get(name, "")), Target(f"--{name}", obj, hand, waypoints))
+        for name, option in options.items()
+    }
     parsed = {constraint: constraint.parse(given, hand, obj) for constraint in CONSTRAINTS}
     found = {constraint.name: arrays for constraint, arrays in parsed.items() if arrays is not None}
     regions = [constraint.avoid_region(given, obj) for constraint in CONSTRAINTS if constraint.name in found]
@@ -85,12 +96,15 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
 
 
 def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
-    """Returns the value of an option, by its kind; None if it is not given."""
+    """Returns the value of an option, by its kind; None if it is not given. Errors name the option."""
     if not text:
         return None
     if isinstance(text, tuple) or option.kind == "text" or text in option.words:
         return text
-    return _READERS[option.kind](text, f"--{option.name}", target)
+    try:
+        return _READERS[option.kind](text, target)
+    except CongraspError as error:
+        raise CongraspError(str(error) if str(error).startswith(target.name) else f"{target.name}: {error}") from None
 
 
 def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]) -> str | tuple[str, ...]:
@@ -106,27 +120,27 @@ def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]
     return tuple(text.replace(",", " ").split()) if option.many else text
 
 
-def _place(text: str, name: str, target: Target) -> np.ndarray:
+def _place(text: str, target: Target) -> np.ndarray:
     """(3,) m, object frame, of a place in the coordinates of the object's file."""
-    position = target.placed(_numbers(text, 3, name))
-    _check_near(target.obj, position, name)
+    position = target.placed(_numbers(text, target.name))
+    target.check_near(position, target.name)
     return position
 
 
-def _direction(text: str, name: str, target: Target) -> np.ndarray:
+def _direction(text: str, target: Target) -> np.ndarray:
     """(3,) unit vector."""
-    return _unit(upright(_numbers(text, 3, name), target.obj.file_up), name)
+    return _unit(upright(_numbers(text, target.name), target.obj.file_up), target.name)
 
 
-def _numbers(text: str, count: int, name: str) -> np.ndarray:
-    """(count,) finite numbers."""
+def _numbers(text: str, name: str) -> np.ndarray:
+    """(3,) finite numbers."""
     try:
         values = np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError:
         values = np.zeros(0)
-    if values.shape != (count,) or not np.isfinite(values).all():
+    if values.shape != (3,) or not np.isfinite(values).all():
         example = f'{name} "0 0 -1"' + (f" or {name} {ABOVE}" if name == "--heading" else "")
-        raise CongraspError(f"{name} is '{text}', not {count} numbers.", f"Write for example {example}.")
+        raise CongraspError(f"{name} is '{text}', not 3 numbers.", f"Write for example {example}.")
     return values
 
 
@@ -138,133 +152,106 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
     return vector / largest / np.linalg.norm(vector / largest)
 
 
-def _check_near(obj: GraspObject, position: np.ndarray, what: str) -> None:
-    """Raises a CongraspError if a place (3,), object frame, is so far from the object that its unit must be wrong."""
-    with np.errstate(over="ignore"):
-        away = float(np.linalg.norm(obj.points - position, axis=-1).min())
-    if away > _FAR:
-        raise CongraspError(
-            f"{what} lies {away:.3g} m from '{obj.name}'.", "Give metres, in the axes and with the origin of its file."
-        )
-
-
-def _part(text: str, name: str, target: Target) -> Part:
+def _part(text: str, target: Target) -> Part:
     """A part of the object: a mesh file in the coordinates of its file, or names of its parts."""
     path, obj = pathlib.Path(text), target.obj
     if not path.suffix and not path.exists():
         names = [word.strip() for word in text.split(",")]
-        for part in names:
-            if part not in obj.part_names:
-                raise CongraspError(
-                    f"{name}: '{obj.name}' has no part '{part}'.",
-                    f"Its parts are: {', '.join(obj.part_names)}; or name a mesh file of the part.",
-                )
+        if unknown := [part for part in names if part not in obj.part_names]:
+            known = f"Its parts are: {', '.join(obj.part_names)}; or name a mesh file of the part."
+            raise CongraspError(f"'{obj.name}' has no part '{unknown[0]}'.", known)
         inside = np.isin(obj.labels, [obj.part_names.index(part) for part in names])
         return Part(text, np.where(inside, 0.0, 1.0))
     if not path.is_file():
-        raise CongraspError(f"{name}: there is no file {path}.", "Check the path.")
-    try:
-        geometry = load_geometry(path, "Export the part as PLY.")
-        up = "y" if obj.file_up == "y" else up_of(geometry)
-    except CongraspError as error:
-        raise CongraspError(f"{name}: {error}") from None
+        raise CongraspError(f"there is no file {path}.", "Check the path.")
+    geometry = load_geometry(path, "Export the part as PLY.")
+    up = "y" if obj.file_up == "y" else up_of(geometry)
     geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
     points = np.asarray(getattr(geometry, "vertices", ()), float).reshape(-1, 3)
     if len(getattr(geometry, "faces", ())):
         points = np.concatenate([points, trimesh.sample.sample_surface(geometry, 8000, seed=0)[0]])
     points = upright(points[np.isfinite(points).all(-1)], up)
     if not len(points):
-        raise CongraspError(f"{name}: {path} holds no points.", "Export the part as PLY.")
+        raise CongraspError(f"{path} holds no points.", "Export the part as PLY.")
     return Part(text, cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0])
 
 
-def _pose(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
+def _pose(text: str, target: Target) -> dict[str, np.ndarray]:
     """A reference pose from a motion, a constraint set, or JSON."""
-    hand, obj = target.hand, target.obj
     path, index = numbered(text)
     if path.suffix == ".npz":
-        motion = _motion(path, hand, index)
+        motion = _motion(path, target.hand, index)
         last = grasp_part(motion)[1]
         position, quaternion = _wrist_on_object(motion, last)
-        return _reference(motion.joint_position[last], position[last], quaternion[last])
+        return {"q": motion.joint_position[last], "position": position[last], "quaternion": quaternion[last]}
     if path.name.endswith(constraint_sets.SUFFIX):
-        arrays = _set_of(path, hand, obj, index).arrays
+        arrays = _set_of(path, target, index).arrays
         return {name: arrays[f"pose/{name}"][0, index] for name in ("q", "position", "quaternion")}
-    given = _json(path, name, ("joints", "position", "quaternion"))
+    given, hand = _json(path, ("joints", "position", "quaternion")), target.hand
     joints, names = given["joints"], [joint.name for joint in hand.joints]
     if isinstance(joints, dict):
         if unknown := sorted(set(joints) - set(names)):
-            raise CongraspError(f"{name}: the hand '{hand.name}' has no joint '{unknown[0]}'.", f"Known: {names}.")
+            raise CongraspError(f"the hand '{hand.name}' has no joint '{unknown[0]}'.", f"Known: {names}.")
         joints = [joints.get(name, 0.0) for name in names]
-    q = _floats(joints, (len(names),), f"{name}: 'joints' of {path}")
-    position = target.placed(_floats(given["position"], (3,), f"{name}: 'position' of {path}"))
-    _check_near(obj, position, f"{name}: the wrist of {path}")
+    q = _floats(joints, (len(names),), f"'joints' of {path}")
     if np.abs(q).max() > 2 * np.pi:
-        raise CongraspError(f"{name}: a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians.")
-    turn = _unit(_floats(given["quaternion"], (4,), f"{name}: 'quaternion' of {path}"), f"{name}: the quaternion")
-    return _reference(coupled(hand, np.clip(q, hand.lower, hand.upper)), position, target.turned(turn))
+        raise CongraspError(f"a joint of {path} is at {np.abs(q).max():.4g}.", "Angles are in radians.")
+    position = target.placed(_floats(given["position"], (3,), f"'position' of {path}"))
+    target.check_near(position, f"the wrist of {path}")
+    turn = _unit(_floats(given["quaternion"], (4,), f"'quaternion' of {path}"), "the quaternion")
+    q = coupled(hand, np.clip(q, hand.lower, hand.upper))
+    return {"q": q, "position": position, "quaternion": target.turned(turn)}
 
 
-def _reference(q: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> dict[str, np.ndarray]:
-    """The goal arrays of a reference pose."""
-    return {"q": q, "position": position, "quaternion": quaternion}
-
-
-def _path(text: str, name: str, target: Target) -> dict[str, np.ndarray]:
+def _path(text: str, target: Target) -> dict[str, np.ndarray]:
     """A wrist trajectory from a motion, a constraint set, CSV, BVH, or JSON."""
-    obj, hand, waypoints = target
     path, index = numbered(text)
     file, _, joint = text.partition(":")
     if file.lower().endswith(".bvh"):
-        return _recorded(pathlib.Path(file), joint or "RightHand", name, target)
+        return _recorded(pathlib.Path(file), joint or "RightHand", target)
     if path.suffix == ".npz":
-        motion = _motion(path, hand, index)
+        motion = _motion(path, target.hand, index)
         first, last = grasp_part(motion)
-        position, quaternion = _wrist_on_object(motion, first)
-        return _resampled(position[first : last + 1], quaternion[first : last + 1], waypoints, name, path)
+        position, quaternion = (values[first : last + 1] for values in _wrist_on_object(motion, first))
+        return _resampled(position, quaternion, target.waypoints, path)
     if path.name.endswith(constraint_sets.SUFFIX):
-        arrays = _set_of(path, hand, obj, index).arrays
+        arrays = _set_of(path, target, index).arrays
         position, quaternion = (arrays[f"trajectory/{name}"][0, index] for name in ("position", "quaternion"))
-        return _resampled(position, quaternion, waypoints, name, path)
+        return _resampled(position, quaternion, target.waypoints, path)
     if path.suffix.lower() == ".csv":
-        try:
-            position, quaternion = read_csv(path, _LARGEST)
-        except CongraspError as error:
-            raise CongraspError(f"{name}: {error}") from None
+        position, quaternion = read_csv(path, _LARGEST)
     else:
-        given = _json(path, name, ("position", "quaternion"))
+        given = _json(path, ("position", "quaternion"))
         count = len(given["position"]) if isinstance(given["position"], list) else 0
-        position = _floats(given["position"], (count, 3), f"{name}: 'position' of {path}")
-        quaternion = _floats(given["quaternion"], (count, 4), f"{name}: 'quaternion' of {path}")
+        position = _floats(given["position"], (count, 3), f"'position' of {path}")
+        quaternion = _floats(given["quaternion"], (count, 4), f"'quaternion' of {path}")
     position = target.placed(position)
-    _check_near(obj, position[-1], f"{name}: the end of {path}")
-    return _resampled(position, target.turned(quaternion), waypoints, name, path)
+    target.check_near(position[-1], f"the end of {path}")
+    return _resampled(position, target.turned(quaternion), target.waypoints, path)
 
 
-def _recorded(path: pathlib.Path, joint: str, name: str, target: Target) -> dict[str, np.ndarray]:
+def _recorded(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.ndarray]:
     """The path of a BVH joint up to the frame in which it is nearest to the object, cut like captures."""
     recorded = read_wrist_path(path, joint=joint)
     position, rotation = followed(target.hand, recorded.position, recorded.rotation)
     position = position + target.obj.origin  # both are upright
     away = Surface(target.obj).distance(position)
     frame = int(away.argmin())
-    _check_near(target.obj, position[frame], f"{name}: the joint '{joint}' of {path}")
+    target.check_near(position[frame], f"the joint '{joint}' of {path}")
     known = np.ones(len(away), bool)
     try:
         _, places, turns = approach(path.stem, position, rotation.as_matrix(), away, known, frame, target.waypoints)
     except Dropped as dropped:
-        raise CongraspError(f"{name}: {path}: {dropped.reason}.", "Move the skeleton, or name another joint.") from None
+        raise CongraspError(f"{path}: {dropped.reason}.", "Move the skeleton, or name another joint.") from None
     return {"position": places, "quaternion": turns}
 
 
 def numbered(text: str) -> tuple[pathlib.Path, int]:
     """The file and the number in FILE or FILE:NUMBER; the number is 0 by default."""
     name, colon, number = text.rpartition(":")
-    return (
-        (pathlib.Path(name), int(number))
-        if colon and number.isdecimal() and len(number) < 10
-        else (pathlib.Path(text), 0)
-    )
+    if colon and number.isdecimal() and len(number) < 10:
+        return pathlib.Path(name), int(number)
+    return pathlib.Path(text), 0
 
 
 def _motion(path: pathlib.Path, hand: Hand, index: int) -> GraspMotion:
@@ -291,9 +278,9 @@ def _wrist_on_object(motion: GraspMotion, frame: int) -> tuple[np.ndarray, np.nd
     return turn.apply(motion.wrist_position - motion.object_position[frame]), (turn * wrist).as_quat(scalar_first=True)
 
 
-def _set_of(path: pathlib.Path, hand: Hand, obj: GraspObject, index: int) -> Message:
+def _set_of(path: pathlib.Path, target: Target, index: int) -> Message:
     """The constraint set in a file; raises a CongraspError for another hand or object, or without this number."""
-    constraints = constraint_sets.load(path)
+    constraints, hand, obj = constraint_sets.load(path), target.hand, target.obj
     if constraints.meta["hand"] != hand.name:
         raise CongraspError(f"{path} is for the hand '{constraints.meta['hand']}', not '{hand.name}'.")
     own, wanted = (np.ptp(x, axis=0) for x in (obj.visual_vertices, constraints.arrays["visual/vertices"]))
@@ -310,16 +297,13 @@ def _set_of(path: pathlib.Path, hand: Hand, obj: GraspObject, index: int) -> Mes
     return constraints
 
 
-def _json(path: pathlib.Path, name: str, keys: tuple[str, ...]) -> dict[str, Any]:
+def _json(path: pathlib.Path, keys: tuple[str, ...]) -> dict[str, Any]:
     """A JSON file that has these keys."""
     remedy = f"Write a JSON file with {', '.join(keys)}, or name a motion (.npz) or a constraint set."
-    try:
-        given = read_json(path, _LARGEST, remedy)
-    except CongraspError as error:
-        raise CongraspError(f"{name}: {error}") from None
+    given = read_json(path, _LARGEST, remedy)
     for key in keys:
         if not isinstance(given, dict) or key not in given:
-            raise CongraspError(f"{name}: {path} lacks '{key}'.", remedy)
+            raise CongraspError(f"{path} lacks '{key}'.", remedy)
     return given
 
 
@@ -335,15 +319,15 @@ def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def _resampled(
-    position: np.ndarray, quaternion: np.ndarray, waypoints: int, name: str, path: pathlib.Path
+    position: np.ndarray, quaternion: np.ndarray, waypoints: int, path: pathlib.Path
 ) -> dict[str, np.ndarray]:
     """`waypoints` poses evenly spread along a path (n, 3), (n, 4)."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=-1))])
     kept = np.concatenate([[True], np.diff(along) > 1e-6])
     if kept.sum() < 2:
-        raise CongraspError(f"{name}: the wrist does not move in {path}.", "Give two different waypoints or more.")
+        raise CongraspError(f"the wrist does not move in {path}.", "Give two different waypoints or more.")
     if (np.linalg.norm(quaternion, axis=-1) < 1e-6).any():
-        raise CongraspError(f"{name}: {path} has a quaternion of length zero.")
+        raise CongraspError(f"{path} has a quaternion of length zero.")
     position, quaternion, along = position[kept], quaternion[kept], along[kept]
     wanted = np.linspace(0.0, along[-1], waypoints)
     places = np.stack([np.interp(wanted, along, column) for column in position.T], -1)
@@ -351,11 +335,11 @@ def _resampled(
     return {"position": places, "quaternion": continuous(turns.as_quat(scalar_first=True))}
 
 
-_READERS: dict[str, Callable[[str, str, Target], Any]] = {
+_READERS: dict[str, Callable[[str, Target], Any]] = {
     "direction": _direction,
     "place": _place,
     "part": _part,
     "pose": _pose,
     "path": _path,
 }
-"""Readers of an option's text by its kind (`Option.kind`); their arguments are the text, the option and its target."""
+"""Readers of an option's text by its kind (`Option.kind`); their arguments are the text and the option's target."""

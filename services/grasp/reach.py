@@ -22,7 +22,8 @@ from congrasp.common.hands.spec import Hand, link_origin
 from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.wire.codec import Message
-from congrasp.services.viz.shapes import upright
+from congrasp.common.wire.messages import EPISODE
+from congrasp.services.viz.shapes import link_frames, upright
 
 SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
 """Limits of the wrist: m/s, m/s^2 and rad/s."""
@@ -43,6 +44,9 @@ _BACK = (0.08, 0.15, 0.22)  # of the curve's middle point from its end, against 
 _UP = (0.0, 0.10, 0.20, 0.32)  # and upwards, m
 _TOLERANCE = 1e-3  # m
 _BEGIN = ("object_position", "object_quaternion", "link_position", "link_quaternion", "q", "goal/heading_direction")
+
+_OF_STEPS = {name for name, spec in EPISODE.arrays.items() if spec.shape and spec.shape[0] == "T"}
+"""Arrays of an episode that have a row for each control step."""
 
 
 class NoReachError(CongraspError):
@@ -257,34 +261,19 @@ def with_reach(episode: Message, hand: Hand, reach: Reach) -> Message:
     During the approach the object rests, there is no contact, and errors are those of the first step.
     """
     arrays, steps = episode.arrays, len(reach.q)
-    count = len(arrays["table"])
-    before = {name: np.repeat(value[:1], steps, 0) for name, value in arrays.items() if _of_steps(name, value, count)}
+    moving = [name for name in arrays if name in _OF_STEPS or f"{name.partition('/')[0]}/*" in _OF_STEPS]
+    before = {name: np.repeat(arrays[name][:1], steps, 0) for name in moving}
     for name in before:
         if name.startswith("reward/") or name in ("action", "contact_force"):
             before[name] = np.zeros_like(before[name])
-    local = [mujoco_link_poses(hand, q) for q in reach.q]
-    before["link_position"] = np.stack(
-        [turn.apply(links) + at for (links, _), turn, at in zip(local, reach.rotation, reach.position, strict=True)]
-    )
-    before["link_quaternion"] = np.stack(
-        [
-            (turn * Rotation.from_quat(links, scalar_first=True)).as_quat(scalar_first=True)
-            for (_, links), turn in zip(local, reach.rotation, strict=True)
-        ]
-    )
+    frames = [link_frames(hand, *pose) for pose in zip(reach.q, reach.position, reach.rotation, strict=True)]
+    before["link_position"], before["link_quaternion"] = map(np.stack, zip(*frames, strict=True))
     before["q"] = before["q_target"] = reach.q
     before["u"] = before["u_target"] = _wrist_joints(episode, reach)
     joined = {name: np.concatenate([part.astype(arrays[name].dtype), arrays[name]]) for name, part in before.items()}
     later = steps * episode.meta["control_dt"]
     phases = {"approach": 0.0, **{name: begin + later for name, begin in episode.meta["phases"].items()}}
     return Message({**arrays, **joined}, {**episode.meta, "phases": phases})
-
-
-def _of_steps(name: str, value: np.ndarray, steps: int) -> bool:
-    """True if an array of an episode has a row for each control step."""
-    kinds = ("reward/", "error/", "link_", "object_position", "object_quaternion", "q_target", "u_target")
-    named = name.startswith(kinds) or name in ("contact_force", "q", "u", "action", "table")
-    return named and value.ndim > 0 and len(value) == steps
 
 
 def _wrist_joints(episode: Message, reach: Reach) -> np.ndarray:

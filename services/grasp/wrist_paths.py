@@ -33,7 +33,7 @@ class WristPath(NamedTuple):
     rotation: Rotation
     """T orientations of the wrist frame."""
     seconds: float
-    """Between two frames."""
+    """Between two frames; 10 ms if the file does not say it."""
 
 
 def read_wrist_path(
@@ -55,15 +55,16 @@ def read_wrist_path(
     Raises:
       CongraspError: the file cannot be read or has no such joint, or the axes are unknown or not orthogonal.
     """
-    readers = {".csv": _csv, ".npz": _npz}
     kind = path.suffix.lower()
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Name a CSV, NPZ or BVH file.")
     if kind == ".bvh":
         position, rotation, seconds = read_bvh(path, joint)
         position, rotation = _FROM_Y_UP.apply(position * _CM), _FROM_Y_UP * rotation
-    elif kind in readers:
-        position, quaternion, seconds = readers[kind](path)
+    elif kind in (".csv", ".npz"):
+        position, quaternion = _npz(path) if kind == ".npz" else read_csv(path, _LARGEST)
+        _check(path, position, quaternion)
+        seconds = 0.01
         rotation = Rotation.from_quat(quaternion, scalar_first=True)
     else:
         raise CongraspError(f"{path} is neither CSV, NPZ nor BVH.", "Convert it to one of them.")
@@ -182,28 +183,19 @@ def _is_number(word: str) -> bool:
         return False
 
 
-def _csv(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """Positions, quaternions and seconds between two frames, of a CSV file."""
-    return _checked(path, *read_csv(path, _LARGEST))
-
-
-def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """The same of an NPZ file."""
+def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and quaternions of an NPZ file."""
     try:
         data = read_npz(path, remedy := "It needs 'position' and 'quaternion'.")
         keys = ("wrist_position", "wrist_quaternion") if "wrist_position" in data else ("position", "quaternion")
         position, quaternion = (data[key].astype(float) for key in keys)
     except (KeyError, ValueError) as error:
         raise CongraspError(f"{path} cannot be read: {error}.", remedy) from None
-    return _checked(path, position, quaternion)
+    return position, quaternion
 
 
-def _checked(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns checked arrays, and 10 ms as the time between frames.
-
-    Raises:
-      CongraspError: a shape is wrong, a number is not finite, or a quaternion is not normalised.
-    """
+def _check(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> None:
+    """Raises a CongraspError if a shape is wrong, a number is not finite, or a quaternion is not normalised."""
     if position.ndim != 2 or position.shape[1:] != (3,) or quaternion.shape != (len(position), 4) or not len(position):
         raise CongraspError(
             f"{path} has positions {position.shape} and quaternions {quaternion.shape}.",
@@ -212,4 +204,3 @@ def _checked(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -
     both = np.concatenate([position, quaternion], 1)
     if not np.isfinite(both).all() or np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > 0.05:
         raise CongraspError(f"{path} holds numbers that are not finite, or quaternions that are not of length one.")
-    return position, quaternion, 0.01

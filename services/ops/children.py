@@ -15,6 +15,16 @@ CHILD_GRACE = 2.0
 """Seconds for a child to drain; the rest of `GRACE` remains to kill it before this process must end."""
 
 
+def command(*words: object, **options: object) -> list[str]:
+    """Arguments of congrasp: words, then options by name; None and False leave one out, and a tuple has many values."""
+    arguments = list(map(str, words))
+    for name, value in options.items():
+        if value is not None and value is not False:
+            values = value if isinstance(value, tuple) else () if value is True else (value,)
+            arguments += [f"--{name.replace('_', '-')}", *map(str, values)]
+    return arguments
+
+
 @dataclasses.dataclass
 class Child:
     """A process of the run."""
@@ -44,6 +54,11 @@ class Child:
         register_child(self.process)
         return self.process.pid
 
+    @property
+    def code(self) -> int | None:
+        """Its exit code; None while it runs, and before."""
+        return self.process.poll() if self.process else None
+
     def last_line(self) -> str:
         """The last line of its log."""
         lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
@@ -60,7 +75,7 @@ def wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> No
 
 def end_all(children: Sequence[Child]) -> None:
     """Sends SIGTERM to all, and SIGKILL to those that have not drained within `CHILD_GRACE` seconds."""
-    running = [child.process for child in children if child.process is not None and child.process.poll() is None]
+    running = [child.process for child in children if child.process and child.code is None]
     for process in running:
         process.terminate()
     wait_for(running, CHILD_GRACE)

@@ -1,6 +1,7 @@
-"""Logs of a role: lines for users, or one JSON object per line for a log collector."""
+"""Monitoring of a role: its log, in lines for users or one JSON object per line, and its metrics."""
 
 import contextlib
+import dataclasses
 import datetime
 import json
 import logging
@@ -63,6 +64,32 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
     yield
     # After an exception the handler stays: `log_error` may still report the reason.
     root.removeHandler(handler)
+
+
+@dataclasses.dataclass(frozen=True)
+class Watch:
+    """Options for monitoring a role; the string under a field is its help on the command line."""
+
+    log_format: LogFormat = "text"
+    """Lines of text, or one JSON object a line: time, level, role, id, run, text, fields."""
+    metrics_port: int = 0
+    """Port of a Prometheus endpoint, http://HOST:PORT/metrics; 0 for none."""
+    metrics_host: str = "127.0.0.1"
+    """Interface of the Prometheus endpoint. It has no authentication."""
+
+    @contextlib.contextmanager
+    def watched(self, role: str, id: str, run: str, collector: Any) -> Iterator[None]:
+        """Logs and, if a port is set, serves the collector's metrics while the block runs."""
+        with logging_as(self.log_format, role=role, id=id, run=run), self.exposed(collector):
+            yield
+
+    def exposed(self, collector: Any) -> contextlib.AbstractContextManager[None]:
+        """Context that serves a collector's metrics, if a port is set."""
+        if not self.metrics_port:
+            return contextlib.nullcontext()
+        from congrasp.services.ops.metrics import exposed
+
+        return exposed(self.metrics_port, self.metrics_host, collector)
 
 
 def log(level: str, text: str, fields: Mapping[str, float] | None = None) -> None:

@@ -14,7 +14,7 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.transport.ports import local_url
 from congrasp.services.client.policy import Policy
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.ops.children import Child, end_all
+from congrasp.services.ops.children import Child, command, end_all
 
 
 @contextlib.contextmanager
@@ -28,7 +28,7 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]
       log: file for the server's output.
     """
     endpoint = local_url()
-    server = Child("server", ["serve", "--policy", str(policy), "--listen", endpoint], log)
+    server = Child("server", command("serve", policy=policy, listen=endpoint), log)
     try:
         yield endpoint, server.start()
     finally:

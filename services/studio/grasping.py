@@ -21,7 +21,8 @@ from congrasp.common.task.constraints import get_constraint, known, require_know
 from congrasp.common.task.constraints.priority import explain
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.pictures import cause
-from congrasp.services.grasp.grasper import costs, repeated, surface_of
+from congrasp.services.grasp.approaches import repeated, surface_of
+from congrasp.services.grasp.motion import costs
 from congrasp.services.grasp.reach import with_planned_reach
 from congrasp.services.serve.server import Source
 from congrasp.services.studio.session import SECONDS, Progress
@@ -34,7 +35,7 @@ _ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
 _COMPILING = 60
 """Seconds of the first grasp on two cores of a laptop, with an empty compilation cache."""
 _OTHER = 2.0
-"""Cost of deviating from the drawn grasp, in addition to the costs of `services.grasp.grasper`."""
+"""Cost of deviating from the drawn grasp, in addition to the costs of `services.grasp.motion`."""
 Held = Callable[[GraspRequest, str], int]
 """(weaker request, name of the omitted constraint) -> number of attempts that hold."""
 

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.actors.initial import initial_hand
 from congrasp.common.hands import known_hand
-from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.painting import painted
@@ -23,11 +22,11 @@ from congrasp.common.task.constraints.markers import Ghost, Marker
 from congrasp.common.task.reward import GRASP
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.grasp.grasper import surface_of
+from congrasp.services.grasp.approaches import surface_of
 from congrasp.services.record.goals import active_blocks, active_constraints, markers
 from congrasp.services.studio.state import Studio, tool_of
 from congrasp.services.viz.render import grasp_steps
-from congrasp.services.viz.shapes import skin_colours
+from congrasp.services.viz.shapes import link_frames, skin_colours
 
 TOUCH = 0.05
 """Least force of a link in contact, N."""
@@ -118,9 +117,7 @@ def _start(hand: Hand, task: TaskConfig, goal: Goal, surface: Surface, rest: jax
 def _frames(hand: Hand, q: Any, position: Any, quaternion: Any) -> dict[str, np.ndarray]:
     """Link frames, positions (L, 3) and quaternions (L, 4), of finger angles and a wrist pose, in that pose's frame."""
     wrist = Rotation.from_quat(quaternion, scalar_first=True)
-    places, turns = mujoco_link_poses(hand, np.asarray(q, float))
-    turned = wrist * Rotation.from_quat(turns, scalar_first=True)
-    return {"position": wrist.apply(places) + position, "quaternion": turned.as_quat(scalar_first=True)}
+    return dict(zip(("position", "quaternion"), link_frames(hand, np.asarray(q, float), position, wrist), strict=True))
 
 
 def _shapes(hand: Hand, shown: Iterator[Marker]) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -22,7 +22,7 @@ from congrasp.common.task.sampling.headings import BACK_OFF
 from congrasp.common.task.sampling.write_sets import make_sets
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.grasp.grasper import with_avoid
+from congrasp.services.grasp.approaches import with_avoid
 from congrasp.services.studio.drawing import Arrow, Canvas, Paint, arrow_through, from_above, stroke, vector
 
 Fields = Mapping[str, np.ndarray]

@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator
 from typing import Any, Self
 
-import numpy as np
 from rich.console import Console
 
 from congrasp.common.config import ObjectsConfig, RunConfig
@@ -32,7 +31,7 @@ from congrasp.learner.run_directory import (
 )
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.experiment import Experiment, Variation
-from congrasp.services.evaluate.scores import Row
+from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.shutdown import on_signal
 from congrasp.services.serve.load import example_episode, one_answer, serving
 from congrasp.services.train.launch import Launch, Plan
@@ -46,7 +45,7 @@ EPISODE = "episode.png"
 _EVALUATION_OBJECTS = 12
 _LINE_SECONDS = 10.0
 _SPACE = 64 << 10  # bytes below which a disk counts as full
-console = Console(highlight=False)
+console = Console(highlight=False, soft_wrap=True)
 
 
 def run_training(
@@ -72,7 +71,7 @@ def run_training(
     _announce(config, run_dir, plan)
     with on_signal() as stop:
         began = time.monotonic()
-        with _Progress(config, launch.ranks) as progress:
+        with _Progress(config) as progress:
             if plan.in_process:
                 learn(
                     run_dir,
@@ -80,9 +79,8 @@ def run_training(
                     wire=None,
                     inside=plan.physics,
                     stop=stop,
-                    resume=resume,
                     writers=launch.metric_writers,
-                    metrics_port=launch.metrics_port,
+                    watch=Watch(metrics_port=launch.metrics_port),
                     on_update=progress.update,
                     on_event=lambda level, text: _warn(text) if level == "error" else None,
                 )
@@ -90,7 +88,7 @@ def run_training(
                 with _full_disk_named(run_dir):
                     train(run_dir, config, plan, stop=stop, report=progress.show, notify=_warn)
         if stop.is_set():
-            console.print(f"Stopped. To resume: {_command()} train --resume --run-dir {run_dir}", soft_wrap=True)
+            console.print(f"Stopped. To resume: {_command()} train --resume --run-dir {run_dir}")
             return stop.exit_code
         console.print(f"Trained for {(time.monotonic() - began) / 60:.1f} min.")
         if evaluation:
@@ -101,7 +99,7 @@ def run_training(
 
 def _warn(text: str) -> None:
     """Prints a line about the run's processes."""
-    console.print(f"  {text}", style="yellow", markup=False, soft_wrap=True)
+    console.print(f"  {text}", style="yellow", markup=False)
 
 
 def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | None, *, resume: bool) -> None:
@@ -110,7 +108,7 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
         continue_run(run_dir, config)
         if not has_checkpoints(run_dir):
             raise CongraspError(f"{run_dir} has no checkpoint to resume from.", "Start again in another --run-dir.")
-        Checkpoints(run_dir / CHECKPOINTS).find(lambda level, text: console.print(text, markup=False, soft_wrap=True))
+        Checkpoints(run_dir / CHECKPOINTS).find(lambda level, text: console.print(text, markup=False))
         return
     if run_dir.exists() and any(run_dir.iterdir()) and not (run_dir / CONFIG_FILE).exists():
         raise CongraspError(f"{run_dir} is not empty and is not a run.", "Choose another --run-dir.")
@@ -121,7 +119,6 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
         console.print(
             f"The critic of {initial} has other privileged inputs than this run; the new ones start at zero weight.",
             markup=False,
-            soft_wrap=True,
         )
 
 
@@ -131,26 +128,13 @@ def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:
     console.print(
         f"[bold]{config.name}[/]: {config.updates} updates of {ranks * _steps_per_update(config)} steps, "
         f"{ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on '{plan.physics}' in "
-        f"{run_dir}",
-        soft_wrap=True,
+        f"{run_dir}"
     )
     simplifications = easier(config)
     if simplifications:
         console.print(
-            f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is --preset {FULL}, for a GPU.",
-            soft_wrap=True,
+            f"Easier than the full task: {'; '.join(simplifications)}.\nThe full task is --preset {FULL}, for a GPU."
         )
-
-
-def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
-    """Shows the results of the training: success, a picture, and a live query."""
-    row = _evaluate(bundles.load(run_dir / POLICY_FILE), config, episodes, run_dir)
-    console.print(
-        f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval {100 * row.success_low:.1f} to "
-        f"{100 * row.success_high:.1f}): {row.links_at_removal:.1f} links touch the object when the table is removed.",
-        soft_wrap=True,
-    )
-    _live_query(run_dir, config.task.hand)
 
 
 def _check(config: RunConfig) -> None:
@@ -186,29 +170,27 @@ def untrained(config: RunConfig) -> PolicyBundle:
 class _Progress:
     """One line that is updated on a terminal; elsewhere a line about every ten seconds."""
 
-    def __init__(self, config: RunConfig, ranks: int = 1):
-        self._config, self._steps = config, ranks * _steps_per_update(config)
+    def __init__(self, config: RunConfig):
+        self._config = config
         self._began = time.monotonic()
         self._last = 0.0
         self._first: tuple[float, float] | None = None
         self._line = self._printed = ""
-        self._live = console.status("compiling, and filling the first batch") if console.is_terminal else None
+        self._live = console.status("compiling, and filling the first batch")  # of a terminal
 
     def __enter__(self) -> Self:
-        if self._live:
-            self._live.start()
+        self._live.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        if self._live:
-            self._live.stop()
+        self._live.stop()
         self._print()
 
     def update(self, values: dict[str, float]) -> None:
         """Shows the metrics of an update of this process's learner, and the duration of the start after the first."""
         if self._first is None:
-            console.print(f"  [dim]{first_update()}[/]", soft_wrap=True)
-        self.show({"values": values, "actors": 1, "version": int(values["version"])})
+            console.print(f"  [dim]{first_update()}[/]")
+        self.show({"values": values, "actors": 1, "update": values["update"], "version": int(values["version"])})
 
     def show(self, status: dict[str, Any]) -> None:
         """Shows the learner's newest metrics, if there are any, and the number of actors."""
@@ -219,32 +201,31 @@ class _Progress:
             self._line = (
                 f"compiling, and filling the first batch: {now - self._began:.0f} s, {status['actors']} actor(s)"
             )
-        if self._live:
-            self._live.update(self._line)
-        elif now - self._last >= _LINE_SECONDS:
+        self._live.update(self._line)
+        if not console.is_terminal and now - self._last >= _LINE_SECONDS:
             self._last = now
             self._print()
 
     def _print(self) -> None:
         """Prints the line if it has changed."""
         if self._line != self._printed:
-            console.print(f"  {self._line}", soft_wrap=True)
+            console.print(f"  {self._line}")
             self._printed = self._line
 
     def _progress(self, status: dict[str, Any], now: float) -> str:
         """Formats the metrics as one line; the time left is estimated from the first update on, without compilation."""
         values, updates = status["values"], self._config.updates
-        update = values["transitions"] / self._steps
+        update = status["update"]
         self._first = self._first or (now, update)
         pace = (update - self._first[1]) / max(now - self._first[0], 1e-6)
-        left = (updates - update) / pace if pace > 0 else float("nan")
+        left = int((updates - update) / pace) if pace > 0 else -1
         return (
             f"update {update:4.0f}/{updates}  {values['steps_per_second']:6.0f} steps/s  "
             f"version {status['version']}  lag {values.get('staleness_mean', 0.0):.1f}  "
             f"success {100 * values.get('episode/success', float('nan')):5.1f} %  "
             f"links {values.get('episode/links_at_removal', float('nan')):4.1f}  "
             f"return {values.get('episode/return', float('nan')):6.1f}  actors {status['actors']}  "
-            f"left {_minutes(left)}"
+            f"left {f'{left // 60}:{left % 60:02d}' if left >= 0 else '?'}"
         )
 
 
@@ -259,33 +240,28 @@ def _steps_per_update(config: RunConfig) -> int:
     return config.rollout_steps * config.environments * config.rollouts_per_update
 
 
-def _minutes(seconds: float) -> str:
-    """Formats a duration as minutes and seconds; `?` if it is not known."""
-    return "?" if not np.isfinite(seconds) else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
-
-
-def _evaluate(policy: PolicyBundle, config: RunConfig, episodes: int, run_dir: pathlib.Path) -> Row:
-    """Evaluates headings on held-out objects, and draws one of the episodes, a success if there is one."""
+def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
+    """Evaluates headings on held-out objects, draws an episode, a success if there is one, and queries a server."""
     objects = config.objects
     if not objects.folder:
         objects = ObjectsConfig(families=objects.families, count=_EVALUATION_OBJECTS, seed=HELD_OUT_SEED)
     pool = load_pool(objects)
     console.print(f"Evaluating {episodes} episodes on {len(pool)} objects that no training sees …")
-    policy = dataclasses.replace(policy, task=config.task)
+    policy = dataclasses.replace(bundles.load(run_dir / POLICY_FILE), task=config.task)
     heading = Experiment(policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps)
     (result,) = heading.run([Variation()], keep=True)
     save_png(run_dir / EPISODE, episode_sheet(result.examples(1, 1)[-1]))
-    return result.row
-
-
-def _live_query(run_dir: pathlib.Path, hand: str) -> None:
-    """Starts a policy server in a separate process, and queries one action."""
+    row = result.row
+    console.print(
+        f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval {100 * row.success_low:.1f} to "
+        f"{100 * row.success_high:.1f}): {row.links_at_removal:.1f} links touch the object when the table is removed."
+    )
     console.print("\n[bold]One live query[/] of a policy server in a separate process:")
     with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
-        episode = example_episode(HELD_OUT_SEED, hand)
+        episode = example_episode(HELD_OUT_SEED, config.task.hand)
         with PolicyClient(endpoint, hand=episode.hand, wait=180.0, timeout=5.0) as client:
             client.metadata()
-            console.print(one_answer(client, episode), markup=False, soft_wrap=True)
+            console.print(one_answer(client, episode), markup=False)
 
 
 def _next_steps(run_dir: pathlib.Path) -> None:
@@ -301,7 +277,7 @@ def _next_steps(run_dir: pathlib.Path) -> None:
     ]
     console.print("\n[bold]Next[/]")
     for what, why in rows:
-        console.print(f"  {what}\n      {why}", soft_wrap=True)
+        console.print(f"  {what}\n      {why}")
 
 
 def _command() -> str:

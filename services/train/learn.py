@@ -3,170 +3,31 @@
 import contextlib
 import dataclasses
 import functools
-import json
 import pathlib
-import secrets
-import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Sequence
 
 from congrasp.actors.harvest import references_file
 from congrasp.actors.process.actor import run_actor
 from congrasp.common.config import MetricWriter, RunConfig
+from congrasp.common.policy.bundle import policy_spec
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores, prepare_workers
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.memory import PairTransport
+from congrasp.learner.algorithms import make_algorithm
+from congrasp.learner.batch import rollout_form
 from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
 from congrasp.learner.process import run_learner
-from congrasp.learner.run_directory import LOGS, create_run
-from congrasp.services.ops.metrics import LearnerMetrics, exposed
+from congrasp.learner.run_directory import create_run, has_checkpoints
+from congrasp.services.ops.logs import Watch
+from congrasp.services.ops.metrics import LearnerMetrics
 from congrasp.services.ops.shutdown import GRACE
 from congrasp.services.ops.status import ask
-from congrasp.services.record.channels import Entry, flatten
-from congrasp.services.record.recorder import Recorder
+from congrasp.services.record.metric_writers import recorded
 from congrasp.services.train.launch import engine_of
-
-_TOPIC = "/metrics/learner/"
-
-
-class _Writer(Protocol):
-    """Destination of scalars."""
-
-    def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """Writes the scalars of an update."""
-
-    def close(self) -> None:
-        """Finishes."""
-
-
-class MetricWriters:
-    """A sink of `services.record.recorder.Recorder` for learners' metrics; a failed writer is not used again."""
-
-    def __init__(self, writers: Mapping[str, _Writer]):
-        """Creates a sink with writers by name."""
-        self._writers = dict(writers)
-
-    def write(self, entry: Entry) -> None:
-        """Accepts an entry; entries that are not metrics of a learner are ignored."""
-        if not entry.channel.topic.startswith(_TOPIC):
-            return
-        message = json.loads(entry.data)
-        values = {name: float(value) for name, value in flatten(message["values"]).items()}
-        step = int(message.get("update", message.get("version", 0)))
-        learner = entry.channel.topic.removeprefix(_TOPIC)
-        self._each(lambda writer: writer.write(learner, 1e-9 * entry.time, step, values))
-
-    def close(self) -> None:
-        """Finishes every writer."""
-        self._each(lambda writer: writer.close())
-
-    def _each(self, action: Callable[[_Writer], None]) -> None:
-        for name, writer in list(self._writers.items()):
-            try:
-                action(writer)
-            except Exception as error:  # a failed writer must not end the training
-                del self._writers[name]
-                text = (
-                    f"congrasp: {name} receives no more metrics ({type(error).__name__}: {error}); the run continues."
-                )
-                print(text, file=sys.stderr, flush=True)
-
-
-class _TensorBoard:
-    """Event files, one folder per learner; written synchronously, so that there is no thread to wait for."""
-
-    def __init__(self, folder: pathlib.Path):
-        self._folder = folder
-        self._files: dict[str, Any] = {}
-
-    def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """See `_Writer`."""
-        from tensorboardX.proto.event_pb2 import Event, SessionLog
-        from tensorboardX.proto.summary_pb2 import Summary
-
-        file = self._files.get(learner)
-        if file is None:
-            file = self._files[learner] = self._begin(learner)
-            # A resumed run repeats steps: TensorBoard purges those of an earlier file from here on.
-            file.write_event(Event(wall_time=seconds, step=step, session_log=SessionLog(status=SessionLog.START)))
-        summary = Summary(value=[Summary.Value(tag=name, simple_value=value) for name, value in values.items()])
-        file.write_event(Event(wall_time=seconds, step=step, summary=summary))
-        file.flush()
-
-    def _begin(self, learner: str) -> Any:
-        from tensorboardX.event_file_writer import EventsWriter
-
-        folder = self._folder / f"learner-{learner}"
-        folder.mkdir(parents=True, exist_ok=True)
-        return EventsWriter(str(folder / "events"), f".{secrets.token_hex(4)}")
-
-    def close(self) -> None:
-        """See `_Writer`."""
-        for file in self._files.values():
-            file.close()
-
-
-class _WeightsAndBiases:
-    """A run of Weights & Biases; offline it is stored in the run's folder and uploaded with `wandb sync`."""
-
-    def __init__(self, folder: pathlib.Path, run: str, config: Mapping[str, Any], *, offline: bool):
-        import wandb
-
-        settings = wandb.Settings(console="off", silent=True, x_disable_stats=True, init_timeout=20)
-        self._run = wandb.init(
-            project="congrasp",
-            name=run,
-            group=run,
-            dir=str(folder),
-            config=dict(config),
-            mode="offline" if offline else "online",
-            settings=settings,
-        )
-        self._run.define_metric("*", step_metric="update")
-
-    def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
-        """See `_Writer`."""
-        prefix = "" if learner == "0" else f"learner-{learner}/"
-        self._run.log({**{f"{prefix}{name}": value for name, value in values.items()}, "update": step})
-
-    def close(self) -> None:
-        """See `_Writer`."""
-        import wandb
-
-        self._run.finish()
-        wandb.teardown()  # waits for the process that writes the file
-
-
-@contextlib.contextmanager
-def recorded(
-    transport: Transport, config: RunConfig, run_dir: pathlib.Path, names: Sequence[MetricWriter]
-) -> Iterator[Recorder]:
-    """Context that records a run in its folder, and passes its metrics to writers.
-
-    Args:
-      transport: an endpoint of the run.
-      config: the run's configuration.
-      run_dir: the run's folder; TensorBoard's files go to `tensorboard` in it, those of Weights & Biases to `wandb`.
-      names: names of the writers.
-
-    Raises:
-      ModuleNotFoundError: a writer's package is not installed.
-    """
-    writers: dict[str, _Writer] = {}
-    for name in dict.fromkeys(names):
-        if name == "tensorboard":
-            writers[name] = _TensorBoard(run_dir / name)
-        else:
-            offline = name == "wandb-offline"
-            writers[name] = _WeightsAndBiases(run_dir, config.name, dataclasses.asdict(config), offline=offline)
-    combined = MetricWriters(writers)
-    with contextlib.closing(combined), Recorder(transport, config.name, run_dir / LOGS, sinks=[combined]) as recorder:
-        yield recorder
-
 
 _START_SECONDS = 0.5
 """Head start of the learner, which must listen first, over the actor, s."""
@@ -179,28 +40,25 @@ def learn(
     wire: Transport | None,
     inside: PhysicsName | None,
     stop: threading.Event,
-    resume: bool,
     ranks: Ranks | None = None,
     on_update: Callable[[dict[str, float]], None] = lambda values: None,
     on_event: Callable[[str, str], None] = lambda level, text: None,
     writers: Sequence[MetricWriter] = (),
-    metrics_port: int = 0,
-    metrics_host: str = "127.0.0.1",
+    watch: Watch = Watch(),  # noqa: B008
     grace: float = GRACE,
 ) -> None:
-    """Runs a learner until it is finished or stopped.
+    """Runs a learner from the newest checkpoint, if there is one, until it is finished or stopped.
 
     An actor in the same process shares the processors: acting with old weights during an update would gain nothing.
     Updates are then on-policy, regardless of `max_staleness`.
 
     Args:
-      run_dir: see `run_learner`, also for `config`, `resume`, `ranks`, `on_update` and `on_event`.
+      run_dir: see `run_learner`, also for `config`, `ranks`, `on_update` and `on_event`.
       wire: a listening transport for rollouts and status queries of others; None only with an actor inside.
       inside: engine of an actor in this process, over the in-memory transport; None for no actor.
       stop: ends training.
       writers: metric writers of rank 0.
-      metrics_port: port of a Prometheus endpoint; 0 for none.
-      metrics_host: interface of the endpoint.
+      watch: endpoint of the metrics.
       grace: deadline for the end of the actor inside, s.
     """
     rank, transport = 0 if ranks is None else ranks.rank, wire
@@ -217,8 +75,7 @@ def learn(
             metrics.update(values)
             on_update(values)
 
-        if metrics_port:
-            stack.enter_context(exposed(metrics_port, metrics_host, metrics))
+        stack.enter_context(watch.exposed(metrics))
         if inside is not None:
             stack.enter_context(_actor_thread(url, config, run_dir, f"actor-{rank}", inside, stop, grace))
         run_learner(
@@ -226,13 +83,20 @@ def learn(
             config,
             transport,
             stop_event=stop,
-            resume=resume,
+            resume=rank == 0 and has_checkpoints(run_dir),
             ranks=ranks,
             audit=inside is None,
             recorder=recorded(transport, config, run_dir, writers) if rank == 0 else None,
             on_update=updated,
             on_event=on_event,
         )
+
+
+def longest_rollout(config: RunConfig) -> int:
+    """Limit of rollout messages: twice the size of the run's rollouts, bytes."""
+    spec = policy_spec(config.task, config.network)
+    form = rollout_form(config, spec, make_algorithm(spec, config).batch_schema)
+    return 2 * sum(array.nbytes for array in form.zeros().values())
 
 
 @contextlib.contextmanager
@@ -311,7 +175,6 @@ def until_first_update(
             wire=None,
             inside=engine_of(physics, False),
             stop=stop,
-            resume=False,
             on_update=updated,
             grace=_GRACE,
         )

@@ -19,7 +19,7 @@ from congrasp.common.policy.pretrained import own_policy_file, pretrained_hands
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE
 from congrasp.services.assets.hands.check import Finding, read_findings
-from congrasp.services.ops.children import Child
+from congrasp.services.ops.children import Child, command
 from congrasp.services.train.presets import FULL, get_preset
 from congrasp.services.train.unattended import run_child, seconds, train_in_background, trained
 
@@ -105,8 +105,7 @@ def _check(request: Request, note: Callable[[str], None]) -> None:
     """Runs the self-check, unless it exists."""
     file = request.out / CHECK
     if not file.exists():
-        arguments = ["hands", "check", request.reference, "--json", str(file)]
-        arguments += ["--png", str(file.with_suffix(".png"))]
+        arguments = command("hands", "check", request.reference, json=file, png=file.with_suffix(".png"))
         _run(request, "check", arguments, (0, 1), {"JAX_PLATFORMS": "cpu"})
     findings: list[Finding] = read_findings(file)
     for finding in findings:
@@ -120,7 +119,7 @@ def _check(request: Request, note: Callable[[str], None]) -> None:
 
 def _train(request: Request, note: Callable[[str], None]) -> pathlib.Path:
     """Runs the training, or resumes it."""
-    chosen = ["--preset", FULL if request.full else "quickstart", "--hand", request.reference]
+    chosen = command(preset=FULL if request.full else "quickstart", hand=request.reference)
     log = request.run_dir.with_name(f"{request.run_dir.name}.log")
     note(f"Training {request.hand.name} in {request.run_dir} (log: {log})")
     said, told = time.monotonic(), ""
@@ -132,8 +131,7 @@ def _train(request: Request, note: Callable[[str], None]) -> pathlib.Path:
             said, told = time.monotonic(), line
             note(f"  {line}")
 
-    full = ["--physics", request.physics, "--updates", str(_UPDATES)]
-    options = [*full, *request.options] if request.full else request.options
+    options = [*(command(physics=request.physics, updates=_UPDATES) if request.full else []), *request.options]
     train_in_background(request.run_dir, chosen, options, patience=request.patience, progress=progress)
     return request.run_dir / POLICY_FILE
 
@@ -160,9 +158,9 @@ def _report(request: Request, policy: pathlib.Path, note: Callable[[str], None])
     about = {"content": bundles.content_hash(policy.read_bytes()), "episodes": request.episodes, "pool": request.pool}
     if not (page.exists() and rows.exists() and about.items() <= read_json(rows, _LARGEST).items()):
         note(f"Evaluating {request.episodes} episodes of each constraint …")
-        arguments = ["report", str(request.run_dir), "--out", str(page), "--json", str(rows)]
-        arguments += ["--check", str(request.out / CHECK), "--physics", request.physics]
-        arguments += ["--episodes", str(request.episodes), "--pool", str(request.pool)]
+        measured = {"physics": request.physics, "episodes": request.episodes, "pool": request.pool}
+        check = request.out / CHECK
+        arguments = command("report", request.run_dir, out=page, json=rows, check=check, **measured)
         _run(request, "report", arguments, (0,), {})
     for row in read_json(rows, _LARGEST)["rows"]:
         note(f"  {row['constraint']:22s} success {100 * row['success']:5.1f} %")

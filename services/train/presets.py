@@ -22,8 +22,9 @@ Everything else is the same for all hands.
 
 import dataclasses
 import pathlib
+from typing import Any
 
-from congrasp.common.config import CurriculumConfig, NetworkConfig, ObjectsConfig, PPOConfig, RunConfig
+from congrasp.common.config import CurriculumConfig, NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, Split
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import tip_forces
@@ -183,13 +184,14 @@ def easier(config: RunConfig) -> list[str]:
     return words
 
 
-def get_preset(name: str, hand: str | None = None) -> RunConfig:
+def get_preset(name: str, hand: str | None = None, **sizes: int) -> RunConfig:
     """Returns the preset of this name for a hand, or for its default hand.
 
     Args:
       name: one of `PRESETS`.
       hand: the name, file or text of a hand. A full task depends on the hand (`services.train.presets`); in the others
         only the hand changes.
+      **sizes: other numbers of `environments` and `rollout_steps`; 0 keeps that of the preset.
 
     Raises:
       CongraspError: there is no such preset or hand; the message lists the available ones.
@@ -197,14 +199,26 @@ def get_preset(name: str, hand: str | None = None) -> RunConfig:
     if name not in PRESETS:
         raise CongraspError(f"There is no preset '{name}'.", f"Choose one of: {', '.join(PRESETS)}.")
     if name in _SHORT:
-        return with_hand(_SHORT[name], hand)
-    return recipe(get_hand(hand or (name if name in FULL_FOR else "human")))
+        config = with_hand(_SHORT[name], hand)
+    else:
+        config = recipe(get_hand(hand or (name if name in FULL_FOR else "human")))
+    changed: dict[str, Any] = {size: value for size, value in sizes.items() if value}
+    return dataclasses.replace(config, **changed)
 
 
 def with_hand(config: RunConfig, hand: str | None) -> RunConfig:
     """Returns the configuration with another hand, or unchanged; a hand's file is included, for remote actors."""
     found = get_hand(hand or config.task.hand)
     return dataclasses.replace(config, task=dataclasses.replace(config.task, hand=found.reference))
+
+
+def with_sets(config: RunConfig, folder: pathlib.Path | None, split: Split | None) -> RunConfig:
+    """Returns the configuration with a folder of constraint sets and a split of them, each unchanged by None."""
+    objects = config.objects
+    where = objects.constraints if folder is None else str(folder)
+    return dataclasses.replace(
+        config, objects=dataclasses.replace(objects, constraints=where, split=split or objects.split)
+    )
 
 
 TRACKERS = SensingConfig(

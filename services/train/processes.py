@@ -16,7 +16,8 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import local_url, rank_url, reachable_url
-from congrasp.services.ops.children import CHILD_GRACE, Child, end_all, wait_for
+from congrasp.learner.run_directory import LOGS
+from congrasp.services.ops.children import CHILD_GRACE, Child, command, end_all, wait_for
 from congrasp.services.train.launch import Plan
 
 MAX_RESTARTS = 5
@@ -53,56 +54,51 @@ def train(
       CongraspError: a process failed permanently; the message has the last line of its log.
     """
     launch = plan.launch
-    # One more for the ports through which the ranks join.
-    endpoint = launch.listen or local_url(launch.ranks + 1)
-    certificates = [] if launch.certs is None else ["--certs", str(launch.certs)]
-    listen = [endpoint, *certificates, *(["--insecure"] if launch.insecure else [])]
-    connect = [reachable_url(endpoint), *certificates]
-    logs = run_dir / "logs"
+    endpoint = launch.listen or local_url(launch.ranks + 1)  # one more for the ports through which the ranks join
+    logs = run_dir / LOGS
     logs.mkdir(exist_ok=True)
-    learners, children = _learners(run_dir, plan, listen, connect[0]), _actors(run_dir, plan, config.name, connect)
+    learners, actors = _learners(run_dir, plan, endpoint), _actors(run_dir, plan, config.name, endpoint)
     try:
-        for child in (*learners, *children):
+        for child in (*learners, *actors):
             child.start()
-        transport = _connect(connect[0], learners[0], stop, launch.certs)
+        transport = _connect(reachable_url(endpoint), learners[0], stop, launch.certs)
         if transport is not None:
-            notify(" ".join([f"Watch it in the browser with: congrasp view {run_dir}", *certificates]))
+            shown = " ".join(command("congrasp", "view", run_dir, certs=launch.certs))
+            notify(f"Watch it in the browser with: {shown}")
             with transport:
-                _supervise(learners, children, transport, config.name, stop, report, notify)
+                _supervise(learners, actors, transport, config.name, stop, report, notify)
     finally:
-        end_all([*learners, *children])
+        end_all([*learners, *actors])
 
 
-def _learners(run_dir: pathlib.Path, plan: Plan, listen: Sequence[str], connect: str) -> list[Child]:
-    """Returns the learner processes; `listen` is --listen with its options, `connect` the URL of rank 0."""
-    ranks, inside = plan.launch.ranks, not plan.actors
-    coordinator = rank_url(connect, ranks).partition("/")[2]
-    found = []
-    for rank in range(ranks):
-        name = f"rank-{rank}" if ranks > 1 else "learner"
-        arguments = ["learner", "--run-dir", str(run_dir), "--resume", "--listen", *listen]
-        if ranks > 1 or inside:
-            arguments += ["--rank", str(rank), "--ranks", str(ranks), "--coordinator", coordinator]
-            arguments += ["--inside"] if inside else []
+def _learners(run_dir: pathlib.Path, plan: Plan, endpoint: str) -> list[Child]:
+    """Returns the learner processes; rank 0 listens at the endpoint, and has the metrics."""
+    launch, inside, found = plan.launch, not plan.actors, []
+    coordinator = rank_url(reachable_url(endpoint), launch.ranks).partition("/")[2]
+    for rank in range(launch.ranks):
+        name = f"rank-{rank}" if launch.ranks > 1 else "learner"
+        arguments = command("learner", run_dir=run_dir, resume=True, listen=endpoint, certs=launch.certs)
+        arguments += command(insecure=launch.insecure, inside=inside)
+        if launch.ranks > 1:
+            arguments += command(rank=rank, ranks=launch.ranks, coordinator=coordinator)
+        if rank == 0:
+            arguments += command(metrics_port=launch.metrics_port, metric_writers=launch.metric_writers)
         environment = {"CUDA_VISIBLE_DEVICES": _gpu(rank)} if plan.gpus else {}
-        found.append(Child(name, arguments, run_dir / "logs" / f"{name}.log", environment))
-    found[0].arguments += ["--metrics-port", str(plan.launch.metrics_port)]
-    found[0].arguments += ["--metric-writers", *plan.launch.metric_writers]
+        found.append(Child(name, arguments, run_dir / LOGS / f"{name}.log", environment))
     return found
 
 
-def _actors(run_dir: pathlib.Path, plan: Plan, run: str, connect: Sequence[str]) -> list[Child]:
-    """Returns the actor processes of all ranks; `connect` is rank 0's URL with its options."""
-    ranks, actors = plan.launch.ranks, plan.actors
-    threads = max(1, cores() // max(1, ranks * actors))
-    found = []
-    for number in range(ranks * actors):
-        name = f"actor-{number}"
-        arguments = ["actor", "--connect", rank_url(connect[0], number // actors), *connect[1:], "--run", run]
-        arguments += ["--id", name, "--physics", plan.physics, "--audit", str(run_dir / AUDIT / f"{name}.jsonl")]
-        arguments += ["--references", str(references_file(run_dir, name))]
-        arguments += ["--threads", str(threads), "--patience", "60" if ranks == 1 else "300"]
-        found.append(Child(name, arguments, run_dir / "logs" / f"{name}.log"))
+def _actors(run_dir: pathlib.Path, plan: Plan, run: str, endpoint: str) -> list[Child]:
+    """Returns the actor processes of all ranks; rank 0 listens at the endpoint."""
+    launch, found = plan.launch, []
+    threads = max(1, cores() // max(1, launch.ranks * plan.actors))
+    patience = 60 if launch.ranks == 1 else 300
+    for number in range(launch.ranks * plan.actors):
+        name, url = f"actor-{number}", rank_url(reachable_url(endpoint), number // plan.actors)
+        kept = {"audit": run_dir / AUDIT / f"{name}.jsonl", "references": references_file(run_dir, name)}
+        arguments = command("actor", connect=url, certs=launch.certs, run=run, id=name, physics=plan.physics, **kept)
+        arguments += command(threads=threads, patience=patience)
+        found.append(Child(name, arguments, run_dir / LOGS / f"{name}.log"))
     return found
 
 
@@ -119,8 +115,7 @@ def _connect(url: str, learner: Child, stop: threading.Event, certs: pathlib.Pat
         try:
             return urls.connect(url, "observer", certs=certs, wait=_POLL)
         except TransportError:
-            assert learner.process is not None
-            if learner.process.poll() not in (None, 0):
+            if learner.code:
                 break
     if stop.is_set():
         return None
@@ -140,14 +135,12 @@ def _supervise(
     metrics = transport.subscribe(Keys(run).learner_metrics, depth=16)
     events = transport.subscribe(Keys(run).log("event", "learner", "0"), depth=16)
     while not stop.is_set():
-        codes = {child.name: child.process.poll() for child in learners if child.process}
-        if codes[learners[0].name] == 0:
+        if learners[0].code == 0:
             return
-        if any(codes.values()):
+        if any(child.code for child in learners):
             _restart_learners(learners, stop, notify)
         for child in actors:
-            assert child.process is not None
-            if code := child.process.poll():
+            if code := child.code:
                 _check_can_restart(child, code)
                 if child.again_at == 0.0:
                     notify(f"The {child.name} died (exit code {code}); restarting it.")
@@ -160,20 +153,18 @@ def _supervise(
             if event[1].meta.get("level") == "error":
                 notify(str(event[1].meta.get("text")))
         received = metrics.receive(_POLL)
-        alive = sum(child.process.poll() is None for child in actors if child.process) or len(learners)
+        alive = sum(child.code is None for child in actors) or len(learners)
         report({**(received[1].meta if received else {}), "actors": alive})
 
 
 def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: Callable[[str], None]) -> None:
     """Restarts all ranks after one died; the others notice and end, or are terminated."""
-    dead = next(child for child in learners if child.process and child.process.poll())
-    assert dead.process is not None
-    died = f"The {dead.name} died (exit code {dead.process.poll()})"
+    dead = next(child for child in learners if child.code)
+    died = f"The {dead.name} died (exit code {dead.code})"
     wait_for([child.process for child in learners if child.process], CHILD_GRACE)
     end_all(learners)
     for child in learners:
-        assert child.process is not None
-        _check_can_restart(child, child.process.poll() or 0)
+        _check_can_restart(child, child.code or 0)
     notify(f"{died}; restarting it." if len(learners) == 1 else f"{died}; restarting all ranks.")
     stop.wait(min(2.0 ** learners[0].restarts, 15.0) - 1.0)
     for child in learners:

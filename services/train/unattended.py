@@ -10,7 +10,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
 from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE, has_checkpoints
-from congrasp.services.ops.children import Child, end_all
+from congrasp.services.ops.children import Child, command, end_all
 
 _TRAINED = "trained.json"
 _POLL = 0.5
@@ -45,8 +45,7 @@ def run_child(child: Child, patience: float, progress: Callable[[str], None] = l
     began = time.monotonic()
     try:
         child.start()
-        assert child.process is not None
-        while (code := child.process.poll()) is None and time.monotonic() - began < patience:
+        while (code := child.code) is None and time.monotonic() - began < patience:
             progress(child.last_line())
             time.sleep(_POLL)
     finally:
@@ -75,11 +74,11 @@ def train_in_background(
       CongraspError: it failed, or took too long.
     """
     name = run_dir.name
-    arguments = ["train", *chosen, "--run-dir", str(run_dir), "--evaluation", "0", *options]
-    if has_checkpoints(run_dir):
-        arguments = ["train", "--resume", "--run-dir", str(run_dir), "--evaluation", "0", *options]
-    elif (run_dir / CONFIG_FILE).exists():
+    resume = has_checkpoints(run_dir)
+    if not resume and (run_dir / CONFIG_FILE).exists():
         shutil.rmtree(run_dir)  # it ended before its first checkpoint
+    begin = command(resume=True) if resume else list(chosen)
+    arguments = ["train", *begin, *command(run_dir=run_dir, evaluation=0), *options]
     run_dir.parent.mkdir(parents=True, exist_ok=True)
     child = Child(name, arguments, run_dir.with_name(f"{name}.log"))
     began = time.monotonic()

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.hands import known_hand
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.wire.codec import Message
@@ -30,6 +31,21 @@ class Film(NamedTuple):
     """Frames per second."""
     overlays: bool = False
     """Draws the active constraints, and links in contact in green."""
+
+
+def film_of(size: str, fps: float, overlays: bool) -> Film:
+    """Style of a video, from its size as WIDTHxHEIGHT, both even and from 64 to 4096 pixels.
+
+    Raises:
+      CongraspError: the size is no such text, or a package for videos is missing.
+    """
+    need_package("--video", "imageio_ffmpeg")
+    numbers = size.lower().split("x")
+    if len(numbers) == 2 and all(word.isdecimal() and len(word) < 5 for word in numbers):
+        width, height = map(int, numbers)
+        if all(64 <= side <= 4096 and side % 2 == 0 for side in (width, height)):
+            return Film((width, height), fps, overlays)
+    raise CongraspError(f"--size is '{size}'.", "Write two even numbers from 64 to 4096: --size 1920x1080")
 
 
 def grasp_picture(

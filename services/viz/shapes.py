@@ -73,6 +73,13 @@ def capsule_shapes(hand: Hand, position: np.ndarray, quaternion: np.ndarray) -> 
     return shapes
 
 
+def link_frames(hand: Hand, q: np.ndarray, position: np.ndarray, wrist: Rotation) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (L, 3) and orientations (L, 4) of the links at finger angles (F,), in the frame of the wrist's pose."""
+    links, quaternion = mujoco_link_poses(hand, q)
+    turned = wrist * Rotation.from_quat(quaternion, scalar_first=True)
+    return wrist.apply(links) + position, turned.as_quat(scalar_first=True)
+
+
 def posed_hand(
     hand: Hand,
     q: np.ndarray,
@@ -87,9 +94,7 @@ def posed_hand(
 
     Tint, shares and alpha are those of `skin_shape`; the skin is `skin_of(hand)` by default.
     """
-    links, quaternion = mujoco_link_poses(hand, q)
-    turned = (wrist * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
-    return skin_shape(skin or skin_of(hand), wrist.apply(links) + position, turned, tint, shares, alpha)
+    return skin_shape(skin or skin_of(hand), *link_frames(hand, q, position, wrist), tint, shares, alpha)
 
 
 def object_shape(

@@ -26,9 +26,9 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
-from congrasp.services.cli.audit import FAULTS as KINDS
-from congrasp.services.cli.audit import Report
-from congrasp.services.cli.audit import compare as audit
+from congrasp.services.ops.audit import FAULTS as KINDS
+from congrasp.services.ops.audit import Report
+from congrasp.services.ops.audit import compare as audit
 
 _RUN = "quickstart"
 _OPTIONS = (

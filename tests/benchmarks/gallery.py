@@ -126,7 +126,6 @@ def _results(scans: pathlib.Path, work: pathlib.Path, out: pathlib.Path, attempt
             out=work / shown.name,
             options=ImportOptions("guess"),
             constraints={name: _given(value, work) for name, value in shown.options.items()},
-            identity=(bundles.content_hash(file.read_bytes()), attempts, *_PHASES[:2]),
             film=None,
             view=None,
             pictures=False,

@@ -187,8 +187,9 @@ def test_slurm_tasks_are_ranks_of_one_run(tmp_path):
     for rank in range(2):
         arguments = (tmp_path / str(rank)).read_text().splitlines()
         given = load(arguments[0])(arguments[1:]).keywords
-        assert (given["rank"], given["ranks"], given["coordinator"]) == (rank, 2, "node-7:7440")
-        assert given["run_dir"] == tmp_path / "a run" and given["config"].updates == 9 and given["inside"]
+        options = given["options"]
+        assert (options.rank, options.ranks, options.coordinator) == (rank, 2, "node-7:7440")
+        assert options.run_dir == tmp_path / "a run" and given["config"].updates == 9 and options.inside
 
 
 @pytest.mark.parametrize(

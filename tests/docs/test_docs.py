@@ -41,13 +41,9 @@ def command_lines():
                     yield pytest.param(found[1], id=f"{page.stem}: {found[1][:60]}")
 
 
-def module_of(name):
-    return importlib.import_module(f"congrasp.services.cli.{name}")
-
-
 def commands_of_modules():
     for name in main.COMMANDS:
-        module = module_of(name)
+        module = main.module_of(name)
         for below, function in (getattr(module, "COMMANDS", None) or {"": module.COMMAND}).items():
             yield pytest.param((name, function), id=f"{name} {below}".strip())
 
@@ -96,7 +92,7 @@ def test_every_help_page_ends_with_examples_that_parse(command):
 def test_help_pages_speak_to_people(capsys):
     """Of every command, its options as they are typed: nothing of the parser's own types and headings."""
     for name in main.COMMANDS:
-        for words in ([name], *([name, below] for below in getattr(module_of(name), "COMMANDS", ()))):
+        for words in ([name], *([name, below] for below in getattr(main.module_of(name), "COMMANDS", ()))):
             with pytest.raises(SystemExit):
                 main.load(name)([*words[1:], "--help"])
             page = capsys.readouterr().out

@@ -16,7 +16,7 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import LOGS, create_run
-from congrasp.services.cli.audit import compare as audit
+from congrasp.services.ops.audit import compare as audit
 from congrasp.services.ops.status import ask
 from congrasp.services.record.reader import read_metrics
 from congrasp.services.record.recorder import Recorder

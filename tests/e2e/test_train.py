@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from congrasp.common.policy import bundle as bundles
-from congrasp.services.cli.audit import compare as audit
+from congrasp.services.ops.audit import compare as audit
 from congrasp.services.record.reader import read_episodes, read_metrics, read_rollouts
 
 pytestmark = pytest.mark.timeout(600)

@@ -77,7 +77,7 @@ def test_help_names_every_command_and_every_command_exists():
         (["grasp", "mug:7", "--seed", "-1"], "--seed: a seed is a whole number from 0 to 1e[+]15"),
         (["evaluate", "--seed", "9" * 23], "--seed: a seed is a whole number"),
         (["train", "--objects.seed", "9" * 23], "--objects.seed: a seed is a whole number"),
-        (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It must be from 0 to 1024"),
+        (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It must be from 1 to 1024"),
         (["grasp"], "nothing to grasp"),
         (["grasp", "mug:7", "--approach", "-1"], "--approach is -1.0. It must be from 0 to"),
         (["grasp", "mug:7", "--approach", "11"], "--approach is 11.0. It must be from 0 to"),

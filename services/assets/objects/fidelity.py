@@ -102,7 +102,7 @@ class _Rays(NamedTuple):
     """Crossings (N) of parallel rays with triangles."""
 
     axis: int
-    """That of the rays."""
+    """Axis of the rays, 0 to 2."""
     rays: np.ndarray
     """(N, 2) the ray of each crossing."""
     place: np.ndarray

@@ -15,8 +15,7 @@ from congrasp.common.request import GraspRequest
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.grasp import approaches
-from congrasp.services.grasp.approaches import headings
-from congrasp.services.grasp.grasper import with_avoid
+from congrasp.services.grasp.approaches import headings, with_avoid
 
 
 def test_an_object_that_lies_too_flat(tmp_path: pathlib.Path, quick_import: None) -> None:

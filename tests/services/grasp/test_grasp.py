@@ -30,8 +30,9 @@ from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
 from congrasp.services.export.motion_file import load_motion, motion_of_episode
 from congrasp.services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
-from congrasp.services.grasp.grasper import Grasp, Grasper, _places, costs
+from congrasp.services.grasp.grasper import Grasper, _places
 from congrasp.services.grasp.jobs import Result
+from congrasp.services.grasp.motion import Grasp, costs
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.record.reader import read_episodes
 from tests.episodes import episode

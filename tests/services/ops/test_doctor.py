@@ -15,9 +15,9 @@ import pytest
 
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
-from congrasp.services.cli import doctor
-from congrasp.services.cli.doctor import doctor as command
+from congrasp.services.ops import doctor
 from congrasp.services.ops.certificates import create_authority, issue
+from congrasp.services.ops.doctor import doctor as command
 from tests.rollouts import learner_hub
 
 ALWAYS = ("python", "mujoco", "mujoco-mjx", "jax", "flax", "eclipse-zenoh", "gpu", "ports", "disk", "clock")

@@ -18,8 +18,8 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.schema import RolloutForm
 from congrasp.learner.run_directory import POLICY_FILE, create_run, listening
-from congrasp.services.cli.status import status
-from congrasp.services.cli.view import _of_folder, view
+from congrasp.services.cli.status import Status
+from congrasp.services.cli.view import View
 from congrasp.services.ops.status import ask, tables, warnings
 from tests.rollouts import bundle, learner_hub, rollout
 from tests.waits import eventually
@@ -40,14 +40,14 @@ def endpoint():
 
 
 def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
-    assert status(connect=endpoint, run="r", json=True) == 0
+    assert Status(connect=endpoint, run="r", json=True)() == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["run"], found["version"], found["counters"]["accepted"]) == ("r", 0, 1)
     assert [(role["role"], role["id"]) for role in found["roles"]] == [("actor", "worker-7"), ("learner", "0")]
     actor = found["roles"][0]
     assert (actor["rollouts"], actor["version"], actor["lag"]) == (1, 0, 0)
     assert 0 < actor["steps_per_second"] == found["rates"]["steps_per_second"] <= 8
-    assert status(connect=endpoint, run="r") == 0
+    assert Status(connect=endpoint, run="r")() == 0
     text = capsys.readouterr().out
     assert "worker-7" in text and "accepted" in text and "1 rollout(s) of at most 64 waiting" in text
 
@@ -55,24 +55,25 @@ def test_status_shows_who_works_and_what_came_in(endpoint, capsys):
 def test_a_runs_folder_leads_to_its_learner(endpoint, tmp_path, capsys):
     create_run(tmp_path / "run", dataclasses.replace(RunConfig(), name="r"))
     with pytest.raises(CongraspError, match=r"No learner is running in .*congrasp plot"):
-        status(tmp_path / "run")
+        Status(tmp_path / "run")()
     with listening(tmp_path / "run", endpoint):
-        assert status(tmp_path / "run", json=True) == 0
+        assert Status(tmp_path / "run", json=True)() == 0
         assert json.loads(capsys.readouterr().out)["roles"][0]["id"] == "worker-7"
-        connect, run, policy, recordings = _of_folder(tmp_path / "run", None)
-        assert (connect, run, policy, recordings) == (endpoint, "r", None, tmp_path / "run")
+        page = View()._of_folder(tmp_path / "run")
+        assert page == View(connect=endpoint, run="r", recordings=tmp_path / "run")
     (tmp_path / "run" / POLICY_FILE).touch()
-    assert _of_folder(tmp_path / "run", None) == ("", "r", tmp_path / "run" / POLICY_FILE, tmp_path / "run")
+    page = View()._of_folder(tmp_path / "run")
+    assert page == View(run="r", policy=tmp_path / "run" / POLICY_FILE, recordings=tmp_path / "run")
 
 
 def test_a_folder_beside_what_it_stands_for_is_refused(tmp_path):
     folder, other = tmp_path / "run", {"connect": "tcp/127.0.0.1:1"}
     for command, named in (
-        *((status, named) for named in (other, {"run": "r"})),
-        *((view, named) for named in (other, {"run": "r"}, {"policy": tmp_path}, {"recordings": tmp_path})),
+        *((Status, named) for named in (other, {"run": "r"})),
+        *((View, named) for named in (other, {"run": "r"}, {"policy": tmp_path}, {"recordings": tmp_path})),
     ):
         with pytest.raises(CongraspError, match=r"run is in place of --connect.*\. Give either the folder or these\."):
-            command(folder, **named)
+            command(folder, **named)()
 
 
 def test_counters_that_do_not_add_up_are_named(endpoint):
@@ -101,7 +102,7 @@ def test_watching_goes_on_until_it_is_interrupted(endpoint):
 
 def test_a_run_that_is_not_there_is_an_error_in_words(endpoint):
     with pytest.raises(TransportError, match="other"):
-        status(connect=endpoint, run="other")
+        Status(connect=endpoint, run="other")()
 
 
 def test_thousands_of_foreign_processes_are_counted_and_their_names_are_no_markup(endpoint):

@@ -24,7 +24,7 @@ CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=
 def said(monkeypatch):
     """What was printed so far, as lines."""
     output = io.StringIO()
-    monkeypatch.setattr(command, "console", Console(file=output, width=200))
+    monkeypatch.setattr(command, "console", Console(file=output, width=200, soft_wrap=True))
     return lambda: output.getvalue().splitlines()
 
 
@@ -37,8 +37,9 @@ def clock(monkeypatch):
 
 
 def status(update, **values):
-    figures = {"transitions": 40.0 * update, "steps_per_second": 1234.4, "staleness_mean": 0.5, **values}
-    return {"values": figures, "version": update, "actors": 2}
+    # Fewer steps than updates of this size: earlier updates may have had fewer ranks.
+    figures = {"transitions": 30.0 * update, "steps_per_second": 1234.4, "staleness_mean": 0.5, **values}
+    return {"values": figures, "update": update, "version": update, "actors": 2}
 
 
 def test_progress_counts_the_time_left_from_the_first_update(said, clock):

@@ -16,6 +16,8 @@ from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import tyro
+from rich.console import Console
+from rich.table import Table
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.journal import AUDIT, JournalLines, has_fields, read_journal
@@ -297,9 +299,6 @@ def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tupl
       congrasp audit runs/mine
       congrasp audit runs/mine --journals actor.1 actor.2
     """
-    from rich.console import Console
-    from rich.table import Table
-
     report = compare(run_dir, journals)
     console = Console()
     table = Table("rollouts", "number", "kind", title=f"Audit of {run_dir}")

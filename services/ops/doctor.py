@@ -40,7 +40,14 @@ class Finding(NamedTuple):
 
     what: str
     fine: bool
-    text: str
+    state: str
+    remedy: str = ""
+    """Problem and repair, for a failure."""
+
+    @property
+    def text(self) -> str:
+        """One line, with the remedy of a failure."""
+        return self.state if self.fine or not self.remedy else f"{self.state}: {self.remedy}"
 
 
 def examine(
@@ -78,7 +85,7 @@ def _tried(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
 def _python() -> Iterator[Finding]:
     """Checks the version of Python."""
     fine = (3, 11) <= sys.version_info[:2] < (3, 14)
-    yield Finding("python", fine, platform.python_version() + ("" if fine else ": 3.11, 3.12 or 3.13 is needed"))
+    yield Finding("python", fine, platform.python_version(), "3.11, 3.12 or 3.13 is needed")
 
 
 def _packages() -> Iterator[Finding]:
@@ -100,9 +107,8 @@ def _packages() -> Iterator[Finding]:
                 extra = "cuda" if gpu else "train"
                 yield Finding(name, False, f"not installed; run: pip install 'congrasp[{extra}]'")
             continue
-        fine = not needed or wanted[name].contains(have[name])
-        remedy = "" if fine else f": {wanted[name]} is needed; run: pip install '{name}{wanted[name]}'"
-        yield Finding(name, fine, f"{have[name]}{remedy}")
+        fine, version = not needed or wanted[name].contains(have[name]), wanted.get(name)
+        yield Finding(name, fine, have[name], f"{version} is needed; run: pip install '{name}{version}'")
     for one, other in _PAIRS:
         versions = [importlib.metadata.version(name) for name in (one, other)] if one in have else ["", ""]
         if versions[0] != versions[1]:
@@ -125,7 +131,7 @@ def _gpu() -> Iterator[Finding]:
         name, memory, used, driver = (part.strip() for part in line.split(","))
         fine = int(driver.split(".")[0]) >= _DRIVER
         text = f"{name}, {int(memory) / 1024:.0f} GiB ({int(used) / 1024:.0f} used), driver {driver}"
-        yield Finding(f"gpu {number}", fine, text + ("" if fine else f": {_DRIVER} or newer is needed; update it"))
+        yield Finding(f"gpu {number}", fine, text, f"{_DRIVER} or newer is needed; update it")
 
 
 def _jax() -> Iterator[Finding]:
@@ -138,9 +144,11 @@ def _jax() -> Iterator[Finding]:
     backend = jax.default_backend()
     computed = float(jax.jit(lambda x: (x * x).sum())(jnp.arange(4.0)))
     missing = backend == "cpu" and os.path.exists(_NVIDIA)
-    wrong = ": an NVIDIA GPU is not found; run: pip install 'congrasp[cuda]'" if missing else ""
-    wrong = wrong or ("" if computed == 14.0 else f": a small program gave {computed}, not 14; reinstall it")
-    yield Finding("jax", not wrong, f"{jax.__version__} on {backend} ({devices}), a small program runs{wrong}")
+    remedy = "an NVIDIA GPU is not found; run: pip install 'congrasp[cuda]'"
+    if not missing:
+        remedy = f"a small program gave {computed}, not 14; reinstall it"
+    text = f"{jax.__version__} on {backend} ({devices}), a small program runs"
+    yield Finding("jax", not missing and computed == 14.0, text, remedy)
 
 
 def _warp() -> Iterator[Finding]:
@@ -161,10 +169,8 @@ def _warp() -> Iterator[Finding]:
     values = wp.full(4, 3.0, dtype=float, device=devices[0])
     wp.launch(double, dim=4, inputs=[values], device=devices[0])
     total = float(values.numpy().sum())
-    fine = total == 24.0
-    names = ", ".join(device.name for device in devices)
-    text = f"{wp.__version__} ({names}), a small kernel runs"
-    yield Finding("warp", fine, text if fine else f"{text}, but gave {total}, not 24; reinstall it")
+    text = f"{wp.__version__} ({', '.join(device.name for device in devices)}), a small kernel runs"
+    yield Finding("warp", total == 24.0, text, f"it gave {total}, not 24; reinstall it")
 
 
 def _ports() -> Iterator[Finding]:
@@ -173,8 +179,7 @@ def _ports() -> Iterator[Finding]:
     for port in range(_PORT, last + 1):
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
-                text = f"{port} is in use (by another learner?); pass others with --listen"
-                yield Finding("ports", True, text)
+                yield Finding("ports", True, f"{port} is in use (by another learner?); pass others with --listen")
                 return
     yield Finding("ports", True, f"{_PORT}-{last} are free")
 
@@ -183,8 +188,8 @@ def _disk(folder: pathlib.Path) -> Iterator[Finding]:
     """Checks free space, and the speed of a synchronous write."""
     free = shutil.disk_usage(folder).free / 2**30
     if free < _LEAST_GIB:
-        text = f"{free:.1f} GiB free: a run needs about {_LEAST_GIB:g} GiB; free some, or pass another --run-dir"
-        yield Finding("disk", False, text)
+        remedy = f"a run needs about {_LEAST_GIB:g} GiB; free some, or pass another --run-dir"
+        yield Finding("disk", False, f"{free:.1f} GiB free", remedy)
         return
     try:
         with tempfile.NamedTemporaryFile(dir=folder) as file:
@@ -197,9 +202,8 @@ def _disk(folder: pathlib.Path) -> Iterator[Finding]:
     except OSError as error:
         yield Finding("disk", False, f"{folder.absolute()} cannot be written: {error.strerror}; pass another --run-dir")
         return
-    fine = speed >= _LEAST_MB_S
-    slow = "" if fine else f": checkpoints and recordings need about {_LEAST_MB_S:g} MB/s; pass another --run-dir"
-    yield Finding("disk", fine, f"{free:.1f} GiB free, written at {speed:.0f} MB/s{slow}")
+    remedy = f"checkpoints and recordings need about {_LEAST_MB_S:g} MB/s; pass another --run-dir"
+    yield Finding("disk", speed >= _LEAST_MB_S, f"{free:.1f} GiB free, written at {speed:.0f} MB/s", remedy)
 
 
 def _clock() -> Iterator[Finding]:
@@ -207,11 +211,10 @@ def _clock() -> Iterator[Finding]:
     began, monotonic = time.time(), time.monotonic()
     time.sleep(0.2)
     drift = abs((time.time() - began) - (time.monotonic() - monotonic))
-    behind = began < 1.7e9
-    now = time.strftime("%Y-%m-%d %H:%M:%S %Z")
-    wrong = ": it is years behind; set it (timedatectl set-ntp true)" if behind else ""
-    wrong = wrong or (f": it jumped by {drift:.2f} s in 0.2 s; check the time service" if drift > 0.1 else "")
-    yield Finding("clock", not wrong, now + wrong)
+    behind, remedy = began < 1.7e9, f"it jumped by {drift:.2f} s in 0.2 s; check the time service"
+    if behind:
+        remedy = "it is years behind; set it (timedatectl set-ntp true)"
+    yield Finding("clock", not behind and drift <= 0.1, time.strftime("%Y-%m-%d %H:%M:%S %Z"), remedy)
 
 
 def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
@@ -222,12 +225,9 @@ def _certificates(folder: pathlib.Path) -> Iterator[Finding]:
         yield Finding("certificates", False, str(error))
         return
     for one in found:
-        fine = one.days > _LEAST_DAYS
         text = f"{one.name}: valid until {one.expires:%Y-%m-%d}" if one.days > 0 else f"{one.name}: expired"
-        remedy = (
-            "" if fine else "; run 'congrasp certs issue --force' to renew it, 'certs init --force' for all of them"
-        )
-        yield Finding("certificate", fine, text + remedy)
+        remedy = "run 'congrasp certs issue --force' to renew it, 'certs init --force' for all of them"
+        yield Finding("certificate", one.days > _LEAST_DAYS, text, remedy)
 
 
 def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Iterator[Finding]:
@@ -245,8 +245,8 @@ def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Itera
     yield Finding("learner", True, f"{connect} responds in {1e3 * (ended - began):.1f} ms, version {status['version']}")
     offset = status["time"] - (began + ended) / 2
     fine = abs(offset) < _OFFSET + (ended - began) / 2
-    remedy = "" if fine else ": times in recordings will not match; synchronise both clocks"
-    yield Finding("its clock", fine, f"{offset:+.3f} s from this one (± {(ended - began) / 2:.3f}){remedy}")
+    remedy = "times in recordings will not match; synchronise both clocks"
+    yield Finding("its clock", fine, f"{offset:+.3f} s from this one (± {(ended - began) / 2:.3f})", remedy)
 
 
 def doctor(
