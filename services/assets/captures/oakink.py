@@ -85,8 +85,8 @@ def _sequence(
     if known is None:
         raise Dropped(name, "frames missing", "none of its frames has a right hand and an object")
     pose, shape, wrist, place = (np.stack([(row or known)[i] for row in rows]) for i in range(4))
-    if not is_unit(pose).all():
-        length = np.linalg.norm(pose, axis=-1).min()
+    if (wrong := np.isfinite(pose).all(-1) & ~is_unit(pose)).any():
+        length = np.linalg.norm(pose[wrong][0])
         raise Dropped(name, "wrong layout", f"a quaternion of 'hand_pose' has the length {length:.3g}")
     palm, fingers = (Rotation.from_quat(part, scalar_first=True) for part in (pose[:, 0], pose[:, 1:]))
     wrist_turn, joints = human.skeleton(model, shape[0]).posed(palm, fingers)

@@ -142,7 +142,7 @@ def frames_of(
 
 
 def is_unit(quaternions: np.ndarray) -> np.ndarray:
-    """(T,) bool: quaternions (T, 4) that are of length one, but for rounding."""
+    """(...) bool: quaternions (..., 4) that are of length one, but for rounding."""
     return np.abs(np.linalg.norm(quaternions, axis=-1) - 1) < 0.05
 
 

@@ -77,9 +77,9 @@ def confined(
         try:
             answer = call_confined(function, folder, options, memory=MEMORY, **limits)
         except TimeoutError:
-            raise CongraspError(f"{path} was not read within {SECONDS} s.", _REMEDY) from None
-        except ChildProcessError:
-            why = f"reading it takes more than {SECONDS} s or {MEMORY >> 30} GB, or MuJoCo fails on it"
+            raise CongraspError(f"{path} was not read within {SECONDS + _START:g} s.", _REMEDY) from None
+        except ChildProcessError as error:
+            why = f"reading it {error}; the limits are {SECONDS} s and {MEMORY >> 30} GB"
             raise CongraspError(f"{path} cannot be read: {why}.", _REMEDY) from None
         yield answer, folder
 

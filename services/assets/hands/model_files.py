@@ -107,9 +107,8 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     tree = hand_tree(model, choices.palm, notes)
     palm = model.body(tree.palm).name
     if len(tree.ends) < 2:
-        raise CongraspError(
-            f"{path} has {len(tree.ends)} finger(s) on its palm '{identifier(palm, 'world')}'.", "Pass another --palm."
-        )
+        shown = identifier(palm, f"body_{tree.palm}")
+        raise CongraspError(f"{path} has {len(tree.ends)} finger(s) on its palm '{shown}'.", "Pass another --palm.")
     wide = np.sqrt(model.body_inertia.max(1) / np.maximum(model.body_mass, LEAST[0])) > _LINK[1]
     if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
         said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"

@@ -1,7 +1,8 @@
 """Trials of a hand without a policy: motors follow a step, the empty hand closes, objects are gripped, lifted, pushed.
 
-In free air, motors follow steps of their targets, and all close. In a grip, a hand closes around a ball, a cylinder or
-a box, and lifts it; then it is pushed.
+In free air, motors follow steps of their targets, and the empty hand closes. In a grip, a hand closes around a ball, a
+cylinder or a box and lifts it, and the object is then pushed.
+
 The hand is above: its heading axis points down, and the object is in the grasp frame, with the length of cylinder and
 box across the closing plane of the fingers. Each object is tried in parallel at several positions along the heading
 axis and with several forces. It is fixed until the fingers have closed and then released, without a table. The lift and

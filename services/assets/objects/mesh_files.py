@@ -152,7 +152,8 @@ def _content(path: pathlib.Path) -> tuple[str, bytes]:
     Raises:
       CongraspError: it cannot be read, is empty, or is not a mesh; the remedy describes how to get one.
     """
-    data = read_file(path, MAX_BYTES, "Check the path and its permissions.")
+    limit = f"Check the path and its permissions, or export it with less than {MAX_BYTES >> 20} MB."
+    data = read_file(path, MAX_BYTES, limit)
     if not data:
         raise CongraspError(f"{path} is empty (0 bytes).", "Export or download it again.")
     start, suffix = data[:_START], path.suffix.lower()
@@ -189,7 +190,7 @@ def _foreign(text: bytes, data: bytes) -> tuple[str, str] | None:
             names = zipfile.ZipFile(io.BytesIO(data)).namelist()
         except (OSError, zipfile.BadZipFile):
             return "a zip archive that is damaged", "Download it again."
-        inside = " ".join(names).lower().encode()
+        inside = "".join(f"{name}\n" for name in names).lower().encode()
     for row in tomllib.loads(_FOREIGN.read_text())["format"]:
         begins = tuple(beginning.encode("latin-1") for beginning in row["begins"])
         holds = row.get("holds", [""])

@@ -96,11 +96,13 @@ def bodies(vertices: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, np
     labels = connected_component_labels(faces_to_edges(faces), len(vertices))[faces[:, 0]]
     shells = [faces[labels == i] for i in np.unique(labels)]
     solid = [shell for shell in shells if np.linalg.det(vertices[shell]).sum() > 0]
+    boxes = [np.stack([vertices[body].min((0, 1)), vertices[body].max((0, 1))]) for body in solid]
     for shell in shells:
+        if np.linalg.det(vertices[shell]).sum() > 0:
+            continue
         corners = vertices[shell].reshape(-1, 3)
-        boxes = [np.stack([vertices[body].min((0, 1)), vertices[body].max((0, 1))]) for body in solid]
         around = [i for i, (low, high) in enumerate(boxes) if (low <= corners).all() and (corners <= high).all()]
-        if around and np.linalg.det(vertices[shell]).sum() <= 0:
+        if around:
             i = min(around, key=lambda i: float(np.ptp(boxes[i], axis=0).prod()))
             solid[i] = np.concatenate([solid[i], shell])
     parts = [np.unique(body, return_inverse=True) for body in solid]

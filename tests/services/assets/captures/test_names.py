@@ -44,3 +44,12 @@ def test_settings_that_are_none_are_dropped(tmp_path, text):
     (tmp_path / "meta.yml").write_text(text)
     with pytest.raises(Dropped):
         _yaml("a", tmp_path / "meta.yml")
+
+
+def test_a_mesh_folder_without_a_mesh_or_with_several_is_refused(tmp_path):
+    with pytest.raises(CongraspError, match="holds no STL"):
+        build._source(tmp_path)
+    for name in "ab":
+        (tmp_path / f"{name}.stl").write_bytes(b"")
+    with pytest.raises(CongraspError, match="holds 2 objects"):
+        build._source(tmp_path)

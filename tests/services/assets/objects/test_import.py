@@ -251,3 +251,28 @@ def test_a_bowl_is_as_thin_as_its_wall(tmp_path, options):
     (obj,) = objects_of(tmp_path / "bowl.stl", options)
     assert obj.shape_reliable and abs(obj.volume_error) < 0.1
     assert obj.surface_error < 4e-3
+
+
+def test_given_convex_pieces_are_used(tmp_path, options, quick_import):
+    folder = tmp_path / "ell"
+    folder.mkdir()
+    first, second = block((0.08, 0.02, 0.02)), block((0.02, 0.02, 0.06), (0.03, 0, 0.04))
+    trimesh.util.concatenate([first, second]).export(folder / "ell.stl")
+    first.export(folder / "contact0.stl")
+    second.export(folder / "contact1.stl")
+    first.export(folder / "ell_handle.stl")
+    second.export(folder / "ell_blade.stl")
+    (obj,) = objects_of(folder, options)
+    assert obj.part_names == ("blade", "handle")
+    assert obj.graspable.tolist() == [False, True]
+    volumes = sorted(shapes.volume(piece) for piece in obj.pieces)
+    np.testing.assert_allclose(volumes, [24e-6, 32e-6], rtol=1e-4)
+    assert [piece.part for piece in sorted(obj.pieces, key=shapes.volume)] == [0, 1]
+
+
+def test_coacd_cuts_an_ell_in_two():
+    mesh = ell()
+    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
+    assert result.method == "coacd"
+    assert 2 <= len(result.pieces) <= 3
+    np.testing.assert_allclose(sum(shapes.hull_of(piece).volume for piece in result.pieces), mesh.volume, rtol=0.05)

@@ -38,3 +38,22 @@ def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
     soup = fine.vertices[fine.faces].reshape(-1, 3)  # as STL files have it: no triangle shares a corner
     vertices, faces = reduced(soup, np.arange(len(soup)).reshape(-1, 3), [])
     assert trimesh.Trimesh(vertices, faces).is_watertight
+
+
+def test_a_surface_without_an_outside_is_unchanged():
+    strip = trimesh.Trimesh(*_moebius())
+    said: list[str] = []
+    assert closed(strip, said).faces.shape == strip.faces.shape
+    assert not said
+
+
+def _moebius():
+    turns = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    rim = [(np.cos(t) * (1 + s * np.cos(t / 2)), np.sin(t) * (1 + s * np.cos(t / 2)), s * np.sin(t / 2))
+           for t in turns for s in (-0.2, 0.2)]  # fmt: skip
+    faces = []
+    for i in range(24):
+        a, b = 2 * i, 2 * i + 1
+        c, d = (2 * i + 2, 2 * i + 3) if i < 23 else (1, 0)
+        faces += [(a, b, c), (b, d, c)]
+    return rim, faces
