@@ -57,9 +57,16 @@ def call_confined(
     called = f"{function.__module__}:{function.__name__}"
     command = [sys.executable, "-P", "-m", _MODULE, called, str(folder), str(memory), str(seconds)]
     given, env = json.dumps(options).encode(), {**os.environ, **own}
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     try:
-        child = subprocess.run(command, input=given, timeout=patience, env=env, check=False, **pipes)
+        child = subprocess.run(
+            command,
+            input=given,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            timeout=patience,
+            env=env,
+            check=False,
+        )
     except subprocess.TimeoutExpired:
         raise TimeoutError from None
     if child.returncode == -signal.SIGPROF:

@@ -1,6 +1,6 @@
-"""The command line: one module per command.
+"""The command line: one module per command, here or, for those in `main._MODULES`, in another folder of `services`.
 
-A module `services.cli.<command>` offers `COMMAND`: a function, whose parameters are the options, or a frozen dataclass
+Such a module offers `COMMAND`: a function, whose parameters are the options, or a frozen dataclass
 with `__call__`, whose fields are. tyro turns them and their docstrings into options and help. A group such as `congrasp
 objects import` has a dict of them, `COMMANDS`. Where defaults depend on the command line itself, `defaults(arguments)`
 returns them by the names of the parameters.

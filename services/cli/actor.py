@@ -60,9 +60,9 @@ class Actor:
         with self.watch.watched("actor", name, self.run, metrics), on_signal() as stop:
             with announced(f"Waiting up to {self.patience:g} s for the learner at {self.connect}"):
                 transport = urls.connect(self.connect, "actor", certs=self.certs, wait=self.patience, run=self.run)
-            journal = Journal(self.audit, lambda text: log("error", text)) if self.audit else None
             with transport:
                 log("info", f"Connected to the learner at {self.connect}.")
+                journal = Journal(self.audit, lambda text: log("error", text)) if self.audit else None
                 run_actor(
                     transport,
                     run=self.run,

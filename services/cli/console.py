@@ -23,8 +23,9 @@ def in_range(least: float, most: float = math.inf, unit: str = "", **options: fl
     """Raises a CongraspError for the first option that is not from the minimum to the maximum."""
     for name, value in options.items():
         if not least <= value <= most:
-            bounds = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g} {unit}".rstrip()
-            raise CongraspError(f"--{name.replace('_', '-')} is {value}.", f"It must be {bounds}.")
+            bounds = f"at least {least:g}" if most == math.inf else f"from {least:g} to {most:g}"
+            remedy = f"It must be {bounds} {unit}".rstrip()
+            raise CongraspError(f"--{name.replace('_', '-')} is {value}.", f"{remedy}.")
 
 
 def say(*lines: object) -> None:
@@ -49,8 +50,8 @@ def show_facts(facts: Mapping[str, str]) -> None:
     Console(markup=False, highlight=False).print(table)
 
 
-def save_picture(path: pathlib.Path | None, draw: Callable[[], np.ndarray]) -> None:
-    """Draws a picture into a file that an option names, if it does."""
+def save_drawing(path: pathlib.Path | None, draw: Callable[[], np.ndarray]) -> None:
+    """Draws a picture into the file of an option; None draws nothing."""
     if path is not None:
         from congrasp.services.viz.sheets import save_png
 

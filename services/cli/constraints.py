@@ -168,7 +168,7 @@ class Import:
             raise CongraspError(f"There is no format '{self.format}'.", f"Choose one of: {', '.join(IMPORTERS)}.")
         if not self.path.exists():
             raise CongraspError(f"There is no file or folder {self.path}.", "Pass the data set's folder.")
-        in_range(0.0, beyond=self.beyond)
+        in_range(0.0, unit="radians", beyond=self.beyond)
         hand, options = get_hand(self.hand), Options(self.headings, self.affordance, self.beyond, seed=self.seed)
         importer = importlib.import_module(IMPORTERS[self.format])
         with bars() as progress:
@@ -263,14 +263,14 @@ def show(
     """
     from congrasp.common.task.sampling.sets import load
     from congrasp.common.task.sampling.write_sets import describe
-    from congrasp.services.cli.console import in_range, save_picture, show_facts
+    from congrasp.services.cli.console import in_range, save_drawing, show_facts
     from congrasp.services.viz.object_sheet import constraint_sheet
 
     constraints = load(file)
     in_range(0, len(constraints.arrays["rest"]), rest=rest)
     show_facts(describe(constraints))
     best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
-    save_picture(png, lambda: constraint_sheet(constraints, rest - 1 if rest else best, seed))
+    save_drawing(png, lambda: constraint_sheet(constraints, rest - 1 if rest else best, seed))
     return 0
 
 

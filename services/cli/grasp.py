@@ -115,14 +115,14 @@ class Grasp:
         grasper = open_grasper(self.policy, self.hand, self.attempts, self.seed, phases, self.arm)
         found, results = find_objects(self.objects, self.folder)
         settings = Settings(
-            self.out,
-            self.mesh,
-            dataclasses.asdict(self.constraint),
-            film_of(self.size, self.fps, self.overlays) if self.video else None,
-            view_of(self.camera),
-            self.pictures,
-            self.again,
-            self.rest,
+            out=self.out,
+            options=self.mesh,
+            constraints=dataclasses.asdict(self.constraint),
+            film=film_of(self.size, self.fps, self.overlays) if self.video else None,
+            view=view_of(self.camera),
+            pictures=self.pictures,
+            again=self.again,
+            rest=self.rest,
         )
         for result in results:
             _show(result)

@@ -3,9 +3,8 @@
 import dataclasses
 import pathlib
 import shlex
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import jax
 import tyro
 
 from congrasp.actors.physics import PhysicsName
@@ -15,17 +14,11 @@ from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.meshes import load_meshes, save_meshes
 from congrasp.common.hands.skin import skin_of_meshes
 from congrasp.common.io.files import write_atomically
-from congrasp.common.policy.pretrained import pretrained_file
 from congrasp.common.runtime.parallel import cores
-from congrasp.services.assets.hands import check as self_check
-from congrasp.services.assets.hands.model_files import Choices, Proposal, describe
-from congrasp.services.assets.hands.model_files import import_hand as proposed
 from congrasp.services.cli.console import in_range, say, show_table
-from congrasp.services.train import launch
-from congrasp.services.train.own_hand import Request, train_hand
-from congrasp.services.train.presets import recipe
-from congrasp.services.viz import hand_sheets
-from congrasp.services.viz.sheets import save_png
+
+if TYPE_CHECKING:
+    from congrasp.services.assets.hands.model_files import Choices, Proposal
 
 
 def list_hands() -> int:
@@ -34,6 +27,7 @@ def list_hands() -> int:
     Examples:
       congrasp hands list
     """
+    from congrasp.common.policy.pretrained import pretrained_file
 
     rows, missing = [], []
     own, folder = own_hands(), hands_folder()
@@ -72,6 +66,8 @@ def sheet(
       congrasp hands sheet human
       congrasp hands sheet allegro sharpa --out robot-hands.png
     """
+    from congrasp.services.viz import hand_sheets
+    from congrasp.services.viz.sheets import save_png
 
     found = [get_hand(name) for name in hands]
     files = [own_hands().get(name, pathlib.Path(name)) for name in hands]
@@ -114,8 +110,9 @@ def import_hand(
       congrasp hands import hand.urdf
       congrasp hands import hand.xml --name mine --palm palm_link
     """
+    from congrasp.services.assets.hands import model_files
 
-    proposal = proposed(file, Choices(name, palm, thumb, object_scale, collision == "own"))
+    proposal = model_files.import_hand(file, model_files.Choices(name, palm, thumb, object_scale, collision == "own"))
     if out is not None and out.suffix != SUFFIX:
         raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
     _keep(proposal, out, png)
@@ -124,8 +121,11 @@ def import_hand(
     return 0
 
 
-def _keep(proposal: Proposal, out: pathlib.Path | None, png: pathlib.Path | None) -> None:
+def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | None) -> None:
     """Writes a hand's file and picture, by default to the folder of custom hands, and prints a description."""
+    from congrasp.services.assets.hands.model_files import describe
+    from congrasp.services.viz import hand_sheets
+    from congrasp.services.viz.sheets import save_png
 
     hand = proposal.hand
     if hand.name in HANDS:
@@ -162,6 +162,10 @@ def check(
       congrasp hands check allegro
       congrasp hands check my_hand --png check.png --json check.json
     """
+    from congrasp.services.assets.hands import check as self_check
+    from congrasp.services.train.presets import recipe
+    from congrasp.services.viz import hand_sheets
+    from congrasp.services.viz.sheets import save_png
 
     found = get_hand(hand)
     checked = self_check.check_hand(found, recipe(found).task, cores())
@@ -216,6 +220,11 @@ class Train:
 
     def __call__(self) -> int:
         """Imports, checks, trains and evaluates."""
+        import jax
+
+        from congrasp.services.assets.hands.model_files import Choices
+        from congrasp.services.train import launch
+        from congrasp.services.train.own_hand import Request, train_hand
 
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
@@ -240,13 +249,14 @@ class Train:
         return 0
 
 
-def _taken(hand: str, choices: Choices) -> str:
+def _taken(hand: str, choices: "Choices") -> str:
     """Name of a hand in commands; that of a URDF or MJCF is imported, unless it was before."""
+    from congrasp.services.assets.hands.model_files import import_hand
 
     file = pathlib.Path(hand)
     if not file.is_file() or file.suffix == SUFFIX:
         return hand
-    proposal = proposed(file, choices)
+    proposal = import_hand(file, choices)
     name = proposal.hand.name
     if name in own_hands():
         print(f"The hand '{name}' is {own_hands()[name]}; 'congrasp hands import' would replace it.")

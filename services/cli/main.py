@@ -64,8 +64,17 @@ UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_UNUSABLE = "ENOENT ENOTDIR EISDIR EACCES EPERM EROFS ENAMETOOLONG ELOOP EEXIST"
-_PATH = [getattr(errno, name) for name in _UNUSABLE.split()]
+_PATH = (
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+    errno.EEXIST,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

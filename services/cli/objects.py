@@ -122,7 +122,7 @@ def list_objects(
     """
     from congrasp.common.objects.procedural import FAMILIES
     from congrasp.common.objects.store import Catalogue
-    from congrasp.services.cli.console import report_error, save_picture, show_table
+    from congrasp.services.cli.console import report_error, save_drawing, show_table
 
     if families:
         print("\n".join(FAMILIES))
@@ -146,7 +146,7 @@ def list_objects(
     if png is not None and found:
         from congrasp.services.viz.object_sheet import overview
 
-        save_picture(png, lambda: overview(found))
+        save_drawing(png, lambda: overview(found))
     return 2 if failures else 0
 
 
@@ -167,7 +167,7 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     from congrasp.common.objects.store import digest
     from congrasp.common.task.sampling.headings import sample_headings
     from congrasp.services.assets.objects.named import find_object
-    from congrasp.services.cli.console import save_picture, say, show_facts
+    from congrasp.services.cli.console import save_drawing, say, show_facts
     from congrasp.services.viz.object_sheet import object_sheet
 
     obj = find_object(object, folder)
@@ -195,8 +195,8 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
         )
     say(obj.name)
     show_facts(facts)
-    if free is not None:
-        save_picture(png, lambda: object_sheet(obj, free))
+    assert free is not None, "only the graspable region may be out of reach"
+    save_drawing(png, lambda: object_sheet(obj, free))
     return 0
 
 
@@ -218,7 +218,7 @@ def rests(
 
     from congrasp.common.objects.resting import rest_tilts
     from congrasp.services.assets.objects.named import find_object
-    from congrasp.services.cli.console import save_picture, show_table
+    from congrasp.services.cli.console import save_drawing, show_table
     from congrasp.services.viz.object_sheet import rests_sheet
 
     obj = find_object(object, folder)
@@ -228,7 +228,7 @@ def rests(
         for i, (pose, tilt) in enumerate(zip(obj.rest_poses, tilts, strict=True), 1)
     ]
     show_table(("--rest", "centre of mass (cm)", "z axis from up (°)"), rows)
-    save_picture(png, lambda: rests_sheet(obj))
+    save_drawing(png, lambda: rests_sheet(obj))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Builds parsers from command functions: signatures become options, and docstrings help."""
+"""Builds parsers from commands: parameters or fields become options, and docstrings help."""
 
 import contextlib
 import dataclasses
@@ -94,8 +94,7 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
 
 def _run(command: Command, *args: Any, **options: Any) -> Any:
     """Calls a function, or a command whose fields are its options."""
-    made = command(*args, **options)
-    return made() if isinstance(command, type) else made
+    return command(*args, **options)() if isinstance(command, type) else command(*args, **options)
 
 
 def _described(name: str, hint: Any, *more: Any) -> Any:

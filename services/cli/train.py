@@ -1,5 +1,6 @@
 """`congrasp train`: a learner and its actors on this machine."""
 
+import dataclasses
 import pathlib
 import time
 from typing import Any
@@ -12,7 +13,7 @@ from congrasp.common.io.inputs import file_name
 from congrasp.common.task.methods import STUDENT, STUDENTS, with_method
 from congrasp.learner.run_directory import CONFIG_FILE, open_run
 from congrasp.services.train.launch import Launch
-from congrasp.services.train.presets import get_preset, student_of, with_hand, with_sets
+from congrasp.services.train.presets import get_preset, student_of, with_hand
 
 
 def train(
@@ -65,8 +66,10 @@ def train(
     from congrasp.services.train.command import run_training
 
     config = with_hand(config if method is None else with_method(config, method), hand)
+    given: dict[str, Any] = {"constraints": constraints and str(constraints), "split": split}
+    objects = dataclasses.replace(config.objects, **{name: value for name, value in given.items() if value})
     return run_training(
-        with_sets(config, constraints, split),
+        dataclasses.replace(config, objects=objects),
         run_dir or pathlib.Path("runs") / f"{file_name(config.name, 'a run')}-{time.strftime('%Y%m%d-%H%M%S')}",
         launch,
         resume=resume,

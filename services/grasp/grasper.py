@@ -115,9 +115,9 @@ class Grasper:
     @functools.cached_property
     def identity(self) -> tuple[Any, ...]:
         """Inputs of a grasp other than object and request."""
-        policy, (approach, lift, *_) = bundles.content_hash(encode(self._policy.to_message())), self._attempts.phases
+        policy = bundles.content_hash(encode(self._policy.to_message()))
         arm = self._arm.identity if self._arm else ""
-        return policy, self._attempts_count, self._seed, approach, lift, self._left, arm
+        return policy, self._attempts_count, self._rounds, self._seed, *self._attempts.phases, self._left, arm
 
     def grasp(
         self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
@@ -139,6 +139,7 @@ class Grasper:
         require_known(request.constraints, self.task)
         if self._left:
             obj, request = obj.mirrored(), mirrored_request(request)
+        obj = obj if request.avoid is None else with_avoid(obj, request.avoid)
         best: tuple[_Round, np.ndarray] | None = None
         refused: collections.Counter[str] = collections.Counter()
         held = attempts = 0
@@ -174,13 +175,13 @@ class Grasper:
         self, obj: GraspObject, request: GraspRequest, seed: int | tuple[int, int], what: str, progress: Progress
     ) -> _Round:
         """A round of attempts, which is called `what` in its progress."""
-        labelled = obj if request.avoid is None else with_avoid(obj, request.avoid)
         rng, count = np.random.default_rng(seed), self._attempts_count
-        episodes, rests, different = to_attempt(self._hand, self.task, labelled, request, count, rng)
+        episodes, rests, different = to_attempt(self._hand, self.task, obj, request, count, rng)
         progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
         self._compiled = True
         outcome = self._attempts.run(obj, episodes, lambda step: progress(what, step, self._attempts.steps))
-        return _Round(labelled, request, episodes, rests, outcome, outcome.metrics["held"][:different] > 0)
+        holds = outcome.metrics["held"][:different] > 0
+        return _Round(obj=obj, request=request, episodes=episodes, rests=rests, outcome=outcome, holds=holds)
 
     def _cost(self, tried: _Round) -> np.ndarray:
         """(n,) cost of each attempt, with that of its resting pose."""

@@ -33,7 +33,7 @@ class WristPath(NamedTuple):
     rotation: Rotation
     """T orientations of the wrist frame."""
     seconds: float
-    """Between two frames; 10 ms if the file does not say it."""
+    """Time between two frames, s; 0.01 for CSV and NPZ files."""
 
 
 def read_wrist_path(

@@ -56,7 +56,7 @@ class Child:
 
     @property
     def code(self) -> int | None:
-        """Its exit code; None while it runs, and before."""
+        """Its exit code; None before it starts and while it runs."""
         return self.process.poll() if self.process else None
 
     def last_line(self) -> str:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any, Self
 
 from rich.console import Console
+from rich.padding import Padding
 
 from congrasp.common.config import ObjectsConfig, RunConfig
 from congrasp.common.errors import CongraspError
@@ -125,8 +126,9 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
 def _announce(config: RunConfig, run_dir: pathlib.Path, plan: Plan) -> None:
     """Prints a summary of the run, and in what it is easier than the full task."""
     ranks = plan.launch.ranks
+    steps = ranks * config.rollout_steps * config.environments * config.rollouts_per_update
     console.print(
-        f"[bold]{config.name}[/]: {config.updates} updates of {ranks * _steps_per_update(config)} steps, "
+        f"[bold]{config.name}[/]: {config.updates} updates of {steps} steps, "
         f"{ranks * (plan.actors or 1)} actor(s) with {config.environments} hands each on '{plan.physics}' in "
         f"{run_dir}"
     )
@@ -201,7 +203,7 @@ class _Progress:
             self._line = (
                 f"compiling, and filling the first batch: {now - self._began:.0f} s, {status['actors']} actor(s)"
             )
-        self._live.update(self._line)
+        self._live.update(Padding(self._line, 0))  # a text would be cropped, since the console does not wrap
         if not console.is_terminal and now - self._last >= _LINE_SECONDS:
             self._last = now
             self._print()
@@ -233,11 +235,6 @@ def first_update() -> str:
     """Stages of the time until the first update of this process's learner."""
     parts = ", ".join(f"{one.name} {one.ended - one.began:.1f}" for one in stages())
     return f"first update {since_start():.1f} s after the start, including (partly in parallel): {parts}"
-
-
-def _steps_per_update(config: RunConfig) -> int:
-    """Number of environment steps of one update of one rank."""
-    return config.rollout_steps * config.environments * config.rollouts_per_update
 
 
 def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:

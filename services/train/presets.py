@@ -24,7 +24,7 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from congrasp.common.config import CurriculumConfig, NetworkConfig, ObjectsConfig, PPOConfig, RunConfig, Split
+from congrasp.common.config import CurriculumConfig, NetworkConfig, ObjectsConfig, PPOConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.motors import tip_forces
@@ -210,15 +210,6 @@ def with_hand(config: RunConfig, hand: str | None) -> RunConfig:
     """Returns the configuration with another hand, or unchanged; a hand's file is included, for remote actors."""
     found = get_hand(hand or config.task.hand)
     return dataclasses.replace(config, task=dataclasses.replace(config.task, hand=found.reference))
-
-
-def with_sets(config: RunConfig, folder: pathlib.Path | None, split: Split | None) -> RunConfig:
-    """Returns the configuration with a folder of constraint sets and a split of them, each unchanged by None."""
-    objects = config.objects
-    where = objects.constraints if folder is None else str(folder)
-    return dataclasses.replace(
-        config, objects=dataclasses.replace(objects, constraints=where, split=split or objects.split)
-    )
 
 
 TRACKERS = SensingConfig(

@@ -74,6 +74,16 @@ def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(said, clock):
     assert [line.split()[-4] for line in said()] == ["1", "11", "21", "22"]  # the last one at the end
 
 
+def test_progress_on_a_narrow_terminal_is_wrapped(monkeypatch, clock):
+    output = io.StringIO()
+    narrow = Console(file=output, width=80, force_terminal=True, highlight=False, soft_wrap=command.console.soft_wrap)
+    monkeypatch.setattr(command, "console", narrow)
+    with _Progress(CONFIG) as progress:
+        progress.show(status(1))
+        progress._live._live.refresh()
+        assert "left ?" in output.getvalue()
+
+
 def test_next_steps_name_the_pictures_that_exist_and_commands_that_exist(said, tmp_path):
     from congrasp.services.cli.main import COMMANDS
 

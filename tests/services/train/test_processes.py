@@ -9,10 +9,16 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
+from congrasp.services.ops.children import command
 from congrasp.services.train import processes
 from congrasp.services.train.processes import Child
 
 WAITS = "import time; time.sleep(60)"
+
+
+def test_options_become_arguments():
+    given = {"run_dir": "a", "resume": True, "certs": None, "insecure": False, "port": 0, "metric_writers": ()}
+    assert command("learner", **given) == ["learner", "--run-dir", "a", "--resume", "--port", "0", "--metric-writers"]
 
 
 class Script(Child):
