@@ -128,7 +128,8 @@ FULL_FOR = ("human", "allegro", "sharpa")
 QUICKSTART = RunConfig(
     name="quickstart",
     environments=64,
-    updates=60,
+    rollouts_per_update=1,
+    updates=100,
     physics="native",
     task=TaskConfig(
         constraints=("heading",),
@@ -139,9 +140,9 @@ QUICKSTART = RunConfig(
         # The full task's hands close slowly, which takes several times as many steps to learn.
         control=ControlConfig(approach_position_limit=0.04, closing_position_limit=0.04),
     ),
-    objects=ObjectsConfig(count=16),
+    objects=ObjectsConfig(count=32),
     network=NetworkConfig(hidden=(256, 128)),
-    ppo=PPOConfig(minibatches=8, settling=0.25),
+    ppo=PPOConfig(minibatches=4, kl_target=0.03, settling=0.25),
 )
 """Takes minutes on two CPU cores; `easier` lists the simplifications."""
 CHECK = dataclasses.replace(
