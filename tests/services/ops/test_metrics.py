@@ -134,7 +134,8 @@ def test_a_learner_and_an_actor_are_scraped(tmp_path):
         wanted = {("congrasp_learner_roles", "actor"): 1, ("congrasp_learner_ready",): 1}
         found = scraped_until(ports[0], lambda found: wanted.items() <= found.items())
         assert found["congrasp_learner_counters_balanced",] == 1
-        assert found["congrasp_learner_tickets_capacity",] + found["congrasp_learner_tickets_running",] == 4
+        # One rollout an update, for the next version and the one after it.
+        assert found["congrasp_learner_tickets_capacity",] + found["congrasp_learner_tickets_running",] == 2
         assert ("congrasp_actor_rollouts_total",) in scrape(ports[1])
     assert all(line.keys() == {"time", "level", "role", "id", "run", "text", "fields"} for line in said)
     assert datetime.datetime.fromisoformat(said[0]["time"]).tzinfo is datetime.UTC
