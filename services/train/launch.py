@@ -13,6 +13,7 @@ from congrasp.actors.physics import resolve_physics
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
+from congrasp.common.runtime.parallel import cores
 from congrasp.common.transport import urls
 from congrasp.common.transport.ports import LEARNER_URL
 from congrasp.common.transport.security import CERTIFICATE_FILE, check_exposure
@@ -23,8 +24,8 @@ class Launch:
     """Options of a run's processes."""
 
     actors: int | None = None
-    """Actor processes. By default two; on a GPU none: a single actor then runs in the learner's process, and rollouts
-    never leave the device."""
+    """Actor processes. By default two, or one on fewer than four cores; on a GPU none: a single actor then runs in the
+    learner's process, and rollouts never leave the device."""
     ranks: int = 1
     """Learners that train together, data parallel; each has --actors actors, and a separate GPU if there are GPUs. The
     batch grows with them."""
@@ -58,7 +59,8 @@ class Launch:
             self._check_connections(config.name)
         gpus = self.ranks > 1 and leave_gpus_to(self.ranks)
         physics = engine_of(config.physics, gpus)
-        default = 0 if ENGINES[physics].on_device and not joined else 2
+        # Two actors on two cores would compile the same programs at the same time.
+        default = 0 if ENGINES[physics].on_device and not joined else min(2, max(1, cores() // 2))
         return Plan(self, default if self.actors is None else self.actors, physics, gpus)
 
     def _check_connections(self, run: str) -> None:

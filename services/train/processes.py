@@ -38,8 +38,7 @@ def train(
 ) -> None:
     """Runs a prepared run directory to its end with one learner and its actor processes, or several of both.
 
-    Of several actors of a rank all but the first start after the first update, with the programs that it compiled. A
-    process that dies is restarted (the learner from its last checkpoint), up to `MAX_RESTARTS` times each. If one of
+    A process that dies is restarted (the learner from its last checkpoint), up to `MAX_RESTARTS` times each. If one of
     several ranks dies, the others end as well, and all are restarted.
 
     Args:
@@ -60,7 +59,7 @@ def train(
     logs.mkdir(exist_ok=True)
     learners, actors = _learners(run_dir, plan, endpoint), _actors(run_dir, plan, config.name, endpoint)
     try:
-        for child in (*learners, *actors[:: max(1, plan.actors)]):  # of each rank the first actor
+        for child in (*learners, *actors):
             child.start()
         transport = _connect(reachable_url(endpoint), learners[0], stop, launch.certs)
         if transport is not None:
@@ -154,11 +153,7 @@ def _supervise(
             if event[1].meta.get("level") == "error":
                 notify(str(event[1].meta.get("text")))
         received = metrics.receive(_POLL)
-        if received:  # after an update: the programs that the first actor of each rank compiled are kept for the others
-            for child in actors:
-                if child.process is None:
-                    child.start()
-        alive = sum(child.process is not None and child.code is None for child in actors) or len(learners)
+        alive = sum(child.code is None for child in actors) or len(learners)
         report({**(received[1].meta if received else {}), "actors": alive})
 
 

@@ -8,9 +8,7 @@ import threading
 import pytest
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
-from congrasp.common.wire.codec import Message
 from congrasp.services.ops.children import command
 from congrasp.services.train import processes
 from congrasp.services.train.processes import Child
@@ -57,29 +55,6 @@ def test_one_that_dies_takes_the_others_with_it_and_all_come_back(supervise, tmp
     )
     notes = supervise([WAITS, waits_for_it], ["raise SystemExit(9)", writes])
     assert notes == ["The rank-1 died (exit code 9); restarting all ranks."]
-
-
-def test_other_actors_start_after_the_first_update(tmp_path):
-    seen: list[int] = []
-    here = f"import pathlib, time; there = pathlib.Path({str(tmp_path)!r}, 'second')"
-    learner = Script("learner", [f"{here}\nwhile not there.exists(): time.sleep(0.05)"], tmp_path / "learner.log")
-    actors = [
-        Script("actor-0", [WAITS], tmp_path / "0.log"),
-        Script("actor-1", [f"{here}; there.touch()\n{WAITS}"], tmp_path / "1.log"),
-    ]
-    learner.start()
-    actors[0].start()
-    hub = MemoryHub()
-    with MemoryTransport(hub) as transport, MemoryTransport(hub) as other:
-
-        def report(status: dict) -> None:
-            seen.append(status["actors"])
-            if len(seen) == 2:
-                other.publish(Keys("run").learner_metrics, Message({}, {"update": 1}))
-
-        processes._supervise([learner], actors, transport, "run", threading.Event(), report, print)
-    processes.end_all([learner, *actors])
-    assert seen[:2] == [1, 1] and seen[-1] == 2
 
 
 def test_bad_input_of_any_rank_ends_the_run_with_its_last_words(supervise):
