@@ -166,3 +166,10 @@ def test_docstrings_open_plainly_and_no_banned_word_is_used(read, wrong):
     modules = trees(*FOLDERS).items()
     found = [f"{path}:{line}: {text[:100]}" for path, tree in modules for line, text in read(tree) if wrong(text)]
     assert not found, "\n".join(found)
+
+
+def test_the_modules_of_make_check_exist():
+    """xdist runs nothing, and says no reason, if one is missing."""
+    listed = re.search(r"^FAST :=((?:.*\\\n)*.*)", (ROOT / "Makefile").read_text(), re.M)
+    names = set(re.findall(r"\btest_\w+", listed[1]))
+    assert len(names) > 10 and names <= {path.stem for path in (ROOT / "tests").rglob("test_*.py")}
