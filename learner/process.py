@@ -316,9 +316,9 @@ class _Learner:
         """Runs one update on all ranks; returns its metrics and its number of environment steps."""
         messages = self._hub.next_batch(self._config.rollouts_per_update, 0.0)
         assert messages is not None, "an available batch cannot disappear"
-        mine = summary(messages, self._hub.lag)
         batch = collate([message.arrays for message in messages], self._form.arrays)
         lags = [self._hub.lag(int(message.meta["version"])) for message in messages]
+        mine = summary(messages, lags)
         batch["lag"] = np.repeat(np.array(lags, np.int32), self._form.worlds)
         try:
             with self._ranks.watchdog(), stage("first update"):

@@ -14,16 +14,15 @@ _EPISODE = ("episode/", "term/")
 _OPTIONAL = tuple(constraint for constraint in CONSTRAINTS if constraint.optional)
 
 
-def summary(messages: Sequence[Message], lag: Callable[[int], int]) -> dict[str, Any]:
+def summary(messages: Sequence[Message], lags: Sequence[int]) -> dict[str, Any]:
     """Summary of one rank's batch as JSON, from which `overall` computes means over all ranks.
 
     Args:
       messages: the rollouts of the batch.
-      lag: returns the lag of a policy version.
+      lags: versions between the policy of each rollout and the current one.
     """
     sums, episodes = _episode_sums(messages)
     steps = [int(message.meta["steps"]) for message in messages]
-    lags = [lag(int(message.meta["version"])) for message in messages]
     sums["staleness_mean"] = [float(np.dot(lags, steps)), float(sum(steps))]
     return {"sums": sums, "episodes": episodes, "steps": sum(steps), "staleness_max": max(lags)}
 

@@ -50,13 +50,12 @@ def show_facts(facts: Mapping[str, str]) -> None:
     Console(markup=False, highlight=False).print(table)
 
 
-def save_drawing(path: pathlib.Path | None, draw: Callable[[], np.ndarray]) -> None:
-    """Draws a picture into the file of an option; None draws nothing."""
-    if path is not None:
-        from congrasp.services.viz.sheets import save_png
+def save_drawing(path: pathlib.Path, image: np.ndarray) -> None:
+    """Writes a picture into the file of an option, and says so."""
+    from congrasp.services.viz.sheets import save_png
 
-        save_png(path, draw())
-        print(f"The picture is {path}.")
+    save_png(path, image)
+    print(f"The picture is {path}.")
 
 
 def report_error(error: CongraspError | str) -> None:

@@ -264,13 +264,15 @@ def show(
     from congrasp.common.task.sampling.sets import load
     from congrasp.common.task.sampling.write_sets import describe
     from congrasp.services.cli.console import in_range, save_drawing, show_facts
-    from congrasp.services.viz.object_sheet import constraint_sheet
 
     constraints = load(file)
     in_range(0, len(constraints.arrays["rest"]), rest=rest)
     show_facts(describe(constraints))
-    best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
-    save_drawing(png, lambda: constraint_sheet(constraints, rest - 1 if rest else best, seed))
+    if png is not None:
+        from congrasp.services.viz.object_sheet import constraint_sheet
+
+        best = int(constraints.arrays["pose/allowed"].sum((0, 2)).argmax())
+        save_drawing(png, constraint_sheet(constraints, rest - 1 if rest else best, seed))
     return 0
 
 

@@ -146,7 +146,7 @@ def list_objects(
     if png is not None and found:
         from congrasp.services.viz.object_sheet import overview
 
-        save_drawing(png, lambda: overview(found))
+        save_drawing(png, overview(found))
     return 2 if failures else 0
 
 
@@ -168,7 +168,6 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
     from congrasp.common.task.sampling.headings import sample_headings
     from congrasp.services.assets.objects.named import find_object
     from congrasp.services.cli.console import save_drawing, say, show_facts
-    from congrasp.services.viz.object_sheet import object_sheet
 
     obj = find_object(object, folder)
     share = obj.graspable[obj.labels].mean()
@@ -195,8 +194,11 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
         )
     say(obj.name)
     show_facts(facts)
-    assert free is not None, "only the graspable region may be out of reach"
-    save_drawing(png, lambda: object_sheet(obj, free))
+    if png is not None:
+        from congrasp.services.viz.object_sheet import object_sheet
+
+        assert free is not None, "only the graspable region may be out of reach"
+        save_drawing(png, object_sheet(obj, free))
     return 0
 
 
@@ -219,7 +221,6 @@ def rests(
     from congrasp.common.objects.resting import rest_tilts
     from congrasp.services.assets.objects.named import find_object
     from congrasp.services.cli.console import save_drawing, show_table
-    from congrasp.services.viz.object_sheet import rests_sheet
 
     obj = find_object(object, folder)
     tilts = np.degrees(rest_tilts(obj))
@@ -228,7 +229,10 @@ def rests(
         for i, (pose, tilt) in enumerate(zip(obj.rest_poses, tilts, strict=True), 1)
     ]
     show_table(("--rest", "centre of mass (cm)", "z axis from up (°)"), rows)
-    save_drawing(png, lambda: rests_sheet(obj))
+    if png is not None:
+        from congrasp.services.viz.object_sheet import rests_sheet
+
+        save_drawing(png, rests_sheet(obj))
     return 0
 
 

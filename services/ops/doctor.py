@@ -125,7 +125,7 @@ def _gpu() -> Iterator[Finding]:
     try:
         lines = subprocess.run(query, capture_output=True, text=True, timeout=30, check=True).stdout.splitlines()
     except (OSError, subprocess.SubprocessError):
-        yield Finding("gpu", False, "nvidia-smi does not respond: install the NVIDIA driver")
+        yield Finding("gpu", False, "nvidia-smi does not respond", "install the NVIDIA driver")
         return
     for number, line in enumerate(lines):
         name, memory, used, driver = (part.strip() for part in line.split(","))

@@ -11,7 +11,9 @@ def rollout(version: int = 0, steps: int = 1, **episodes: list[float]) -> Messag
 
 
 def figures(*batches: list[Message]) -> dict[str, float]:
-    return overall([summary(messages, lambda version: 9 - version) for messages in batches])
+    return overall(
+        [summary(messages, [9 - int(message.meta["version"]) for message in messages]) for messages in batches]
+    )
 
 
 def episode_means(messages: list[Message]) -> dict[str, float]:
