@@ -15,6 +15,8 @@ from congrasp.common.errors import printable
 
 LogFormat = Literal["text", "json"]
 _logger = logging.getLogger("congrasp")
+_LOG = "__congrasp_log__"
+"""Attribute of an exception that ended a JSON log: the log's handler."""
 
 
 class JsonLines(logging.Formatter):
@@ -52,7 +54,8 @@ class Lines(logging.Formatter):
 def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[None]:
     """Context that writes the log of this process to standard output, including warnings of libraries.
 
-    A full disk loses lines, but does not end the process.
+    A full disk loses lines, but does not end the process. An exception that ends the context carries the handler of a
+    JSON log, for `log_error`.
     """
     root, handler = logging.getLogger(), logging.StreamHandler(sys.stdout)
     handler.setFormatter(
@@ -61,9 +64,14 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
     handler.handleError = lambda record: None  # type: ignore[method-assign]
     root.addHandler(handler)
     _logger.setLevel(logging.INFO)
-    yield
-    # After an exception the handler stays: `log_error` may still report the reason.
-    root.removeHandler(handler)
+    try:
+        yield
+    except Exception as error:
+        if form == "json":
+            setattr(error, _LOG, handler)
+        raise
+    finally:
+        root.removeHandler(handler)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,9 +132,9 @@ def announced(what: str | Callable[[], str], first: float = 3.0, every: float = 
         done.set()
 
 
-def log_error(text: str) -> bool:
-    """Logs an error that ends the process if the log is JSON; returns True if it is."""
-    structured = any(isinstance(handler.formatter, JsonLines) for handler in logging.getLogger().handlers)
-    if structured:
-        log("error", text)
-    return structured
+def log_error(error: Exception, text: str) -> bool:
+    """Describes an error in the log that it ended if that is JSON; returns True if it is."""
+    handler: logging.Handler | None = getattr(error, _LOG, None)
+    if handler is not None:
+        handler.handle(_logger.makeRecord(_logger.name, logging.ERROR, "", 0, text, (), None))
+    return handler is not None

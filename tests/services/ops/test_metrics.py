@@ -152,6 +152,9 @@ def test_an_error_is_the_last_line_of_a_log_in_json(capfd):
     line = json.loads(said.out)
     assert (end.value.code, line["level"], said.err) == (2, "error", "")
     assert line["text"].startswith("'nonsense' is not an endpoint.")
+    with pytest.raises(SystemExit):
+        main(["grasp", "nowhere.obj"])
+    assert capfd.readouterr().err.startswith("congrasp: error: There is no file nowhere.obj.")  # no log of before
 
 
 def test_a_full_disk_under_a_log_costs_lines_and_not_the_process(monkeypatch):

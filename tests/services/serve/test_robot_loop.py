@@ -36,7 +36,7 @@ def test_the_node_follows_a_server_and_opens_without_one(robot, tmp_path):
     """Over Zenoh, in a process of its own; nothing was lifted, so that the hand opens when the server has gone."""
     with contextlib.closing(Rig(tmp_path, robot, TASK)) as rig:
         with steady_server(HAND.name) as port:
-            rig.begin(f"tcp/127.0.0.1:{port}", "--hold", "0.4")
+            rig.begin(f"tcp/127.0.0.1:{port}", "--hold", "1.5")
             rig.run(lambda: "follow" in "".join(rig.lines) and rig.commands > 60, SECONDS)
         rig.run(lambda: rig.lines[-1].startswith("open:"), SECONDS)
         commands = rig.commands
