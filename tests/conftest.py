@@ -37,7 +37,7 @@ _MOST_MEMORY = 4 << 30  # bytes of a worker
 
 _LONGEST = (
     *("actors/test_physics_warp", "services/evaluate/test_evaluate", "services/grasp/test_grasp", "e2e/test_faults"),
-    *("e2e/test_train", "services/evaluate/test_shipped", "e2e/test_security", "services/assets/test_cases"),
+    *("e2e/test_train", "e2e/test_security", "services/assets/test_cases"),
     *("services/serve/test_robot_loop", "services/assets/objects/test_import", "services/test_cli"),
     *("actors/test_rollout", "services/dataset/test_dataset", "test_congrasp"),
 )

@@ -37,11 +37,16 @@ def ceiling(row, name, episodes):
     return row.errors[name] + _SIGMAS * deviation * math.sqrt(1 / episodes + 1 / successes)
 
 
-def check(hand, names, episodes):
+@pytest.mark.timeout(600)
+@pytest.mark.slow
+@pytest.mark.parametrize("hand", pretrained_hands())
+def test_a_shipped_policy_is_as_good_as_its_figures(hand):
     """A broken bundle, or physics that it does not know, falls below these floors."""
     recorded_rows = {row.constraint: row for row in RESULTS[hand].rows if not row.group}
     policy = bundles.load(policy_file(None, hand))
-    own = Experiment(policy, exam_pool("development", episodes), episodes=episodes, hold=policy.task.hold_steps)
+    names = [name for name in policy.task.constraints if hand == "human" or name in ("heading", "affordance")]
+    pool, hold = exam_pool("development", EPISODES), policy.task.hold_steps
+    own = Experiment(policy, pool, episodes=EPISODES, hold=hold)
     for row in (result.row for result in own.run([Variation(name) for name in names])):
         record = recorded_rows[row.constraint]
         assert row.success >= farthest(record.success, row.covered, record.independent), row.constraint
@@ -49,15 +54,3 @@ def check(hand, names, episodes):
         for name, error in row.errors.items():
             if error is not None:
                 assert error <= ceiling(record, name, row.covered * row.success), name
-
-
-def test_the_human_policy_is_as_good_as_its_figure_under_headings():
-    check("human", ["heading"], 8)
-
-
-@pytest.mark.timeout(600)
-@pytest.mark.slow
-@pytest.mark.parametrize("hand", pretrained_hands())
-def test_a_shipped_policy_is_as_good_as_its_figures(hand):
-    names = bundles.load(policy_file(None, hand)).task.constraints
-    check(hand, [name for name in names if hand == "human" or name in ("heading", "affordance")], EPISODES)
