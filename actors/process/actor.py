@@ -25,6 +25,7 @@ from congrasp.common.io.journal import Journal
 from congrasp.common.policy.bundle import PolicyBundle, acting, policy_spec
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.stages import stage
+from congrasp.common.task.constraints import from_references
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.transport.base import Transport
@@ -175,7 +176,8 @@ class _Actor:
             what = f"The learner's policies have the schema {info.schema}; this actor's have {self._spec.schema}."
             raise CongraspError(what, remedy)
         self._number = zlib.crc32(link.actor.encode())
-        self._references = references if config.task.own_references else None
+        self._own_references = config.task.own_references and from_references(config.task)
+        self._references = references if self._own_references else None
         self._saved = time.monotonic()
         self._objects, bank = training_set(self._hand, config, self._number)
         if self._references:
@@ -286,7 +288,7 @@ class _Actor:
         taken = {name: getattr(rollout, name) for name in self._arrays}
         episodes, left_out = countable(finished_episodes(rollout, config.task))
         arrays = taken | episodes
-        if config.task.own_references:
+        if self._own_references:
             self._worker.renew_references()
             if self._references and time.monotonic() - self._saved > _SAVE_SECONDS:
                 save_references(self._references, self._worker.bank)

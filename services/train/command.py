@@ -245,16 +245,17 @@ def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:
     pool = load_pool(objects)
     console.print(f"Evaluating {episodes} episodes on {len(pool)} objects that no training sees …")
     policy = dataclasses.replace(bundles.load(run_dir / POLICY_FILE), task=config.task)
-    heading = Experiment(policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps)
-    (result,) = heading.run([Variation()], keep=True)
-    save_png(run_dir / EPISODE, episode_sheet(result.examples(1, 1)[-1]))
-    row = result.row
-    console.print(
-        f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval {100 * row.success_low:.1f} to "
-        f"{100 * row.success_high:.1f}): {row.links_at_removal:.1f} links touch the object when the table is removed."
-    )
-    console.print("\n[bold]One live query[/] of a policy server in a separate process:")
-    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):
+    heading = Experiment(policy, pool, episodes=episodes, batch=episodes, hold=config.task.hold_steps, measured=False)
+    with serving(run_dir / POLICY_FILE, run_dir / LOGS / "serve.log") as (endpoint, _):  # starts meanwhile
+        (result,) = heading.run([Variation()], keep=True)
+        save_png(run_dir / EPISODE, episode_sheet(result.examples(1, 1)[-1]))
+        row = result.row
+        console.print(
+            f"[bold]Success {100 * row.success:.1f} %[/] (95 % interval {100 * row.success_low:.1f} to "
+            f"{100 * row.success_high:.1f}): "
+            f"{row.links_at_removal:.1f} links touch the object when the table is removed."
+        )
+        console.print("\n[bold]One live query[/] of a policy server in a separate process:")
         episode = example_episode(HELD_OUT_SEED, config.task.hand)
         with PolicyClient(endpoint, hand=episode.hand, wait=180.0, timeout=5.0) as client:
             client.metadata()

@@ -12,7 +12,7 @@ from congrasp.actors.harvest import Grasps, renew, save_references, with_kept_re
 from congrasp.common import rotations as module
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
-from congrasp.common.task.sampling.bank import surface_of
+from congrasp.common.task.sampling.bank import SHARED, surface_of
 from congrasp.common.task.sampling.build import POSES, build_bank, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
 from tests import task as suite
@@ -84,6 +84,16 @@ def test_an_object_that_cannot_be_approached_is_named():
     lifted = dataclasses.replace(wide, rest_poses=np.array([[0, 0, -5.0, 1, 0, 0, 0]]))
     with pytest.raises(CongraspError, match="'wide' cannot be approached"):
         build_bank(HAND, TASK, [lifted], 0)
+
+
+def test_a_task_that_draws_no_references_gets_none_and_the_same_headings():
+    own = build_bank(HAND, dataclasses.replace(TASK, constraints=("heading", "affordance")), suite.OBJECTS, 0)
+    assert not np.any(own.pose_valid)
+    for name in SHARED:
+        got, whole = np.asarray(getattr(own, name)), np.asarray(getattr(suite.bank(), name))
+        assert (got.shape, got.dtype) == (whole.shape, whole.dtype), name
+        if not name.startswith(("pose", "trajectory")):
+            np.testing.assert_array_equal(got, whole, err_msg=name)
 
 
 @pytest.fixture(scope="module")

@@ -56,6 +56,11 @@ def optional(task: TaskSettings) -> tuple[Constraint, ...]:
     return tuple(constraint for constraint in known(task) if constraint.optional)
 
 
+def from_references(task: TaskSettings) -> bool:
+    """True if a constraint of the task is drawn from reference poses or trajectories."""
+    return any(constraint.from_reference for constraint in known(task))
+
+
 def blocks(task: TaskSettings) -> tuple[str, ...]:
     """Names of the gated blocks of the observation, in order; each is a bit of the mask."""
     return tuple(block for constraint in known(task) for block in constraint.blocks)
@@ -103,6 +108,7 @@ __all__ = [
     "blocks",
     "center_fingers",
     "error_specs",
+    "from_references",
     "get_constraint",
     "goal_of",
     "known",

@@ -25,7 +25,7 @@ from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import known
+from congrasp.common.task.constraints import from_references, known
 from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
 from congrasp.common.task.sampling.headings import (
@@ -54,7 +54,8 @@ _STEEPEST_UP = 0.1
 def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
     """Builds a bank for a pool of objects: headings by the paper's rules, procedural reference poses and trajectories.
 
-    Banks of large pools are cached on disk.
+    References are made only for tasks with a constraint that is drawn from them. Banks of large pools are cached on
+    disk.
 
     Args:
       hand: the hand.
@@ -95,8 +96,9 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
     columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     chosen = [columns.pop(f"chosen_{name}") for name in Headings._fields]
     surfaces = [np.stack([getattr(obj, name) for obj in objects]).astype(np.float32) for name in ("points", "normals")]
-    key = jax.random.key(seed)
-    references = _references(hand, *surfaces, *chosen, columns["rest"], key, waypoints=task.trajectory_points)
+    key, waypoints = jax.random.key(seed), task.trajectory_points
+    make = _references if from_references(task) else _no_references  # closing a hand around objects takes seconds
+    references = make(hand, *surfaces, *chosen, columns["rest"], key, waypoints=waypoints)
     own = {"renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
     own["mass"] = np.array([obj.mass for obj in objects], np.float32)
     return jax.device_put(ConstraintBank(**columns, **references, **own))
@@ -117,6 +119,21 @@ def _references(
 ) -> dict[str, Array]:
     """Poses and trajectories of the bank: the hand closed around N objects (N, P, 3) at headings (N, V, M, 3)."""
     return reference_columns(hand, _closed(hand, points, normals, position, direction, cross), rest, key, waypoints)
+
+
+def _no_references(hand: Hand, *arrays: Array, waypoints: int) -> dict[str, np.ndarray]:
+    """As many poses and trajectories as `_references` makes, none of them usable; same arguments."""
+    *_, direction, _, rest, _ = arrays
+    shape = direction.shape[:-1]
+    level = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
+    return {
+        "pose_q": np.zeros((*shape, len(hand.joints)), np.float32),
+        "pose_position": np.zeros((*shape, 3), np.float32),
+        "pose_quaternion": np.broadcast_to(level, (*shape, 4)),
+        "trajectory_position": np.zeros((*shape, waypoints, 3), np.float32),
+        "trajectory_quaternion": np.broadcast_to(level, (*shape, waypoints, 4)),
+        "pose_valid": np.zeros((*shape[:2], rest.shape[1], shape[2]), bool),
+    }
 
 
 @functools.partial(jax.jit, static_argnames=("hand", "waypoints"))

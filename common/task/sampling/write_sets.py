@@ -1,5 +1,6 @@
 """Generates constraint sets, the files read by `common.task.sampling.sets`, and describes them."""
 
+import dataclasses
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -13,6 +14,7 @@ from congrasp.common.objects import store
 from congrasp.common.objects.pool import object_scale, scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.constraints import OURS
 from congrasp.common.task.sampling.bank import ConstraintBank, rows_of
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.common.task.sampling.sets import FORMAT, MEANING, REGIONS, SUFFIX
@@ -37,7 +39,7 @@ def make_sets(
       CongraspError: see `build_bank`.
     """
     fitting = scale_objects(hand, task, objects)
-    rows = rows_of(bank or build_bank(hand, task, fitting, seed))
+    rows = rows_of(bank or build_bank(hand, dataclasses.replace(task, constraints=OURS), fitting, seed))
     scale = object_scale(hand, task)
     return [
         set_of(
