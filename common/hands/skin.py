@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
 
 from congrasp.common import mirror
 from congrasp.common.hands.flesh import Skeleton, Surface, flesh, skeleton_of, wrist_circles
@@ -17,7 +18,7 @@ from congrasp.common.hands.meshes import Meshes, own_meshes
 from congrasp.common.hands.spec import Hand, Link, link_origin
 
 _AROUND = 28  # points of a ring
-_NAIL = ((0.2, 0.0004), (0.55, 0.0004), (0.9, 0.0003), (1.0, 0.0), (0.9, -0.0012), (0.2, -0.0012))
+_NAIL = ((0.2, 0.0005), (0.55, 0.0005), (0.9, 0.0004), (1.0, 0.0001), (0.9, -0.0012), (0.2, -0.0012))
 """Rings of a nail: size as a share of the nail's outline, and height above the skin, m."""
 _NAIL_WIDTH, _NAIL_LENGTH, _NAIL_BACK = 0.90, 0.85, 0.30
 """Half width of a nail, rad about the finger; its half length, and its distance behind the centre of the fingertip, in
@@ -30,9 +31,9 @@ _SLEEVE = (
 """Rings of the sleeve: distance behind the start of the wrist, and radius in excess of the wrist's, m."""
 
 
-def nails(skeleton: Skeleton) -> list[Surface]:
-    """A nail on the back of each fingertip that a joint bends; it follows the tip's link."""
-    found = []
+def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:
+    """A nail on the back of each fingertip that a joint bends; it moves with the skin below it."""
+    found, below = [], cKDTree(skin.points)
     for chain in skeleton.chains():
         bends = np.flatnonzero(skeleton.joint_link == chain[-1])
         if not len(bends):
@@ -52,7 +53,9 @@ def nails(skeleton: Skeleton) -> list[Surface]:
             down = np.clip(place / radius, 0, np.pi / 2)[:, None]  # over the ball at the finger's end
             out = np.cos(down) * radial + np.sin(down) * along
             rings.append(end + np.minimum(place, 0)[:, None] * along + (radius + height) * out)
-        found.append(_shell(np.array(rings), chain[-1], len(skeleton.names)))
+        nail = _shell(np.array(rings), chain[-1], len(skeleton.names))
+        moves = skin.weights[below.query(nail.points)[1]].mean(0)
+        found.append(nail._replace(weights=np.tile(moves, (len(nail.points), 1))))
     return found
 
 
@@ -155,7 +158,8 @@ def skin_on(skeleton: Skeleton) -> Skin:
         skin = skin_on(skeleton._replace(hand=right, axes=mirror.axial(skeleton.axes), **own))
         return skin._replace(faces=skin.faces[:, ::-1].copy(), **_mirrored(skin, ("points", "normals", "origins")))
     if skeleton.hand in HUMAN_HANDS and _anatomical(skeleton):
-        kinds = ("flesh", flesh(skeleton)), ("sleeve", sleeve(skeleton)), *(("nail", nail) for nail in nails(skeleton))
+        soft = flesh(skeleton)
+        kinds = ("flesh", soft), ("sleeve", sleeve(skeleton)), *(("nail", nail) for nail in nails(skeleton, soft))
         material = np.concatenate([np.full(len(part.points), MATERIALS.index(kind)) for kind, part in kinds])
         firsts = np.cumsum([0, *(len(part.points) for _, part in kinds)])
         faces = [part.faces + first for (_, part), first in zip(kinds, firsts, strict=False)]

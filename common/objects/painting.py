@@ -10,6 +10,7 @@ from congrasp.common.objects.spec import Colours
 _EDGE, _MOST_FACES = 0.006, 12_000
 """Edge length below which no edge is split, m; most faces."""
 _OWN_EDGE, _OWN_MOST_FACES = 0.003, 40_000  # for coloured surfaces
+_AMONG = 8  # known points of a mean colour
 
 
 def finer(
@@ -47,7 +48,7 @@ def finer(
 
 
 def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Subdivides a mesh (V, 3), (F, 3); returns it with (V', 3) uint8 sRGB, the colours of the nearest known points.
+    """Subdivides a mesh (V, 3), (F, 3); returns it with (V', 3) uint8 sRGB (`colours_at`).
 
     Results of the last few objects are cached; the arrays are read-only.
     """
@@ -61,12 +62,20 @@ def _painted(*content: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     kinds = float, np.int64, float, np.uint8
     corners, faces, *own = (np.frombuffer(a, kind).reshape(-1, 3) for a, kind in zip(content, kinds, strict=True))
     vertices, faces = finer(corners, faces, _OWN_EDGE, _OWN_MOST_FACES)
-    found = vertices, faces, nearest(vertices, Colours(*own))
+    found = vertices, faces, colours_at(vertices, Colours(*own))
     for array in found:
         array.flags.writeable = False
     return found
 
 
-def nearest(points: np.ndarray, colours: Colours) -> np.ndarray:
-    """(n, 3) uint8 sRGB at points (n, 3) of a surface."""
-    return colours.values[cKDTree(colours.points).query(points)[1]]
+def colours_at(points: np.ndarray, colours: Colours) -> np.ndarray:
+    """(n, 3) uint8 sRGB at points (n, 3) of a surface: means of the nearest known points, by their distances.
+
+    The single nearest one would give edges between two colours teeth.
+    """
+    distance, index = cKDTree(colours.points).query(points, k=min(_AMONG, len(colours.points)))
+    distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
+    width = np.maximum(distance.mean(1, keepdims=True), 1e-9)
+    weight = np.exp(-((distance / width) ** 2))
+    mean = np.einsum("nk,nkd->nd", weight / weight.sum(1, keepdims=True), colours.values[index])
+    return np.round(mean).astype(np.uint8)

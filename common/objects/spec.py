@@ -43,7 +43,7 @@ class Piece:
 
 
 class Colours(NamedTuple):
-    """Colours of surface points; elsewhere the colour is that of the nearest point."""
+    """Colours of surface points; elsewhere the colour is a mean of the nearest ones (`painting.colours_at`)."""
 
     points: np.ndarray
     """(P, 3) float32, m."""

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from congrasp.common.objects.painting import nearest
+from congrasp.common.objects.painting import colours_at
 from congrasp.services.export.frames import COLOURS, OBJECT, arm_meshes, bodies, facts
 from congrasp.services.export.motion_file import GraspMotion, joint_trajectory, robot_joints
 from congrasp.services.export.urdf import robot_urdf
@@ -75,7 +75,7 @@ def _topics(
     corners = motion.object_vertices[motion.object_faces.ravel()]
     thing = _marker(OBJECT, motion.object, 0, corners, COLOURS[OBJECT])
     if motion.colours:
-        thing["colors"] = [_colour(each) for each in (nearest(corners, motion.colours) / 255).tolist()]
+        thing["colors"] = [_colour(each) for each in (colours_at(corners, motion.colours) / 255).tolist()]
     topics: dict[str, tuple[str, Sequence[_Content]]] = {
         "/robot_description": ("std_msgs/msg/String", [{"data": robot_urdf(motion)}]),
         "/joint_trajectory": ("trajectory_msgs/msg/JointTrajectory", [trajectory]),

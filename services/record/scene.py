@@ -27,7 +27,7 @@ from congrasp.common.hands.flesh import skeleton_of
 from congrasp.common.hands.mjcf import WRIST_JOINTS, mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand, Link, capsule_ends
-from congrasp.common.objects.painting import nearest
+from congrasp.common.objects.painting import colours_at
 from congrasp.common.objects.spec import Colours
 from congrasp.common.objects.store import LARGEST
 from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
@@ -244,7 +244,7 @@ def _static_scene(
     body = _add_triangles(entity, arrays["visual_vertices"], arrays["visual_faces"], _OBJECT)
     if "colour_values" in arrays:
         own = Colours(arrays["colour_points"], arrays["colour_values"])
-        for colour in (nearest(arrays["visual_vertices"], own) / 255).tolist():
+        for colour in (colours_at(arrays["visual_vertices"], own) / 255).tolist():
             _set_colour(body.colors.add(), (*colour, 1.0))
     text = _entity(update, "label", frame, now).texts.add(billboard=True, font_size=0.015, text=_label(meta))
     _set_vector(text.pose.position, [0.0, 0.0, arrays["visual_vertices"][:, 2].max() + 0.12])

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from congrasp.common.objects import painting
-from congrasp.common.objects.painting import finer, nearest, painted
+from congrasp.common.objects.painting import colours_at, finer, painted
 from congrasp.common.objects.spec import Colours
 
 
@@ -33,15 +33,24 @@ def test_a_mesh_of_many_faces_is_left_as_it_is():
     np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-6)
 
 
-def test_points_take_the_colour_of_the_nearest():
-    colours = Colours(np.array([[0, 0, -1], [0, 0, 1]], np.float32), np.array([[255, 0, 0], [0, 0, 255]], np.uint8))
-    np.testing.assert_array_equal(
-        nearest(np.array([[0.3, 0, 0.2], [0.0, 0.9, -0.1]]), colours), [[0, 0, 255], [255, 0, 0]]
-    )
-    box = trimesh.creation.box((0.02, 0.02, 0.02))
-    vertices, _, found = painted(box.vertices, box.faces, colours)
-    above = vertices[:, 2] > 1e-6
-    assert (found[above] == [0, 0, 255]).all() and above.sum() > 8
+RED, BLUE = (255, 0, 0), (0, 0, 255)
+
+
+def test_a_colour_is_a_mean_of_those_nearby():
+    """At distances of 1 and 2 m, 1.5 on average: exp(-(1 / 1.5)^2) = .6412 to exp(-(2 / 1.5)^2) = .1690, so 79.1 %."""
+    colours = Colours(np.array([[0, 0, -1], [0, 0, 2]], np.float32), np.array([RED, BLUE], np.uint8))
+    np.testing.assert_array_equal(colours_at(np.zeros((1, 3)), colours), [[202, 0, 53]])
+
+
+def test_an_edge_between_two_colours_has_no_teeth():
+    """Along the edge the colour hardly changes, a centimetre away it is pure."""
+    rng = np.random.default_rng(0)
+    points = np.c_[rng.uniform(0, 0.1, (8000, 2)), np.zeros(8000)].astype(np.float32)
+    colours = Colours(points, np.where(points[:, :1] < 0.05, RED, BLUE).astype(np.uint8))
+    along = np.linspace(0.01, 0.09, 300)
+    red = [colours_at(np.c_[np.full(300, x), along, np.zeros(300)], colours)[:, 0].astype(float) for x in (0.04, 0.05)]
+    assert (red[0] == 255).all() and abs(red[1].mean() - 127.5) < 20
+    assert red[1].std() < 60  # of the nearest points alone 127
 
 
 def test_a_painted_mesh_is_cut_once_until_it_or_its_colours_change(monkeypatch):

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.flesh import surface_net
 from congrasp.common.hands.mjcf import mujoco_link_poses
-from congrasp.common.hands.skin import skin_of
+from congrasp.common.hands.skin import MATERIALS, skin_of
 from congrasp.common.hands.spec import Hand
 
 HANDS = ("human", "allegro", "sharpa")
@@ -40,6 +41,18 @@ def test_a_surface_net_of_a_ball_is_a_ball() -> None:
     assert mesh.is_volume and mesh.euler_number == 2
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * 5.3**3, rel=0.06)
     assert np.abs(np.linalg.norm(mesh.vertices, axis=-1) - 5.3).max() < 0.3
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_nails_lie_on_the_skin_however_far_the_fingers_bend(share: float) -> None:
+    """By the nearest point of the flesh and its normal; one that only followed its link sank by half a millimetre."""
+    hand = get_hand("human")
+    skin, (points, normals) = skin_of(hand), posed(hand, share * np.array([joint.upper for joint in hand.joints]))
+    flesh, nail = (skin.material == MATERIALS.index(kind) for kind in ("flesh", "nail"))
+    below = cKDTree(points[flesh]).query(points[nail])[1]
+    height = np.einsum("ni,ni->n", points[nail] - points[flesh][below], normals[flesh][below])
+    rings = height.reshape(5, -1)[:, :84]  # of each nail the three rings on top
+    assert (rings.mean(1) > 1e-4).all() and (rings.mean(1) < 1e-3).all()
 
 
 @pytest.mark.parametrize("name", HANDS)
