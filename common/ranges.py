@@ -21,6 +21,7 @@ _TASK: dict[str, tuple[float, float]] = {
     "object_scale": (0.0, 100.0),
     "control_dt": (1e-4, 1.0),
     "substeps": (1, 100),
+    "impratio": (0.1, 10_000.0),
     "approach_steps": (1, 10_000),
     "hold_steps": (1, 10_000),
     "hold_steps_max": (1, 10_000),

@@ -70,10 +70,10 @@ def scene_spec(hand: Hand, task: TaskConfig) -> mujoco.MjSpec:
     spec.option.timestep = task.control_dt / task.substeps
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Held objects creep out of every grasp within seconds with pyramidal friction cones. With elliptic ones they do
-    # too unless friction is much harder than normal forces and the solver converges: with impratio 100 eight iterations
-    # are too few (docs/notes/training.md).
+    # too unless friction is much stiffer than normal forces and the solver converges: with an impratio of 100 eight
+    # iterations are too few (docs/notes/training.md).
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 100.0
+    spec.option.impratio = task.impratio
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.iterations = 24
     spec.option.ls_iterations = 40

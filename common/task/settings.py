@@ -119,6 +119,10 @@ class TaskSettings:
     contact_time: float = CONTACT_TIME
     """Time constant of the hand's contacts, s; at least two physics steps. At 0.006 a grasp's contacts are about 1 mm
     deep."""
+    impratio: float = 100.0
+    """How much stiffer friction is than normal contact forces, in training (MuJoCo's option). With 1 a control step in
+    contact takes half the time on a CPU, but objects creep out of every grasp within seconds. Evaluations and grasps
+    always have the default."""
     torsional_friction: float = 0.004
     """Torsional friction of contacts of fingertips with the object (condim 4), m: the sliding friction times about two
     thirds of the contact patch's radius. 0: point contacts. The engine `jax` supports point contacts only."""

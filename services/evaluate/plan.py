@@ -41,7 +41,7 @@ def two_seconds(task: TaskConfig) -> int:
 
 
 def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) -> TaskConfig:
-    """Returns the task with `hold` steps without the table, unscaled masses, one friction and no disturbances.
+    """Returns the task with `hold` steps without the table, unscaled masses, one stiff friction and no disturbances.
 
     Servo gains are nominal, and the tracker is perfect. Rates are therefore comparable between policies trained with
     different ranges.
@@ -53,6 +53,7 @@ def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) ->
         end_when_fallen=False,
         mass_range=(1.0, 1.0),
         friction_range=(friction, friction),
+        impratio=TaskConfig.impratio,
         gain_range=(1.0, 1.0),
         sensing=SensingConfig(),
     )

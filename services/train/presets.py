@@ -137,6 +137,7 @@ QUICKSTART = RunConfig(
         approach_steps=50,
         back_off_range=(0.15, 0.15),
         initial_speed=0.0,
+        impratio=1.0,
         # The full task's hands close slowly, which takes several times as many steps to learn.
         control=ControlConfig(approach_position_limit=0.04, closing_position_limit=0.04),
     ),
@@ -175,6 +176,8 @@ def easier(config: RunConfig) -> list[str]:
         words.append(f"no episode has another constraint ({', '.join(absent)})")
     if task.control.closing_position_limit > full.task.control.closing_position_limit:
         words.append("hands may close fast")
+    if task.impratio < full.task.impratio:
+        words.append("friction is soft")
     if task.approach_steps < full.task.approach_steps:
         words.append(f"the table is removed after {task.approach_steps} control steps, not {full.task.approach_steps}")
     if not config.objects.folder and config.objects.count < full.objects.count:

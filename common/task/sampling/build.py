@@ -361,6 +361,7 @@ MOST_FILES = 8
 """Most banks in the cache; that of 800 objects takes about 50 MB."""
 _IRRELEVANT = (
     *("reward", "control", "mass_range", "friction_range", "gain_range", "hold_steps", "drop_height", "disturbed"),
+    "impratio",
     *("p_", "observation", "history", "sensing", "surface_normals"),
 )
 """Prefixes of the settings that no bank depends on."""

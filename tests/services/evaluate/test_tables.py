@@ -1,5 +1,6 @@
 """Tables whose rows are levels: what each level changes, and that all have the same episodes otherwise."""
 
+import contextlib
 import dataclasses
 import math
 from unittest import mock
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from congrasp.actors.physics.scene import scene_spec
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task import sensing
 from congrasp.common.task.config import TaskConfig
@@ -18,6 +20,7 @@ from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.plan import protocol
 from congrasp.services.evaluate.plots import draw_noise
 from congrasp.services.evaluate.tables import MASSES, NOISE, PEERS, SENSING, Load, Noise, payload
+from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.train.presets import TRACKERS
 from tests import draws, task
 from tests.task import HAND, OBJECTS
@@ -110,6 +113,14 @@ def test_a_level_is_what_it_says(bank):
 def test_a_policy_observes_trackers_only_there():
     ranged = dataclasses.replace(TASK, observation="tracked", sensing=TRACKERS)
     assert protocol(ranged, 25).sensed and not TASK.sensed and SENSING[0].task(TASK).sensed
+
+
+def test_friction_is_stiff_whatever_the_training_s_was():
+    """One option of the scene, in training alone."""
+    soft = dataclasses.replace(TASK, impratio=1.0)
+    assert [scene_spec(HAND, one).option.impratio for one in (TASK, soft, protocol(soft, 25))] == [100.0, 1.0, 100.0]
+    with contextlib.closing(Grasper(dataclasses.replace(task.policy(), task=soft), attempts=1)) as grasper:
+        assert grasper.task.impratio == 100.0
 
 
 def test_a_load_sets_the_mass_of_objects_and_the_friction_of_the_same_episodes():
