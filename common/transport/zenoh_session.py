@@ -268,6 +268,19 @@ class Sessions:
         with self._changed:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
+    def watch_revocations(self, credentials: Credentials, period: float, known: frozenset[str] | None) -> None:
+        """Checks for revoked certificates in a thread, until the sessions are closed.
+
+        Args:
+          credentials: credentials of this process.
+          period: seconds between two checks.
+          known: the certificates that were revoked when a listener's sessions were opened; None if they connect.
+        """
+        if known is None:
+            self.start(heed_revocations, self, credentials, period)
+        else:
+            self.start(follow_revocations, self, credentials, known, period)
+
     def peers(self) -> set[str]:
         """Common names of the certificates of connected peers."""
         return {str(link.auth_identifier) for session in list(self._open.values()) for link in session.info.links()}

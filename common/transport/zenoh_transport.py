@@ -262,11 +262,8 @@ class ZenohTransport(Transport):
         except BaseException:
             self.close()
             raise
-        if listen and credentials:
-            follow = zenoh_session.follow_revocations
-            self._sessions.start(follow, self._sessions, credentials, known, revocation_seconds)
-        elif credentials:
-            self._sessions.start(zenoh_session.heed_revocations, self._sessions, credentials, revocation_seconds)
+        if credentials:
+            self._sessions.watch_revocations(credentials, revocation_seconds, known if listen else None)
 
     def serve(
         self,

@@ -124,7 +124,7 @@ class PPO:
             term and holds the state before the update.
           CongraspError: there are more minibatches than transitions.
         """
-        layout, config = self._spec.layout, self._config
+        config = self._config
         if batch["reward"].size < config.minibatches:
             raise CongraspError(
                 f"A batch of {batch['reward'].size} transitions cannot be split into {config.minibatches} minibatches.",
@@ -137,20 +137,15 @@ class PPO:
         frozen = {name: _first(getattr(state, name), found, mesh) for name, found in moments.items()}
         given = _Given(
             batch=arrays,
-            observations=normalizer.observation_affine(frozen["observation"], layout),
+            observations=normalizer.observation_affine(frozen["observation"], self._spec.layout),
             privileged=normalizer.privileged_affine(frozen["privileged"]) if "privileged" in frozen else None,
             returns=normalizer.value_affine(state.value),
-            hyper={name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)}
-            | {
-                "kl_target": config.kl_target_at(state.version, self._updates),
-                "noise_kept": config.noise_kept_at(state.version, self._updates),
-                "least_std": config.least_std_at(state.version, self._updates),
-            },
+            hyper=self._hyperparameters(state.version),
         )
         learnt, returns, failure, scalars = _optimise(
             *shard(state[:_ON_DEVICE], mesh),
             given,
-            layout=layout,
+            layout=self._spec.layout,
             epochs=config.epochs,
             minibatches=config.minibatches,
             mesh=mesh,
@@ -170,6 +165,16 @@ class PPO:
             **{name: normalizer.merge(getattr(state, name), *_ranks(found)) for name, found in moments.items()},
         )
         return state, {name: float(scalar) for name, scalar in scalars.items()}
+
+    def _hyperparameters(self, version: int) -> dict[str, Any]:
+        """Hyperparameters of the update of a version that are arguments of the compiled program."""
+        config = self._config
+        fixed = {name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)}
+        return fixed | {
+            "kl_target": config.kl_target_at(version, self._updates),
+            "noise_kept": config.noise_kept_at(version, self._updates),
+            "least_std": config.least_std_at(version, self._updates),
+        }
 
 
 @optax.inject_hyperparams

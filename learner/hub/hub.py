@@ -103,9 +103,7 @@ class LearnerHub:
         """Reason why the run cannot be saved, and what its end would cost; part of the status."""
         self._audit, self._log = audit, log
         self._rate_limit, self._pull_limit = RateLimit(), RateLimit(per_second=_PIECES, most=4 * _PIECES)
-        if durable is not None:
-            self._restore(durable)
-        self._recovered: Recovered | None = self._begin()
+        self._recovered: Recovered | None = self._begin(durable)
         self._serve()
 
     def has_batch(self, count: int, timeout: float) -> bool:
@@ -259,9 +257,14 @@ class LearnerHub:
         transport.watch_alive(self.keys.everyone, self._on_alive)
         transport.declare_alive(self.keys.alive("learner", self._name, self.session_id))
 
-    def _begin(self) -> Recovered:
-        """Reads the data of earlier sessions from disk, and records the start of this one."""
+    def _begin(self, durable: Mapping[str, Any] | None) -> Recovered:
+        """Restores a checkpoint's part, reads the data of earlier sessions, and records the start of this one."""
         staleness, log = self._staleness, self._log
+        if durable is not None:
+            if durable["run_id"] != self.run_id:
+                raise CongraspError(f"The checkpoint has run id {durable['run_id']}, not {self.run_id}.")
+            staleness.restore(durable["counters"], durable["version"])
+            self._sequences.restore(durable)
         version = staleness.version
         recovered = Recovered([], []) if log is None else log.recover(version, self.run_id, self._form, self._schema)
         if self._audit is not None:
@@ -269,12 +272,6 @@ class LearnerHub:
             session = self.session_id, self.run_id, version, staleness.max_staleness
             staleness.note_undone(self._audit.begin(*session, kept=kept))
         return recovered
-
-    def _restore(self, durable: Mapping[str, Any]) -> None:
-        if durable["run_id"] != self.run_id:
-            raise CongraspError(f"The checkpoint has run id {durable['run_id']}, not {self.run_id}.")
-        self._staleness.restore(durable["counters"], durable["version"])
-        self._sequences.restore(durable)
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1

@@ -76,12 +76,7 @@ def set_of(
     # The bank pads an object's resting poses to the most of any object by repetition.
     again = np.flatnonzero((row.rest[1:] == row.rest[0]).all(-1))
     rests = int(again[0]) + 1 if len(again) else len(row.rest)
-    allowed = np.zeros((len(REGIONS), rests, row.heading_position.shape[1]), bool)
-    back = np.zeros(allowed.shape, np.float32)
-    for v, r in np.ndindex(allowed.shape[:2]):
-        if v == 0 or row.has_affordance[r] or not row.avoid.any():
-            allowed[v, r, row.heading_index[v, r]] = True
-            back[v, r, row.heading_index[v, r]] = row.heading_back[v, r]
+    allowed, back = _allowed_headings(row, rests)
     if pose_training is None:
         pose_training = for_training(row.pose_q.shape[1])
     if heading_training is None:
@@ -107,7 +102,23 @@ def set_of(
         "visual/vertices": np.asarray(obj.visual_vertices, np.float32),
         "visual/faces": np.asarray(obj.visual_faces, np.int32),
     }
-    meta: dict[str, Any] = {
+    return Message(arrays, {**_description(hand, obj, seed), **(about or {})})
+
+
+def _allowed_headings(row: ConstraintBank, rests: int) -> tuple[np.ndarray, np.ndarray]:
+    """Headings that a row allows in its first R resting poses: (V, R, H) bool, and the distances back in m."""
+    allowed = np.zeros((len(REGIONS), rests, row.heading_position.shape[1]), bool)
+    back = np.zeros(allowed.shape, np.float32)
+    for v, r in np.ndindex(allowed.shape[:2]):
+        if v == 0 or row.has_affordance[r] or not row.avoid.any():
+            allowed[v, r, row.heading_index[v, r]] = True
+            back[v, r, row.heading_index[v, r]] = row.heading_back[v, r]
+    return allowed, back
+
+
+def _description(hand: Hand, obj: GraspObject, seed: int) -> dict[str, Any]:
+    """Metadata of a set of an object that was not scaled."""
+    return {
         "kind": "constraints",
         "format": FORMAT,
         "hand": hand.name,
@@ -122,9 +133,7 @@ def set_of(
         "quaternions": "(w, x, y, z)",
         "object_frame": "origin at the centre of mass, orientation of the object file, lengths times object_scale",
         "arrays": MEANING,
-        **(about or {}),
     }
-    return Message(arrays, meta)
 
 
 def for_training(count: int, seed: int | None = None) -> np.ndarray:
