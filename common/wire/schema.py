@@ -34,7 +34,7 @@ class ArraySpec:
 
 Schema = Mapping[str, ArraySpec]
 """Arrays by name; their shapes consist of T control steps, B worlds, D observation and A action sizes, P privileged
-inputs of the critic, and S inputs of a teacher (`common.task.teaching`)."""
+inputs of the critic, and S inputs of a teacher (`common.task.privileged`)."""
 
 F32 = ("float32",)
 _OBSERVATION = ("float16", "float32")
@@ -55,7 +55,7 @@ PRIVILEGED: Schema = {
 }
 """Additional arrays for a critic with privileged inputs (`common.task.privileged`)."""
 TAUGHT: Schema = {"teacher_observation": ArraySpec(_OBSERVATION, ("T", "B", "S"))}
-"""Additional arrays for a teacher that labels the rollout (`common.task.teaching`)."""
+"""Additional arrays for a teacher that labels the rollout (`common.task.privileged`)."""
 RECORDABLE: Schema = {**RECORDED, **PRIVILEGED, **TAUGHT}
 """All recordable arrays."""
 

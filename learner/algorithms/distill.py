@@ -2,7 +2,7 @@
 
 The student acts, and the teacher, which observes the full state, labels each state with its action (DAgger:
 Ross et al. 2011, arXiv 1011.0686, without its mixture of the two and without keeping old states). The student's mean is
-regressed on the action that gives the teacher's targets (`common.task.teaching`), in units of the teacher's standard
+regressed on the action that gives the teacher's targets (`common.task.privileged`), in units of the teacher's standard
 deviation: up to a constant the KL divergence from the student to the teacher, whose standard deviation the student
 keeps. The critic learns nothing.
 """
@@ -28,11 +28,16 @@ from congrasp.common.policy.network import Layout, Params
 from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task.config import ControlConfig, TaskConfig
-from congrasp.common.task.teaching import extra, student_action
+from congrasp.common.task.privileged import extra, student_action
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import RECORDABLE, Schema
-from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
-from congrasp.learner.batch import partition_specs
+from congrasp.learner.algorithms.protocol import (
+    LearnedPolicy,
+    NonFiniteUpdate,
+    TrainState,
+    partition_specs,
+    random_policy,
+)
 from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 _SCHEMA = {name: RECORDABLE[name] for name in ("observation", "teacher_observation")}

@@ -30,8 +30,13 @@ from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.task.types import Array
 from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
 from congrasp.learner.algorithms import gae, losses
-from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
-from congrasp.learner.batch import partition_specs
+from congrasp.learner.algorithms.protocol import (
+    LearnedPolicy,
+    NonFiniteUpdate,
+    TrainState,
+    partition_specs,
+    random_policy,
+)
 from congrasp.learner.distributed.collectives import AXIS, REPLICATED, Collectives, shard, shard_map, unreplicate
 
 _SPECS = {**partition_specs(RECORDABLE), "lag": PartitionSpec(AXIS)}

@@ -30,8 +30,7 @@ from congrasp.common.wire.messages import (
 )
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.deduplication import SequenceTable
-from congrasp.learner.hub.members import Members
-from congrasp.learner.hub.rate_limit import DAMAGED, RateLimit
+from congrasp.learner.hub.limits import DAMAGED, Members, RateLimit
 from congrasp.learner.hub.staleness import Owner, StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import Identity, Recovered, WriteAheadLog

@@ -18,8 +18,7 @@ import numpy as np
 from congrasp.actors import initial
 from congrasp.actors.initial import PlannedEpisodes
 from congrasp.common.hands import get_hand
-from congrasp.common.io.caches import keep, read_kept
-from congrasp.common.io.files import cache_folder
+from congrasp.common.io.files import cache_folder, keep, read_kept
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles

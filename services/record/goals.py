@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.task.constraints import CONSTRAINTS
-from congrasp.common.task.constraints.markers import Marker
+from congrasp.common.task.constraints.base import Marker
 
 _LATEST = 1e4  # s
 _OLDER = ("affordance", "pose_finger", "pose_wrist", "trajectory")

@@ -21,7 +21,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys, check_name
 from congrasp.common.wire.codec import Message, encode, finite
 from congrasp.common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
-from congrasp.learner.hub.rate_limit import certificate
+from congrasp.learner.hub.limits import certificate
 from congrasp.services.record.channels import (
     ROLLOUT_SCHEMA,
     Entry,

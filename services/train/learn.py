@@ -18,7 +18,7 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.memory import PairTransport
 from congrasp.learner.algorithms import make_algorithm
-from congrasp.learner.batch import rollout_form
+from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run, has_checkpoints

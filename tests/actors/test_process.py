@@ -32,7 +32,7 @@ from congrasp.common.wire.codec import encode
 from congrasp.common.wire.messages import EPISODE, validate
 from congrasp.common.wire.schema import PRIVILEGED, RECORDED
 from congrasp.learner.algorithms import make_algorithm
-from congrasp.learner.batch import rollout_form
+from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 

@@ -16,8 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
-from congrasp.common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Weight
-from congrasp.common.task.constraints.markers import Polyline
+from congrasp.common.task.constraints.base import (
+    Constraint,
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Polyline,
+    Weight,
+)
 from tests.conftest import ROOT
 
 

@@ -18,8 +18,7 @@ from congrasp.common.hands import kinematics
 from congrasp.common.hands.closure import CENTER, Outline, outline
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.caches import keep, read_kept, source_digest
-from congrasp.common.io.files import cache_folder
+from congrasp.common.io.files import cache_folder, keep, read_kept, source_digest
 from congrasp.common.objects import store
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.closure import CENTER, outline
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import distinct_names, safe_name
 from congrasp.common.objects import store

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
 from congrasp.common.task.sampling.build import HEADINGS
 from congrasp.common.task.sampling.sets import bank_of
