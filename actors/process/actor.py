@@ -29,7 +29,7 @@ from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.transport.base import Transport
 from congrasp.common.wire.codec import Message, finite
-from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, TAUGHT
+from congrasp.common.wire.messages import PRIVILEGED, RECORDABLE, TAUGHT
 
 
 class Followed(NamedTuple):

@@ -30,7 +30,7 @@ from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task.config import ControlConfig, TaskConfig
 from congrasp.common.task.privileged import extra, student_action
 from congrasp.common.task.types import Array
-from congrasp.common.wire.schema import RECORDABLE, Schema
+from congrasp.common.wire.messages import RECORDABLE, Schema
 from congrasp.learner.algorithms.protocol import (
     LearnedPolicy,
     NonFiniteUpdate,

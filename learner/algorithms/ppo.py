@@ -28,7 +28,7 @@ from congrasp.common.policy.bundle import PolicySpec
 from congrasp.common.policy.network import Layout, Params
 from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.task.types import Array
-from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
+from congrasp.common.wire.messages import PRIVILEGED, RECORDABLE, RECORDED, Schema
 from congrasp.learner.algorithms import gae, losses
 from congrasp.learner.algorithms.protocol import (
     LearnedPolicy,

@@ -23,7 +23,7 @@ from congrasp.common.policy.normalizer import Statistics
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.privileged import extra
 from congrasp.common.task.types import Array
-from congrasp.common.wire.schema import TAUGHT, WORLDS, RolloutForm, Schema
+from congrasp.common.wire.messages import TAUGHT, WORLDS, RolloutForm, Schema
 from congrasp.learner.distributed.collectives import AXIS
 
 
@@ -71,7 +71,7 @@ class Algorithm(Protocol):
 
     @property
     def batch_schema(self) -> Schema:
-        """Arrays of a rollout used for learning, a subset of `common.wire.schema.RECORDABLE`.
+        """Arrays of a rollout used for learning, a subset of `common.wire.messages.RECORDABLE`.
 
         They determine what actors send, what the hub admits, warm-up batches, and how a batch is sharded over ranks.
         """

@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.motion_file import GraspMotion, joint_trajectory, robot_joints
-from congrasp.services.record.moved_arm import MovedArm
+from congrasp.services.record.episode import MovedArm
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.render import Film, save_episode_video
-from congrasp.services.viz.scene import Camera, Shape
-from congrasp.services.viz.shapes import arm_shapes, fit, shape_points
+from congrasp.services.viz.shapes import Camera, Shape, arm_shapes, fit, shape_points
 from congrasp.services.viz.sheets import save_png
 from congrasp.services.viz.views import episode_shapes
 

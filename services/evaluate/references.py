@@ -35,7 +35,7 @@ from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.plan import RowPlan, batches, protocol
 
 HELD_OUT = POSES // 5
-"""References of an object and region that its constraint set holds out (`write_sets`), the last ones."""
+"""References of an object and region that its constraint set holds out (`sampling.sets`), the last ones."""
 _ATTEMPTS = 3 * POSES
 """Most episodes of an object and region; the grasps found by then are used."""
 _SPARE = 1.25

@@ -26,7 +26,7 @@ from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.wire.codec import Message, encode
-from congrasp.services.arm.options import ArmOptions
+from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions

@@ -29,8 +29,7 @@ from congrasp.common.task.types import Surface
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import encode
-from congrasp.common.wire.messages import EPISODE, validate
-from congrasp.common.wire.schema import PRIVILEGED, RECORDED
+from congrasp.common.wire.messages import EPISODE, PRIVILEGED, RECORDED, validate
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.hub.hub import LearnerHub

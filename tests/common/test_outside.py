@@ -220,7 +220,7 @@ def file():
 
 def marker():
     """What pictures, recordings and the studio's player draw of it."""
-    from congrasp.services.record.goals import markers
+    from congrasp.services.record.episode import markers
 
     heading = {"position": np.zeros(3), "direction": np.array([0.0, 0.0, -1.0]), "cross": np.array([1.0, 0.0, 0.0])}
     arrays = {f"goal/heading_{name}": value for name, value in heading.items()}

@@ -11,7 +11,7 @@ import optax
 
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.normalizer import Statistics
-from congrasp.common.wire.schema import RECORDED
+from congrasp.common.wire.messages import RECORDED
 from congrasp.learner.algorithms import gae
 from congrasp.learner.algorithms.protocol import (
     LearnedPolicy,

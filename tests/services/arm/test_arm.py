@@ -15,16 +15,15 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands import get_hand
+from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import SPEED, arm_file, load_arm
 from congrasp.services.arm.files import CSV, PICTURE, TRAJECTORY
-from congrasp.services.arm.options import ArmOptions
 from congrasp.services.arm.planner import ANGLE, POSITION, ArmPlanner, Path, follow
 from congrasp.services.arm.robot import Infeasible, build_robot, default_mount
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
-from congrasp.services.export.motion_file import load_motion, robot_joints
-from congrasp.services.export.motion_formats import pick_motion
+from congrasp.services.export.motion_file import load_motion, pick_motion, robot_joints
 from tests.services.conftest import quick_imports
 
 LINKS = [("0 0 1", 0.3, 170), ("0 1 0", 0.0, 120), ("0 0 1", 0.4, 170), ("0 1 0", 0.0, 140), ("0 0 1", 0.4, 170),

@@ -33,8 +33,7 @@ from congrasp.services.viz.render import (
     render_episode_frames,
     save_episode_video,
 )
-from congrasp.services.viz.scene import Camera, Shape, between
-from congrasp.services.viz.shapes import arrow, beads, capsule_shapes, fit, skin_colours
+from congrasp.services.viz.shapes import Camera, Shape, arrow, beads, between, capsule_shapes, fit, skin_colours
 from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
 from congrasp.services.viz.triangles import cut, smooth_corners
 from congrasp.services.viz.views import TOUCHING, View, camera_of, episode_shapes, view_of, views
