@@ -7,9 +7,12 @@ import logging
 import os
 import pathlib
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.wire.codec import Message, decode, encode
+
+if TYPE_CHECKING:  # commands that read no message start without NumPy
+    from congrasp.common.wire.codec import Message
 
 _log = logging.getLogger(__name__)
 
@@ -105,8 +108,10 @@ def source_digest(*packages: ModuleType) -> str:
     return digest.hexdigest()[:16]
 
 
-def read_kept(path: pathlib.Path) -> Message | None:
+def read_kept(path: pathlib.Path) -> "Message | None":
     """Reads a cached message if it exists and is intact, and marks it as used now."""
+    from congrasp.common.wire.codec import decode
+
     try:
         message = decode(path.read_bytes(), max_bytes=path.stat().st_size)
         os.utime(path)
@@ -115,11 +120,13 @@ def read_kept(path: pathlib.Path) -> Message | None:
     return message
 
 
-def keep(path: pathlib.Path, message: Message, most: int) -> None:
+def keep(path: pathlib.Path, message: "Message", most: int) -> None:
     """Writes a message to the cache, and removes all but the `most` last used files of its folder.
 
     A full disk or a folder without write permission is ignored: the next run recomputes the entry.
     """
+    from congrasp.common.wire.codec import encode
+
     with contextlib.suppress(CongraspError, OSError):
         write_atomically(path, encode(message))
         files = sorted(path.parent.glob(f"*{path.suffix}"), key=lambda file: file.stat().st_mtime)

@@ -23,11 +23,9 @@ from congrasp.common.task import observation
 from congrasp.common.task.constraints.base import ObservationField, Scene
 from congrasp.common.task.control import Guided, guided, wrist_lead
 from congrasp.common.task.sensing import Sensors
-from congrasp.common.task.settings import ControlConfig, TaskSettings
+from congrasp.common.task.settings import GRAVITY, ControlConfig, TaskSettings
 from congrasp.common.task.types import Array
 
-GRAVITY = 9.81
-"""m/s^2."""
 MOST_LOAD = 10.0
 """Upper bound of `load`."""
 

@@ -8,6 +8,9 @@ from typing import Literal
 
 from congrasp.common.hands.spec import CONTACT_TIME
 
+GRAVITY = 9.81
+"""m/s^2."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ControlConfig:

@@ -5,6 +5,7 @@ The learner's process, its hub, checkpoints and ranks use algorithms only throug
 ranks shard it.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -23,8 +24,8 @@ from congrasp.common.policy.normalizer import Statistics
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.privileged import extra
 from congrasp.common.task.types import Array
-from congrasp.common.wire.messages import TAUGHT, WORLDS, RolloutForm, Schema
-from congrasp.learner.distributed.collectives import AXIS
+from congrasp.common.wire.messages import RECORDED, TAUGHT, WORLDS, RolloutForm, Schema
+from congrasp.learner.distributed.collectives import AXIS, Collectives, shard_map
 
 
 class LearnedPolicy(NamedTuple):
@@ -148,3 +149,18 @@ def partition_specs(schema: Schema) -> dict[str, PartitionSpec]:
         name: PartitionSpec(*(AXIS if size == WORLDS else None for size in spec.shape or ()))
         for name, spec in schema.items()
     }
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def gathered_moments(observation: Array, *, mesh: Mesh | None) -> Statistics:
+    """Moments of each rank's observations (T, B, D), stacked; `of_ranks` splits them."""
+
+    def program(observation: Array) -> Statistics:
+        return Collectives(mesh).gather(normalizer.moments(observation, event_axes=1))
+
+    return shard_map(mesh, program, partition_specs(RECORDED)["observation"])(observation)
+
+
+def of_ranks(gathered: Statistics) -> list[Statistics]:
+    """Splits statistics stacked by `Collectives.gather` into those of each rank."""
+    return [Statistics(*(entry[i] for entry in gathered)) for i in range(len(gathered.count))]

@@ -52,13 +52,13 @@ class RateLimit:
     def admits(self, key: str) -> bool:
         """True if a request under an actor's key may be processed; counts it otherwise."""
         with self._lock:
-            fine = self._level(_account(key)) > 0
+            fine = self._level(certificate(sender(key))) > 0
             self.rejected += not fine
             return fine
 
     def charge(self, key: str, size: int) -> None:
         """Charges a useless request of `size` bytes."""
-        name = _account(key)
+        name = certificate(sender(key))
         with self._lock:
             self._levels[name] = self._level(name) - 1 - size / self._unit, self._clock()
             self._levels.move_to_end(name)
@@ -123,8 +123,9 @@ def certificate(actor: str) -> str:
     return actor.partition(".")[0]
 
 
-def _account(key: str) -> str:
-    return certificate(key.rpartition("/")[2])
+def sender(key: str) -> str:
+    """Returns the actor of a key, which access control may reserve for it."""
+    return key.rpartition("/")[2]
 
 
 _EACH = 64

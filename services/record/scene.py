@@ -32,10 +32,10 @@ from congrasp.common.objects.store import LARGEST
 from congrasp.common.task.constraints.base import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import EPISODE, validate
-from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
 from congrasp.services.record.episode import MovedArm, arm_of_episode, markers
 from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE, HEADING, OBJECT, TABLE, WAYPOINT, Colour, nearest
 from congrasp.services.record.palette import MATERIALS as COLOURS
+from congrasp.services.record.writer import Entry, JsonChannels, opaque_channel, protobuf_channel
 
 _OVERLAP = 0.4  # weight of a link on a vertex above which the triangle belongs to the link
 _MOST_FACES = 12_000  # triangles of a hand; meshes of links may have more

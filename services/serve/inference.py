@@ -24,9 +24,8 @@ from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import seen_by
 from congrasp.common.task.types import SceneState
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.episode import PACKED, EpisodePolicy
 from congrasp.services.client.limits import JointLimits
-from congrasp.services.client.policy import LeftPolicy, Policy
+from congrasp.services.client.policy import PACKED, EpisodePolicy, LeftPolicy, Policy
 from congrasp.services.serve.requests import STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)

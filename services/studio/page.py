@@ -29,11 +29,10 @@ from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.motion_file import FORMATS, export_motions, motion_of_episode, save_motion
 from congrasp.services.grasp.approaches import surface_of
-from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.episode import active_blocks, active_constraints, markers
 from congrasp.services.record.palette import painted
 from congrasp.services.record.scene import episode_entries
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import JsonChannels, LogWriter
 from congrasp.services.studio.drawing import vector
 from congrasp.services.studio.server import Download
 from congrasp.services.studio.state import Studio, tool_of

@@ -9,10 +9,10 @@ import jax
 import numpy as np
 import pytest
 
+from congrasp.actors import process
 from congrasp.actors.env import episode_fields
-from congrasp.actors.process import actor as process
-from congrasp.actors.process.actor import Follower
-from congrasp.actors.process.link import RunInfo
+from congrasp.actors.link import RunInfo
+from congrasp.actors.process import Follower
 from congrasp.actors.rollout import Rollout, Trace
 from congrasp.actors.training_set import TrainingSet
 from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig, to_json

@@ -23,7 +23,7 @@ import zenoh
 from zenoh import CongestionControl
 from zenoh.handlers import FifoChannel
 
-from congrasp.actors.process.link import ActorLink, RunFinished
+from congrasp.actors.link import ActorLink, RunFinished
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.journal import AUDIT, Journal
 from congrasp.common.transport import urls

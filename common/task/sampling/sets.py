@@ -10,8 +10,7 @@ from congrasp.common.config import Split
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
-from congrasp.common.io.inputs import file_name, read_file
-from congrasp.common.io.npz import check_arrays
+from congrasp.common.io.inputs import check_arrays, file_name, read_file
 from congrasp.common.objects import store
 from congrasp.common.objects.pool import object_scale, scale_objects
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject

@@ -18,8 +18,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import cache_folder
 from congrasp.common.objects import shapes, store
 from congrasp.common.objects.resting import rest_poses
+from congrasp.common.objects.shapes import halves, sample_mesh
 from congrasp.common.objects.spec import Colours, GraspObject, Piece
-from congrasp.common.objects.surface import halves, sample_mesh
 from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels

@@ -31,8 +31,8 @@ from congrasp.services.export.motion_file import (
     robot_joints,
     save_motion,
 )
-from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.scene import check_episode, episode_entries
+from congrasp.services.record.writer import JsonChannels
 from tests.episodes import episode
 from tests.motion_readers import FROM_Y_UP, READERS, error_mm, forward_kinematics
 

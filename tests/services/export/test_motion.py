@@ -34,9 +34,8 @@ from congrasp.services.export.motion_file import (
     motion_of_episode,
     save_motion,
 )
-from congrasp.services.record.channels import Entry
 from congrasp.services.record.recorder import Converter
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import Entry, LogWriter
 from tests.episodes import episode
 from tests.motion_readers import FROM_Y_UP, READERS, error_mm, read_glb
 from tests.printed import errors

@@ -18,10 +18,9 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.wire.codec import encode
 from congrasp.services.cli.main import load
-from congrasp.services.record.channels import Entry, opaque_channel
 from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE
 from congrasp.services.record.reader import pick_episode
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import Entry, LogWriter, opaque_channel
 from congrasp.services.viz.hand_sheets import hand_sheet
 from congrasp.services.viz.raster import render_scene, visible
 from congrasp.services.viz.render import (
