@@ -19,6 +19,10 @@ CONTACT_TIME = 0.006
 """Time constant of contacts that are as stiff as flesh or rubber, s."""
 _ARM = 0.65  # inertia that an arm adds to that of the hand, kg
 _GYRATION = 0.06  # m, a hand's radius of gyration about its wrist
+LEFT = "_left"
+"""Ends the name of a left hand."""
+SIDE = ":left"
+"""The same, as a user may write it."""
 
 
 def vector(array: np.ndarray) -> Vector:
@@ -350,12 +354,6 @@ def wrist_gains(mass: float) -> WristGains:
         hinge_limit=20.0 * heavier,
         hinge_armature=0.01 * heavier,
     )
-
-
-LEFT = "_left"
-"""Ends the name of a left hand."""
-SIDE = ":left"
-"""The same, as a user may write it."""
 
 
 def right_name(name: str) -> tuple[str, bool]:

@@ -23,6 +23,13 @@ from congrasp.common.errors import CongraspError
 LONGEST_NAME = 100
 """Longest name of a file or folder, in characters."""
 _LONGEST_BYTES = 200  # of a name in UTF-8; file systems take 255, with suffixes
+MAX_BYTES = 512 << 20
+"""Default limit of the total size of a file's arrays, in bytes."""
+MAX_ARRAYS = 1000
+"""Default limit of the number of arrays."""
+_KINDS = "biufUS"
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_UNREADABLE = (ValueError, LookupError, RuntimeError, OverflowError, SyntaxError, TypeError, MemoryError)
 
 
 def file_name(text: object, what: str) -> str:
@@ -126,15 +133,6 @@ def parse_json(text: bytes, what: str, remedy: str = "") -> Any:
         return json.loads(text)
     except (ValueError, RecursionError):
         raise CongraspError(f"{what} is not JSON.", remedy) from None
-
-
-MAX_BYTES = 512 << 20
-"""Default limit of the total size of a file's arrays, in bytes."""
-MAX_ARRAYS = 1000
-"""Default limit of the number of arrays."""
-_KINDS = "biufUS"
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_UNREADABLE = (ValueError, LookupError, RuntimeError, OverflowError, SyntaxError, TypeError, MemoryError)
 
 
 def read_npz(

@@ -14,6 +14,12 @@ from scipy.spatial import ConvexHull
 from congrasp.common.objects.spec import SURFACE_POINTS, Piece
 
 _SEGMENTS = 24
+DENSE = 8192
+"""Surface points from which `balanced` chooses."""
+_SEAM = 2e-4  # m; a point is on the outer surface if a step of this length along its normal leaves all pieces
+_REACHABLE = 4e-3  # m; a mesh's surface counts as accessible if the collision pieces end within this distance
+# The generalised golden ratio of four dimensions: the positive root of x^5 = x + 1 (Roberts' R4 sequence).
+_STRIDE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
 
 def rotation(piece: Piece) -> np.ndarray:
@@ -281,14 +287,6 @@ def _propose_capsule(radius: float, half: float, u: np.ndarray) -> tuple[np.ndar
     ring, turn = np.sqrt(1 - z**2), 2 * np.pi * u[:, 1]
     normals = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], -1)
     return radius * normals + center[:, None] * [0.0, 0.0, 1.0], normals
-
-
-DENSE = 8192
-"""Surface points from which `balanced` chooses."""
-_SEAM = 2e-4  # m; a point is on the outer surface if a step of this length along its normal leaves all pieces
-_REACHABLE = 4e-3  # m; a mesh's surface counts as accessible if the collision pieces end within this distance
-# The generalised golden ratio of four dimensions: the positive root of x^5 = x + 1 (Roberts' R4 sequence).
-_STRIDE = 1.1673039782614187 ** -np.arange(1.0, 5.0)
 
 
 def sample_union(

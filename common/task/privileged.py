@@ -28,6 +28,8 @@ from congrasp.common.task.types import Array
 
 MOST_LOAD = 10.0
 """Upper bound of `load`."""
+_WRIST = (6, 7, 13, 14, 20)
+"""Ends of the wrist's numbers: the teacher's `Guided`, then the lead of the student's guidance alone."""
 
 
 class Parameters(NamedTuple):
@@ -111,10 +113,6 @@ def observe(scene: Scene, parameters: Parameters) -> Array:
 def _full(task: TaskSettings) -> TaskSettings:
     """Returns the task with a policy that observes the full state."""
     return dataclasses.replace(task, observation="full")
-
-
-_WRIST = (6, 7, 13, 14, 20)
-"""Ends of the wrist's numbers: the teacher's `Guided`, then the lead of the student's guidance alone."""
 
 
 def extra(hand: Hand) -> int:

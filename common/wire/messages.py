@@ -21,6 +21,15 @@ from congrasp.common.wire.codec import Message
 
 WORLDS = "B"
 """Symbol of the axis of a rollout's worlds, along which rollouts are concatenated in a batch."""
+F32 = ("float32",)
+_OBSERVATION = ("float16", "float32")
+LONGEST_TEXT = 4096
+"""Limit of a text in the metadata, in characters; the text of a hand has a separate limit (`common.hands.files`)."""
+REAL = ("float32", "float64")
+_INFINITE_HALF = 0x7C00  # exponent bits of a float16 that is infinite or NaN
+_BLOCK = 1 << 16
+_COUNTS = 1 << 53
+_INDEX = ("int32", "int64")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,8 +54,6 @@ Schema = Mapping[str, ArraySpec]
 """Arrays by name; their shapes consist of T control steps, B worlds, D observation and A action sizes, P privileged
 inputs of the critic, and S inputs of a teacher (`common.task.privileged`)."""
 
-F32 = ("float32",)
-_OBSERVATION = ("float16", "float32")
 
 RECORDED: Schema = {
     "observation": ArraySpec(_OBSERVATION, ("T", "B", "D")),
@@ -121,14 +128,6 @@ class RolloutForm:
         return {name: zeros(spec) for name, spec in self.specs.items()}
 
 
-LONGEST_TEXT = 4096
-"""Limit of a text in the metadata, in characters; the text of a hand has a separate limit (`common.hands.files`)."""
-REAL = ("float32", "float64")
-_INFINITE_HALF = 0x7C00  # exponent bits of a float16 that is infinite or NaN
-_BLOCK = 1 << 16
-_COUNTS = 1 << 53
-
-
 @dataclasses.dataclass(frozen=True)
 class MessageSpec:
     """Specification of one kind of message."""
@@ -140,8 +139,6 @@ class MessageSpec:
     meta: Mapping[str, type | tuple[type, ...]] = dataclasses.field(default_factory=dict)
     """Types of the required entries of the metadata; others are allowed."""
 
-
-_INDEX = ("int32", "int64")
 
 _EPISODES = {"episode/*": ArraySpec(F32, ("E",)), "term/*": ArraySpec(F32, ("E",))}
 

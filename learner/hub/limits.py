@@ -19,6 +19,10 @@ DAMAGED = 1 << 20
 """Bytes charged for a message that cannot be decoded."""
 _NAMES = 1024
 _LONGEST = 600.0  # longest backoff, s
+_EACH = 64
+"""Most listed tokens of one role and certificate."""
+_LISTED = 1024
+"""Most entries of one listing, whose reply must fit into a message."""
 
 
 class RateLimit:
@@ -126,12 +130,6 @@ def certificate(actor: str) -> str:
 def sender(key: str) -> str:
     """Returns the actor of a key, which access control may reserve for it."""
     return key.rpartition("/")[2]
-
-
-_EACH = 64
-"""Most listed tokens of one role and certificate."""
-_LISTED = 1024
-"""Most entries of one listing, whose reply must fit into a message."""
 
 
 class Members:

@@ -19,6 +19,17 @@ from congrasp.common.wire.codec import Message
 
 State = Mapping[str, np.ndarray]
 """Current state of hand and object, by field; see `Policy.act`."""
+PACKED = "packed"
+"""Name of the one array of a query or a reply."""
+_REQUIRED = ("surface", "q", "wrist", "object_pose")
+_WITH_CAMERA = ("cloud", "q", "wrist")
+_MEASURED = ("q", "u", "object_position", "object_quaternion")
+_FIRST = ("object_position_initial", "object_quaternion_initial")
+_READ = (*_MEASURED, "q_target", "u_target")
+_POINTS = ("cloud", "surface_points", "surface_avoid", "surface_normals")
+NORMALS, CAMERA = "surface_normals", "camera_position"
+"""Names of the normals at the points of a query, and of the position of the camera."""
+_LONGEST = 64  # largest history of a policy, control steps
 
 
 class Answer(NamedTuple):
@@ -118,19 +129,6 @@ class Policy(Protocol):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-PACKED = "packed"
-"""Name of the one array of a query or a reply."""
-_REQUIRED = ("surface", "q", "wrist", "object_pose")
-_WITH_CAMERA = ("cloud", "q", "wrist")
-_MEASURED = ("q", "u", "object_position", "object_quaternion")
-_FIRST = ("object_position_initial", "object_quaternion_initial")
-_READ = (*_MEASURED, "q_target", "u_target")
-_POINTS = ("cloud", "surface_points", "surface_avoid", "surface_normals")
-NORMALS, CAMERA = "surface_normals", "camera_position"
-"""Names of the normals at the points of a query, and of the position of the camera."""
-_LONGEST = 64  # largest history of a policy, control steps
 
 
 class EpisodePolicy(Policy):

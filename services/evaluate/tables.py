@@ -34,6 +34,11 @@ from congrasp.services.evaluate.scores import TABLES, Row, known_rows
 Table = Literal[
     "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
 ]
+MASSES = (0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0)
+"""Masses of the table `payload`, kg."""
+_OTHERS = {"noise", "sensing", "objects", "payload", "peers"}  # tables whose rows are not constraints
+_LIFT = np.array([0, 0, 10, 0, 0, 0, 0])
+"""z coordinate of the resting pose, m: higher than any hand reaches down."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,9 +203,6 @@ PEERS = (
     Load(label="dexsuite: 0.04-0.5 kg, friction 0.5-1", mass=(0.04, 0.5), friction=(0.5, 1.0)),
 )
 """Rows of the table `peers`: conditions of RobustDexGrasp (arXiv:2504.05287) and of Isaac Lab's dexsuite."""
-MASSES = (0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0)
-"""Masses of the table `payload`, kg."""
-_OTHERS = {"noise", "sensing", "objects", "payload", "peers"}  # tables whose rows are not constraints
 
 
 def payload(scale: float, *, constant_mass: bool) -> tuple[Load, ...]:
@@ -215,10 +217,6 @@ def payload(scale: float, *, constant_mass: bool) -> tuple[Load, ...]:
     found = (*masses, Load(label="masses of the objects", factor=own))
     literal = Load(label=f"masses scaled with the lengths x {scale:g}", factor=own * scale**3)
     return found if scale == 1.0 else (*found, literal)
-
-
-_LIFT = np.array([0, 0, 10, 0, 0, 0, 0])
-"""z coordinate of the resting pose, m: higher than any hand reaches down."""
 
 
 @dataclasses.dataclass(frozen=True)

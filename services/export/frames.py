@@ -34,6 +34,7 @@ _KINEMATICS = ("link_names", "link_parent", "joint_link", "joint_axis", "joint_a
 _STILL = 1e-6  # m; a link whose origin moves less than this in its parent's frame does not move there
 TO_Y_UP = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation from a world frame with the z axis up to one with the y axis up: z to y, y to -z."""
+_MARGIN = 0.004  # space between charts, as a share of the root of the surface's area
 
 
 class Body(NamedTuple):
@@ -193,9 +194,6 @@ def identifiers(names: Sequence[str]) -> list[str]:
             word += "_"
         plain.append(word)
     return plain
-
-
-_MARGIN = 0.004  # space between charts, as a share of the root of the surface's area
 
 
 class Unwrapped(NamedTuple):

@@ -38,6 +38,31 @@ _INDICES = ("object_colour_values", "object_faces", "joint_link", "link_parent",
 _META = "meta"
 _OLDER = {"pose_joints": "pose_q"}
 """Names of goal arrays in files of format 1."""
+_GOALS = {
+    f"{constraint.name}_{name}": f"({', '.join(map(str, array.shape))}{',' * (len(array.shape) == 1)}) {array.meaning}"
+    for constraint in CONSTRAINTS
+    for name, array in constraint.arrays.items()
+}
+"""Meaning of the goal arrays; like the others, each begins with the shape."""
+_POINTS, _VALUES = "object_colour_points", "object_colour_values"
+_COLOURS = {
+    _POINTS: "(P, 3) m, object frame, points of the surface whose colours are known",
+    _VALUES: "(P, 3) sRGB from 0 to 255 there",
+}
+_OWN = {**_COLOURS, **ARM_ARRAYS}
+"""Arrays of motions whose object has colours, or with an arm."""
+FORMATS = {
+    "glb": ".glb",
+    "usd": ".usda",
+    "bvh": ".bvh",
+    "ros2": "",
+    "lerobot": "",
+}
+"""Name and suffix of each format; `services.export.<name>` writes it. Those without a suffix are folders."""
+DATASETS = ("lerobot",)
+"""Formats that hold several motions, and videos."""
+_QUATERNIONS = ("wrist_quaternion", "link_quaternion", "object_quaternion")
+_UNIT = 1e-3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -96,22 +121,9 @@ class GraspMotion:
     """The arm that carries the hand, if there is one. Its wrist deviates from the hand's by its tracking error."""
 
 
-_GOALS = {
-    f"{constraint.name}_{name}": f"({', '.join(map(str, array.shape))}{',' * (len(array.shape) == 1)}) {array.meaning}"
-    for constraint in CONSTRAINTS
-    for name, array in constraint.arrays.items()
-}
-"""Meaning of the goal arrays; like the others, each begins with the shape."""
 _HINTS = get_type_hints(GraspMotion, include_extras=True)
 _ARRAYS = {name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")}
 _FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name not in ("goal", "colours", "arm"))
-_POINTS, _VALUES = "object_colour_points", "object_colour_values"
-_COLOURS = {
-    _POINTS: "(P, 3) m, object frame, points of the surface whose colours are known",
-    _VALUES: "(P, 3) sRGB from 0 to 255 there",
-}
-_OWN = {**_COLOURS, **ARM_ARRAYS}
-"""Arrays of motions whose object has colours, or with an arm."""
 
 
 def at_rate(motion: GraspMotion, fps: float) -> GraspMotion:
@@ -299,20 +311,6 @@ def _check_arrays(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> No
         raise ValueError("joint_limits are in the wrong order")
     if not (arrays["capsule_radius"] > 0).all() or not 0 < arrays["object_file_scale"] < _LARGEST:
         raise ValueError("capsule_radius or object_file_scale is not above zero")
-
-
-FORMATS = {
-    "glb": ".glb",
-    "usd": ".usda",
-    "bvh": ".bvh",
-    "ros2": "",
-    "lerobot": "",
-}
-"""Name and suffix of each format; `services.export.<name>` writes it. Those without a suffix are folders."""
-DATASETS = ("lerobot",)
-"""Formats that hold several motions, and videos."""
-_QUATERNIONS = ("wrist_quaternion", "link_quaternion", "object_quaternion")
-_UNIT = 1e-3
 
 
 def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:

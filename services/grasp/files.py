@@ -45,6 +45,11 @@ OBJECT = "object.png"
 _SMALL = (320, 240)  # pixels
 _HELD = 0.5  # s of the hold in videos
 _FRAMED = 10  # control steps between the frames that the video's camera must contain
+ARM_CSV, ARM_TRAJECTORY, ARM_PICTURE = "arm.csv", "arm_trajectory.json", "arm.png"
+_SIZE = (1280, 960)  # pixels
+_AHEAD = np.array([0.35, -1.0, 0.45])  # from the robot to the camera, in the frame of the base
+_GREY = (0.75, 0.76, 0.78)
+_EDGE, _UNDER = 0.6, 0.001  # margin of the table around arm and object, and its depth below height zero, m
 
 
 def save_grasp(
@@ -130,13 +135,6 @@ def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
 def key_of(*parts: Any) -> str:
     """Sixteen hex digits that change with any input of a grasp."""
     return hashlib.sha256(json.dumps((_FORMAT, *parts), default=str).encode()).hexdigest()[:16]
-
-
-ARM_CSV, ARM_TRAJECTORY, ARM_PICTURE = "arm.csv", "arm_trajectory.json", "arm.png"
-_SIZE = (1280, 960)  # pixels
-_AHEAD = np.array([0.35, -1.0, 0.45])  # from the robot to the camera, in the frame of the base
-_GREY = (0.75, 0.76, 0.78)
-_EDGE, _UNDER = 0.6, 0.001  # margin of the table around arm and object, and its depth below height zero, m
 
 
 def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) -> None:

@@ -19,6 +19,9 @@ from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
 
 CHILD_GRACE = 2.0
 """Seconds for a child to drain; the rest of `GRACE` remains to kill it before this process must end."""
+_TRAINED = "trained.json"
+_POLL = 0.5
+_LARGEST = 1 << 16
 
 
 def command(*words: object, **options: object) -> list[str]:
@@ -89,11 +92,6 @@ def end_all(children: Sequence[Child]) -> None:
         if process.poll() is None:
             process.kill()
             process.wait()
-
-
-_TRAINED = "trained.json"
-_POLL = 0.5
-_LARGEST = 1 << 16
 
 
 def trained(run_dir: pathlib.Path) -> pathlib.Path | None:

@@ -28,6 +28,7 @@ _SUMS = {
 """Counters that are sums of others: no ticket and no accepted rollout is lost."""
 _ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/s", "steps/s")
 _SHOWN = 100  # most processes in a table
+_RUN = "quickstart"
 
 
 def ask(transport: Transport, run: str) -> dict[str, Any]:
@@ -96,9 +97,6 @@ def tables(status: Mapping[str, Any]) -> Group:
     others = [Text(f"{more} more live process(es).")] if more else []
     wrong = (Text(f"Warning: {text}", style="yellow") for text in status["warnings"])
     return Group(roles, *others, counters, Text(line), *wrong)
-
-
-_RUN = "quickstart"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,6 +22,18 @@ from congrasp.common.wire.codec import Message
 _LATEST = 1e4  # s
 _OLDER = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 """Default blocks of the `goal/mask` of recordings without names."""
+UNLIMITED = 1e3
+"""Limit of joints without limits, rad or m."""
+_PREFIX = "arm_"
+_FOLDER, _META = "arm/", "arm"  # of the arrays, and of name and texts, in an episode's message
+_INDICES = {
+    "joint_link": "A",
+    "link_parent": "A",
+    "hand_link": "A",
+    "mesh_link": "A",
+    "mesh_faces": "V",
+    "face_mesh": "M",
+}
 
 
 def active_blocks(arrays: Mapping[str, np.ndarray]) -> dict[str, bool]:
@@ -65,12 +77,6 @@ def phases_of(meta: Mapping[str, Any]) -> dict[str, float]:
     found = meta.get("phases")
     times = found.items() if isinstance(found, dict) else ()
     return {str(name): float(time) for name, time in times if isinstance(time, int | float) and 0 <= time < _LATEST}
-
-
-UNLIMITED = 1e3
-"""Limit of joints without limits, rad or m."""
-_PREFIX = "arm_"
-_FOLDER, _META = "arm/", "arm"  # of the arrays, and of name and texts, in an episode's message
 
 
 class Mesh(NamedTuple):
@@ -141,14 +147,6 @@ _HINTS = get_type_hints(MovedArm, include_extras=True)
 ARM_ARRAYS = {f"{_PREFIX}{name}": hint.__metadata__[0] for name, hint in _HINTS.items() if name != "name"}
 """Meaning of each array in files, with its shape."""
 _TIMED = [name.removeprefix(_PREFIX) for name, meaning in ARM_ARRAYS.items() if meaning.startswith("(T,")]
-_INDICES = {
-    "joint_link": "A",
-    "link_parent": "A",
-    "hand_link": "A",
-    "mesh_link": "A",
-    "mesh_faces": "V",
-    "face_mesh": "M",
-}
 
 
 def arm_of(name: str, arrays: Mapping[str, np.ndarray], frames: int) -> MovedArm:

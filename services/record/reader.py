@@ -43,6 +43,7 @@ _FOOTER, _CRC = struct.Struct("<QQI"), struct.Struct("<I")
 _LIMIT = 512 << 20  # limit of a record, and of an inflated chunk, bytes
 _BLOCK = 1 << 20
 _PLACES = 5
+_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass
@@ -209,9 +210,6 @@ def intact_summary(file: BinaryIO) -> Summary | None:
 def _read(file: BinaryIO, position: int, count: int) -> bytes:
     file.seek(position)
     return file.read(count)
-
-
-_log = logging.getLogger(__name__)
 
 
 class Record(NamedTuple):

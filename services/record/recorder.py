@@ -50,6 +50,14 @@ _NAMES = 64  # names of one identity
 _IDENTITIES = 1024
 _IDLE = 60.0  # seconds after which a silent name may be replaced
 _PER_SECOND, _MOST = 16 << 20, 256 << 20  # bytes per second of an identity's entries, and their burst
+_AHEAD = 60_000_000_000
+"""Longest queue of an actor's episodes in ns; later ones are dropped."""
+_TIMES = 2**62
+"""Limit of times, ns since 1970."""
+_LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
+FLUSH_SECONDS = 0.5
+"""Seconds between two flushes; a killed recorder loses no more than these."""
+_TOPIC = "/metrics/learner/"
 
 
 class LogBudget:
@@ -104,13 +112,6 @@ class LogBudget:
 def _identity(who: Name) -> Name:
     role, name = who
     return role, certificate(name) if role == "actor" else ""
-
-
-_AHEAD = 60_000_000_000
-"""Longest queue of an actor's episodes in ns; later ones are dropped."""
-_TIMES = 2**62
-"""Limit of times, ns since 1970."""
-_LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
 
 
 class Converter:
@@ -210,10 +211,6 @@ def _scalars(meta: Mapping[str, Any]) -> dict[str, Any]:
         for key, value in meta.items()
         if isinstance(value, bool | int | float | str) and len(str(value)) <= LONGEST_TEXT
     }
-
-
-FLUSH_SECONDS = 0.5
-"""Seconds between two flushes; a killed recorder loses no more than these."""
 
 
 class Sink(Protocol):
@@ -349,9 +346,6 @@ class Recorder:
             )
             self._writer.abandon()
             self._warn(self.error)
-
-
-_TOPIC = "/metrics/learner/"
 
 
 class MetricWriters:

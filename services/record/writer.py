@@ -38,6 +38,11 @@ CONVENTIONS = {
     "joints": "finger joints by name, in the order of the hand's 'q'; wrist x, y, z, then intrinsic x-y-z angles",
 }
 """Metadata of every file: meaning of the numbers."""
+PART = ".part"
+"""Suffix of a file that is being written, or whose writer was killed."""
+CHUNK = 1 << 20
+"""Bytes of a chunk before compression."""
+_INDEXES = IndexType.CHUNK | IndexType.MESSAGE | IndexType.METADATA
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,13 +192,6 @@ def _schema(fields: Mapping[str, Any]) -> dict[str, Any]:
     """JSON schema of known fields."""
     properties = {name: _schema(kind) if isinstance(kind, dict) else {"type": kind} for name, kind in fields.items()}
     return {"type": "object", "properties": properties}
-
-
-PART = ".part"
-"""Suffix of a file that is being written, or whose writer was killed."""
-CHUNK = 1 << 20
-"""Bytes of a chunk before compression."""
-_INDEXES = IndexType.CHUNK | IndexType.MESSAGE | IndexType.METADATA
 
 
 class LogWriter:

@@ -20,6 +20,21 @@ from congrasp.services.reproduce.plan import RequiredPolicy, Result
 
 SUCCESS = "success"
 CAPTURED_DATA = {"captured": "GRAB and OakInk", "cross": "DexYCB"}
+_OPTIONAL = {3: (3,), 9: (8, 9, 10)}
+"""Columns that are left out if the first of them is empty: objects, and errors if the paper has none."""
+PAGE, JSON, LATEX = "reproduction.html", "reproduction.json", "tables.tex"
+_LARGEST_PICTURE = 32 << 20
+_CONDITIONS = (
+    "MuJoCo replaces the paper's simulator; contacts, friction, servos and the hands' models differ.",
+    "The human hand replaces MANO. It has 20 anatomical joints; the paper's has MANO's.",
+    "Procedural objects that are never used in training replace the objects of the paper's table of hands, and "
+    "Objaverse in its table of large-scale objects. Sizes there are terciles of our objects; the paper gives no "
+    "bounds.",
+    "References of the table of hands are grasps of this project's reference policies, generated as in the paper.",
+    "Success is the paper's: the object has not fallen a quarter of a second after the table is removed. The "
+    "paper does not report whether it is held for two seconds, nor whether fingers penetrate anything.",
+)
+"""Differences that apply to every table."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,23 +257,6 @@ _COLUMNS: Columns[list[Cell]] = (
     ("difference", _styled("errors", _joined(_difference))),
 )
 """Columns of a line's figures, success first."""
-_OPTIONAL = {3: (3,), 9: (8, 9, 10)}
-"""Columns that are left out if the first of them is empty: objects, and errors if the paper has none."""
-
-
-PAGE, JSON, LATEX = "reproduction.html", "reproduction.json", "tables.tex"
-_LARGEST_PICTURE = 32 << 20
-_CONDITIONS = (
-    "MuJoCo replaces the paper's simulator; contacts, friction, servos and the hands' models differ.",
-    "The human hand replaces MANO. It has 20 anatomical joints; the paper's has MANO's.",
-    "Procedural objects that are never used in training replace the objects of the paper's table of hands, and "
-    "Objaverse in its table of large-scale objects. Sizes there are terciles of our objects; the paper gives no "
-    "bounds.",
-    "References of the table of hands are grasps of this project's reference policies, generated as in the paper.",
-    "Success is the paper's: the object has not fallen a quarter of a second after the table is removed. The "
-    "paper does not report whether it is held for two seconds, nor whether fingers penetrate anything.",
-)
-"""Differences that apply to every table."""
 
 
 class Account(NamedTuple):

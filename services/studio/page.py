@@ -60,6 +60,14 @@ _PLAYED = (
     "surface_avoid",
 )
 """Arrays of an episode that the player needs unchanged."""
+_ABOVE = np.cos(np.radians(45.0))
+MOST = 30
+"""Number of motions kept; the oldest is dropped first."""
+DATA = ("npz", "mcap", *FORMATS)
+"""Formats in which a motion can be saved at once."""
+DRAWN = ("mp4", "png")
+"""Formats that are rendered first, in a job."""
+_PICTURE, _VIDEO = (1280, 720), (854, 480)  # pixels
 
 
 def describe(studio: Studio) -> dict[str, Any]:
@@ -215,16 +223,6 @@ def for_page(episode: Message) -> Message:
             arrays |= {f"{kind}/{name}/{field}": np.asarray(value, np.float32) for field, value in fields.items()}
     terms = {name: MEANINGS.get(name, "") for name in (key.removeprefix("reward/") for key in rewards)}
     return Message(arrays, {**episode.meta, "lanes": {n: lane.legend for n, lane in found.items()}, "terms": terms})
-
-
-_ABOVE = np.cos(np.radians(45.0))
-MOST = 30
-"""Number of motions kept; the oldest is dropped first."""
-DATA = ("npz", "mcap", *FORMATS)
-"""Formats in which a motion can be saved at once."""
-DRAWN = ("mp4", "png")
-"""Formats that are rendered first, in a job."""
-_PICTURE, _VIDEO = (1280, 720), (854, 480)  # pixels
 
 
 class Motions:

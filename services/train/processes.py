@@ -30,6 +30,12 @@ from congrasp.common.transport.security import CERTIFICATE_FILE, check_exposure
 from congrasp.learner.run_directory import LOGS
 from congrasp.services.ops.children import CHILD_GRACE, Child, command, end_all, wait_for
 
+MAX_RESTARTS = 5
+_BAD_INPUT = 2
+_START_SECONDS, _POLL = 120.0, 0.25
+Report = Callable[[dict[str, Any]], None]
+"""Called several times a second with the learner's newest metrics, if any, and the number of live actors."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Launch:
@@ -144,13 +150,6 @@ def accelerators() -> tuple[str, int]:
 def engine_of(name: PhysicsName, gpus: bool) -> PhysicsName:
     """Resolves `auto` for the ranks, even if this process sees no GPU but they do."""
     return resolve_physics(name, "cuda" if gpus else "")
-
-
-MAX_RESTARTS = 5
-_BAD_INPUT = 2
-_START_SECONDS, _POLL = 120.0, 0.25
-Report = Callable[[dict[str, Any]], None]
-"""Called several times a second with the learner's newest metrics, if any, and the number of live actors."""
 
 
 def train(

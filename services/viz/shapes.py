@@ -22,6 +22,11 @@ from congrasp.services.record.palette import OBJECT, SKIN, TABLE, Colour
 Kind = Literal["sphere", "capsule", "table", "mesh"]
 
 _KEY = np.array([-0.45, -0.55, 1.0])  # towards the key light: right, away from the camera, up
+_TABLE_RADIUS = 0.6  # m
+FIELD_OF_VIEW = 26.0
+"""Field of view of the cameras of `fit`, degrees."""
+_SPACE = 1.06  # factor on the extent, for free space at the picture's edges
+_STILL = 1e-3  # m of a curl that is too small for a direction
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,13 +96,6 @@ def between(
         return Shape("sphere", (radius, 0.0), colour, middle, shadow=shadow)
     turn = Rotation.align_vectors([along / length], [[0.0, 0.0, 1.0]])[0].as_quat(scalar_first=True)
     return Shape("capsule", (radius, length / 2), colour, middle, turn, shadow=shadow)
-
-
-_TABLE_RADIUS = 0.6  # m
-FIELD_OF_VIEW = 26.0
-"""Field of view of the cameras of `fit`, degrees."""
-_SPACE = 1.06  # factor on the extent, for free space at the picture's edges
-_STILL = 1e-3  # m of a curl that is too small for a direction
 
 
 def skin_shape(

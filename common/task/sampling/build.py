@@ -275,9 +275,9 @@ def _sampled(
     obj: GraspObject, rng: np.random.Generator, scale: float, hand: Outline, *, opposed: bool
 ) -> tuple[Headings, Headings | None]:
     """Headings for the whole surface and for the graspable region, None if that is out of reach; see `headings_of`."""
-    lengths = {"inward": scale * INWARD, "max_width": max_width(hand, scale)}
+    inward, width = scale * INWARD, max_width(hand, scale)
     whole, graspable = (
-        sample_headings(obj, rng, count=HEADINGS, use_affordance=use, opposed=opposed, **lengths)
+        sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width, opposed=opposed)
         for use in (False, True)
     )
     assert whole is not None, "only the graspable region may be unreachable"

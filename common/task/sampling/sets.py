@@ -47,6 +47,7 @@ MEANING = {
     "visual/vertices": "(n, 3) m, object frame",
     "visual/faces": "(m, 3) indices of vertices",
 }
+_TRAINING = 0.8
 
 
 def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
@@ -207,9 +208,6 @@ def load_for(
                 chosen.append(obj)
                 sets.append(made)
     return chosen, sets
-
-
-_TRAINING = 0.8
 
 
 def make_sets(

@@ -39,6 +39,16 @@ LEAST_MEMORY = 2 << 30
 _MEMORY = 6 << 30  # bytes of address space of a child, where there is enough for one on every core
 _FINEST = 0.01  # the smallest threshold that CoACD takes, of half the longest side
 _MESH, _PIECES = "mesh.npz", "pieces.npz"
+DEPTH = 1.5e-3
+"""Largest depth of the surface in a hull, or distance of the hull from it, for joins below the limit of pieces, m."""
+GROWTH = 0.02
+"""Share of the volume that joins may add below the limit of pieces."""
+_SAMPLES, _PROBES = 6000, 100  # points on the whole surface, and on the hull of two pieces
+_NEAR = 5e-4  # m; pieces whose boxes are nearer than this are neighbours
+_ON = 1e-4  # m; points of a hull that are nearer to a piece than this belong to it
+_INNER = 30_000  # points inside of the mesh
+_FULL, _MOST = 0.03, 0.9  # hollow shares of its hull from which on a piece is thinned, and by which it is at most
+_LEAST = 1e-11  # m^3; smaller pieces are dropped
 
 
 class Surfaces(NamedTuple):
@@ -252,18 +262,6 @@ def _by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[
 def _convex(hull: ConvexHull, triangles: np.ndarray, volume: float) -> bool:
     """True if the hull of a closed mesh (F, 3, 3) of this volume may stand for it."""
     return volume > (1 - GROWTH) * hull.volume and deepest(hull, triangles) < DEPTH
-
-
-DEPTH = 1.5e-3
-"""Largest depth of the surface in a hull, or distance of the hull from it, for joins below the limit of pieces, m."""
-GROWTH = 0.02
-"""Share of the volume that joins may add below the limit of pieces."""
-_SAMPLES, _PROBES = 6000, 100  # points on the whole surface, and on the hull of two pieces
-_NEAR = 5e-4  # m; pieces whose boxes are nearer than this are neighbours
-_ON = 1e-4  # m; points of a hull that are nearer to a piece than this belong to it
-_INNER = 30_000  # points inside of the mesh
-_FULL, _MOST = 0.03, 0.9  # hollow shares of its hull from which on a piece is thinned, and by which it is at most
-_LEAST = 1e-11  # m^3; smaller pieces are dropped
 
 
 class _Part(NamedTuple):

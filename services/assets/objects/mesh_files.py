@@ -45,6 +45,7 @@ _FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and p
 _PLY_HEADER = 1 << 16  # bytes
 _SIZES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
 _SIZES |= {"int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8}
+_UNSAID = (102, 102, 102)  # default colour of a material in trimesh
 
 
 @np.errstate(all="ignore")  # of numbers that are refused, or far out
@@ -346,9 +347,6 @@ def _checked_ply(data: bytes, notes: list[str]) -> bytes:
     if sum(rows * width for rows, width in elements) > len(data):
         raise ValueError(f"it announces {max(elements)[0]} rows, but has {len(data)} bytes")
     return data
-
-
-_UNSAID = (102, 102, 102)  # default colour of a material in trimesh
 
 
 def sample_colours(
