@@ -314,11 +314,7 @@ class GraspEnv:
             },
             terms=state.terms + stacked,
         )
-        over = state.time - state.hold - task.approach_steps
-        counts, terminal = over == 0, over >= state.after
-        if task.end_when_fallen:
-            fell = (state.time >= task.approach_steps + task.hold_steps) & ~up & (over < 0)
-            counts, terminal = counts | fell, terminal | fell
+        counts, terminal = self._ends(state, up)
         finished = jnp.where(counts[:, None], self._episode(state, up), state.finished)
         state = state._replace(finished=finished, has_finished=state.has_finished | counts)
         # If the object is not held, any end is final: the reward already contains the fall.
@@ -331,6 +327,16 @@ class GraspEnv:
             occupancy=physics_state.occupancy,
         )
         return state, transition
+
+    def _ends(self, state: EnvState, up: Array) -> tuple[Array, Array]:
+        """(B,) bool each: the episode's metrics are complete with this step, and the episode ends with it."""
+        task = self.task
+        over = state.time - state.hold - task.approach_steps
+        counts, terminal = over == 0, over >= state.after
+        if task.end_when_fallen:
+            fell = (state.time >= task.approach_steps + task.hold_steps) & ~up & (over < 0)
+            counts, terminal = counts | fell, terminal | fell
+        return counts, terminal
 
     def with_scene(self, state: EnvState, physics_state: PhysicsState) -> EnvState:
         """Returns the environments with the scene of an engine that has simulated no step since the last `advance`."""

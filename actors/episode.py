@@ -11,14 +11,12 @@ from congrasp.actors.rollout import Trace
 from congrasp.common import rotations
 from congrasp.common.hands.kinematics import link_poses
 from congrasp.common.hands.spec import Hand
-from congrasp.common.objects.spec import GraspObject
+from congrasp.common.objects.spec import PIECE_KINDS, GraspObject
 from congrasp.common.task import metrics
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.reward import terms
 from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.wire.codec import Message
-
-PIECE_KINDS = ("box", "cylinder", "capsule", "ellipsoid", "mesh")
 
 
 def episode_message(

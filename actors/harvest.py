@@ -19,8 +19,7 @@ from congrasp.actors.physics.engine import where_environments
 from congrasp.common import rotations
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.caches import read_kept
-from congrasp.common.io.files import write_atomically
+from congrasp.common.io.files import read_kept, write_atomically
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, optional
 from congrasp.common.task.constraints.base import Scene

@@ -23,8 +23,8 @@ from congrasp.common.task import metrics
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.base import Scene
 from congrasp.common.task.observation import observe
+from congrasp.common.task.privileged import observe_for_teacher
 from congrasp.common.task.sampling.bank import ConstraintBank
-from congrasp.common.task.teaching import observe_for_teacher
 from congrasp.common.task.types import Action, Array
 
 ActFunction = Callable[[Any, Array, Array], tuple[Array, Array]]
@@ -93,7 +93,7 @@ class Rollout(NamedTuple):
     probed: Any
     """Result of the probe, with leading axis T; None without a probe."""
     teacher_observation: Array | None = None
-    """(T, B, S) input of the teacher that labels the rollout (`common.task.teaching`)."""
+    """(T, B, S) input of the teacher that labels the rollout (`common.task.privileged`)."""
     privileged: Array | None = None
     """(T, B, P) privileged inputs of the critic (`common.task.privileged`), if recorded."""
     last_privileged: Array | None = None

@@ -22,10 +22,9 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.plausibility import Sample
+from congrasp.common.task.settings import GRAVITY
 from congrasp.common.task.types import Array
 
-GRAVITY = 9.81
-"""m/s^2."""
 LIFT_HEIGHT, LIFT_SPEED, LIFT_ACCELERATION = 0.15, 0.3, 3.0
 """Height (m), speed (m/s) and acceleration (m/s^2) of the lift."""
 PUSH_SECONDS = 0.25

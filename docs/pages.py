@@ -29,7 +29,7 @@ from congrasp.common.wire import messages
 from congrasp.common.wire.messages import MessageSpec
 from congrasp.services.cli import main
 from congrasp.services.export.motion_file import GraspMotion
-from congrasp.services.record import moved_arm
+from congrasp.services.record.episode import ARM_ARRAYS
 from congrasp.services.train.presets import CAMERAS, TRACKERS
 from congrasp.services.viz.plots import TITLES
 
@@ -150,7 +150,7 @@ class MotionArrays(Directive):
         """Returns a table."""
         hints = typing.get_type_hints(GraspMotion, include_extras=True)
         arrays = {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
-        return [_table(("array", "shape, unit, frame"), [*arrays.items(), *moved_arm.MEANINGS.items()])]
+        return [_table(("array", "shape, unit, frame"), [*arrays.items(), *ARM_ARRAYS.items()])]
 
 
 class Sensing(Directive):

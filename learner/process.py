@@ -28,8 +28,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, encode, finite
 from congrasp.learner.algorithms import make_algorithm
-from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState
-from congrasp.learner.batch import collate, rollout_form
+from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, collate, rollout_form
 from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
 from congrasp.learner.distributed.ranks import Ranks, ended_by
 from congrasp.learner.hub.admission import Admission, task_ranges

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 
-from congrasp.actors.process.link import ActorLink, RunFinished
+from congrasp.actors.link import ActorLink, RunFinished
 from congrasp.common.errors import TransportError
 from congrasp.common.io.journal import AUDIT, Journal
 from congrasp.common.transport import urls

@@ -6,7 +6,7 @@ import numpy as np
 
 from congrasp.common.transport.base import Transport
 from congrasp.common.wire.codec import Message
-from congrasp.common.wire.schema import RolloutForm
+from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 

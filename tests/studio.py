@@ -15,9 +15,8 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.scene import episode_entries
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import JsonChannels, LogWriter
 from congrasp.services.studio.catalogue import Catalogue
 from congrasp.services.studio.session import Progress, Session
 from congrasp.services.studio.training import TrainingWindow

@@ -68,6 +68,21 @@ MODEL_LEAVES = [name for name in Leaves.vars if name.startswith(("geom_", "body_
 DATA_LEAVES = [name for name in Leaves.vars if name.startswith(("mocap_", "eq_", "xfrc_"))]
 
 
+@wp.func
+def scale_gains(leaves: Leaves, env: int, scale: float) -> None:
+    """Scales the gains of an environment's servos."""
+    for i in range(leaves.motors.shape[0]):
+        motor = leaves.motors[i]
+        gains = scale * leaves.gains[i]
+        gain = leaves.actuator_gainprm[env, motor]
+        bias = leaves.actuator_biasprm[env, motor]
+        gain[0] = gains[0]
+        bias[1] = gains[1]
+        bias[2] = gains[2]
+        leaves.actuator_gainprm[env, motor] = gain
+        leaves.actuator_biasprm[env, motor] = bias
+
+
 @wp.kernel
 def place(
     table: wp.array[bool],
@@ -110,16 +125,7 @@ def place(
     leaves.body_invweight0[env, body] = objects.body_invweight0[r] / scale
     for i in range(6):
         leaves.dof_invweight0[env, leaves.object_dof + i] = objects.dof_invweight0[r, i] / scale
-    for i in range(leaves.motors.shape[0]):
-        motor = leaves.motors[i]
-        gains = gain_scale[env] * leaves.gains[i]
-        gain = leaves.actuator_gainprm[env, motor]
-        bias = leaves.actuator_biasprm[env, motor]
-        gain[0] = gains[0]
-        bias[1] = gains[1]
-        bias[2] = gains[2]
-        leaves.actuator_gainprm[env, motor] = gain
-        leaves.actuator_biasprm[env, motor] = bias
+    scale_gains(leaves, env, gain_scale[env])
     leaves.body_pos[env, leaves.base_body] = base_position[env]
     leaves.body_quat[env, leaves.base_body] = base_quaternion[env]
     leaves.mocap_pos[env, leaves.anchor] = anchor_position[env]

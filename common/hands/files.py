@@ -3,7 +3,9 @@
 The hands of the package are such files in `data/`. Their sources:
 
 * `human`: joint centres, axes and capsule radii are MyoHand's (Apache-2.0, MyoHub; OpenSim-derived); so are its limits,
-  widened where anatomy allows; phalanx masses of a mean adult hand.
+  widened where anatomy allows; phalanx masses of a mean adult hand. 20 anatomical finger joints, four for each finger.
+  Wrist frame: origin at the lunate, fingers towards -y, thumb side +x, back of the hand +z. Fingers flex with positive
+  angles, the thumb's `mp` and `ip` with negative ones.
 * `allegro`: the right Allegro hand V3 by the maker's published models (BSD-2, SimLab 2016), with the maker's boxes and
   round fingertips as collision shapes and capsules of 23 mm for rewards and features. Gains of a PD controller that is
   common for this hand. Wrist frame: origin at the palm's mounting end, fingers towards +z, closing side +x, index
@@ -226,3 +228,7 @@ def _numbers(value: Any) -> Iterator[float]:
     elif isinstance(value, (dict, list, tuple)):
         for item in value.values() if isinstance(value, dict) else value:
             yield from _numbers(item)
+
+
+HUMAN = shipped_hand("human")
+"""The human right hand."""

@@ -12,7 +12,7 @@ import pathlib
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.spec import Capsule, Hand, Link, chain, vector
 from congrasp.common.io.pickles import read_archive, read_pickle
 

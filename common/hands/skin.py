@@ -13,9 +13,8 @@ from scipy.spatial import cKDTree
 
 from congrasp.common import mirror
 from congrasp.common.hands.flesh import Skeleton, Surface, flesh, skeleton_of, wrist_circles
-from congrasp.common.hands.left import right_name
 from congrasp.common.hands.meshes import Meshes, own_meshes
-from congrasp.common.hands.spec import Hand, Link, link_origin
+from congrasp.common.hands.spec import Hand, Link, link_origin, right_name
 
 _AROUND = 28  # points of a ring
 _NAIL = ((0.2, 0.0005), (0.55, 0.0005), (0.9, 0.0004), (1.0, 0.0001), (0.9, -0.0012), (0.2, -0.0012))

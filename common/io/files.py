@@ -1,12 +1,18 @@
-"""Atomic file writes: a reader finds the old content or the new one."""
+"""Atomic file writes, by which a reader finds the old content or the new one; caches of results between runs."""
 
 import contextlib
 import functools
+import hashlib
 import logging
 import os
 import pathlib
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from congrasp.common.errors import CongraspError
+
+if TYPE_CHECKING:  # commands that read no message start without NumPy
+    from congrasp.common.wire.codec import Message
 
 _log = logging.getLogger(__name__)
 
@@ -90,3 +96,39 @@ def sync_directory(path: pathlib.Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@functools.cache
+def source_digest(*packages: ModuleType) -> str:
+    """Returns sixteen hex digits of all source and data in these packages; a change invalidates cache entries."""
+    digest = hashlib.sha256()
+    for folder in (folder for package in packages for folder in package.__path__):
+        for file in sorted(file for kind in ("*.py", "*.json") for file in pathlib.Path(folder).rglob(kind)):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def read_kept(path: pathlib.Path) -> "Message | None":
+    """Reads a cached message if it exists and is intact, and marks it as used now."""
+    from congrasp.common.wire.codec import decode
+
+    try:
+        message = decode(path.read_bytes(), max_bytes=path.stat().st_size)
+        os.utime(path)
+    except (OSError, CongraspError):
+        return None
+    return message
+
+
+def keep(path: pathlib.Path, message: "Message", most: int) -> None:
+    """Writes a message to the cache, and removes all but the `most` last used files of its folder.
+
+    A full disk or a folder without write permission is ignored: the next run recomputes the entry.
+    """
+    from congrasp.common.wire.codec import encode
+
+    with contextlib.suppress(CongraspError, OSError):
+        write_atomically(path, encode(message))
+        files = sorted(path.parent.glob(f"*{path.suffix}"), key=lambda file: file.stat().st_mtime)
+        for old in files[:-most]:
+            old.unlink(missing_ok=True)

@@ -1,19 +1,35 @@
-"""Validation of external input: names used as files, and files of bounded size."""
+"""Validation of external input: names used as files, files of bounded size, and arrays against their descriptions.
+
+The declared size of an array in an NPZ file is checked before memory is allocated.
+"""
 
 import hashlib
+import io
 import json
+import math
 import os
 import pathlib
 import stat
 import unicodedata
-from collections.abc import Iterable
+import zipfile
+import zlib
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, BinaryIO
+
+import numpy as np
 
 from congrasp.common.errors import CongraspError
 
 LONGEST_NAME = 100
 """Longest name of a file or folder, in characters."""
 _LONGEST_BYTES = 200  # of a name in UTF-8; file systems take 255, with suffixes
+MAX_BYTES = 512 << 20
+"""Default limit of the total size of a file's arrays, in bytes."""
+MAX_ARRAYS = 1000
+"""Default limit of the number of arrays."""
+_KINDS = "biufUS"
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_UNREADABLE = (ValueError, LookupError, RuntimeError, OverflowError, SyntaxError, TypeError, MemoryError)
 
 
 def file_name(text: object, what: str) -> str:
@@ -117,3 +133,114 @@ def parse_json(text: bytes, what: str, remedy: str = "") -> Any:
         return json.loads(text)
     except (ValueError, RecursionError):
         raise CongraspError(f"{what} is not JSON.", remedy) from None
+
+
+def read_npz(
+    path: pathlib.Path,
+    remedy: str,
+    *,
+    kind: str = "an NPZ file",
+    largest: int = MAX_BYTES,
+    most: int = MAX_ARRAYS,
+    pickled: bool = False,
+) -> dict[str, Any]:
+    """Reads the arrays of a file by name: numbers, booleans and texts.
+
+    Args:
+      path: the file.
+      remedy: remedy for the error message.
+      kind: expected kind of file, for the error message.
+      largest: limit of the arrays' total size, bytes.
+      most: limit of the number of arrays.
+      pickled: returns arrays of objects as the bytes of their pickle; otherwise they are errors. Nothing is unpickled.
+
+    Raises:
+      CongraspError: the file is not an NPZ file, is damaged, or exceeds a limit.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_file(path, largest, remedy))) as archive:
+            members = archive.infolist()
+            _check_members(members, largest, most)
+            names = [member.filename.removesuffix(".npy") for member in members]
+            return {name: _array(archive.read(f"{name}.npy"), name, pickled) for name in names}
+    except OSError as error:
+        raise CongraspError(f"{path} cannot be read: {error.strerror or error}.", remedy) from None
+    except _UNREADABLE as error:
+        why = " ".join(str(error).split())[:200]
+    except (zipfile.BadZipFile, EOFError, zlib.error):
+        why = "it is not an NPZ file, or was cut"
+    raise CongraspError(f"{path} cannot be read: it is not {kind} ({why}).", remedy)
+
+
+def _check_members(members: list[zipfile.ZipInfo], largest: int, most: int) -> None:
+    """Raises a ValueError if the members are not those of an NPZ file, are too many, or inflate to too many bytes."""
+    if len(members) > most:
+        raise ValueError(f"it has more than {most} arrays")
+    if sum(member.file_size for member in members) > largest:
+        raise ValueError(f"its arrays exceed {largest >> 20} MB")
+    for member in members:
+        if not member.filename.endswith(".npy") or member.compress_type not in _METHODS:
+            raise ValueError("it holds something else than arrays")
+    if len({member.filename for member in members}) < len(members):
+        raise ValueError("it holds an array twice")
+
+
+def _array(data: bytes, name: str, pickled: bool) -> Any:
+    """Parses one array in NumPy's format."""
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = header(stream)
+    rest = memoryview(data)[stream.tell() :]
+    if dtype.hasobject and pickled:
+        return bytes(rest)
+    if dtype.kind not in _KINDS:
+        raise ValueError(f"'{name[:60]}' has the type {str(dtype)[:40]}")
+    if math.prod(shape) * dtype.itemsize != len(rest) or (not dtype.itemsize and math.prod(shape) > 1):
+        raise ValueError(f"'{name[:60]}' has {len(rest)} bytes, which is not {dtype} times {shape}")
+    return np.frombuffer(rest, dtype, count=math.prod(shape)).reshape(shape, order="F" if fortran else "C").copy("K")
+
+
+def check_arrays(
+    arrays: Mapping[str, np.ndarray],
+    meanings: Mapping[str, str],
+    *,
+    indices: Collection[str],
+    largest: float,
+    sizes: Mapping[str, int] | None = None,
+) -> dict[str, int]:
+    """Checks arrays against their descriptions.
+
+    Args:
+      arrays: arrays by name.
+      meanings: descriptions of the required arrays: a shape of letters and numbers, then words, such as `(T, 3) m,
+        world`. The word "text" after the shape, or "bool" anywhere, marks an array without numbers.
+      indices: names of integer arrays.
+      largest: exclusive bound of the absolute values.
+      sizes: known sizes by letter; any other letter takes the size of the first array that has it.
+
+    Returns:
+      Sizes by letter.
+
+    Raises:
+      ValueError: an array is empty, has the wrong shape or type, or holds numbers that are not finite or too large.
+      KeyError: an array is missing.
+    """
+    known = dict(sizes or {})
+    for name, meaning in meanings.items():
+        array, words = arrays[name], meaning[1 : meaning.index(")")]
+        letters = words.replace(",", " ").split()
+        if not array.size:
+            raise ValueError(f"{name} is empty")
+        if len(letters) == array.ndim:
+            for letter, size in zip(letters, array.shape, strict=True):
+                known.setdefault(letter, int(letter) if letter.isdigit() else size)
+        wanted = [known.get(letter) for letter in letters]
+        if wanted != list(array.shape):
+            raise ValueError(f"{name} has shape {array.shape}, but ({words}) requires {tuple(wanted)}")
+        kinds = "U" if ") text" in meaning else "b" if "bool" in meaning else "iu" if name in indices else "biuf"
+        if array.dtype.kind not in kinds:
+            raise ValueError(f"{name} has the type {array.dtype}")
+        if kinds == "biuf" and not (np.isfinite(array).all() and np.abs(array.astype(float)).max() < largest):
+            raise ValueError(f"{name} holds numbers that are not finite or too large")
+    return known

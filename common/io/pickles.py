@@ -15,8 +15,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import read_file
-from congrasp.common.io.npz import read_npz
+from congrasp.common.io.inputs import read_file, read_npz
 
 MAX_BYTES = 512 << 20
 """Limit in bytes of the pickles read by one process, and of their arrays."""
@@ -84,7 +83,7 @@ def read_archive(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Arrays of an NPZ file by name; those of pickles inside are named as in `read_pickle`.
 
     Raises:
-      CongraspError: it is not an NPZ file, exceeds the limits of `common.io.npz`, or holds anything but plain values
+      CongraspError: it is not an NPZ file, exceeds the limits of `common.io.inputs`, or holds anything but plain values
         and arrays.
     """
     arrays = read_npz(path, "Download the file again.", pickled=True)

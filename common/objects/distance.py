@@ -21,8 +21,7 @@ import trimesh
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from congrasp.common.io.caches import keep, read_kept
-from congrasp.common.io.files import cache_folder
+from congrasp.common.io.files import cache_folder, keep, read_kept
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
 from congrasp.common.runtime.parallel import cores

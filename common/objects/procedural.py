@@ -10,8 +10,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.families import BASIC, BUILDERS, HOUSEHOLD, SCANS, Draft
 from congrasp.common.objects.resting import rest_poses
+from congrasp.common.objects.shapes import DENSE, balanced, halves, mass_properties, sample_union
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject, Piece
-from congrasp.common.objects.surface import DENSE, balanced, halves, mass_properties, sample_union
 from congrasp.common.runtime.parallel import parallel_map
 
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)

@@ -5,13 +5,15 @@ z).
 """
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from congrasp.common import mirror
 
 PieceKind = Literal["box", "cylinder", "capsule", "ellipsoid", "mesh"]
+PIECE_KINDS: tuple[PieceKind, ...] = get_args(PieceKind)
+"""In the order of their numbers in files and messages."""
 SURFACE_POINTS = 512
 COLOUR_POINTS = 32_768
 """Greatest number of coloured surface points, if the object has colours."""
@@ -43,7 +45,7 @@ class Piece:
 
 
 class Colours(NamedTuple):
-    """Colours of surface points; elsewhere the colour is a mean of the nearest ones (`painting.colours_at`)."""
+    """Colours of surface points; elsewhere the colour is a mean of the nearest ones, by distance."""
 
     points: np.ndarray
     """(P, 3) float32, m."""

@@ -12,14 +12,13 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import LONGEST_NAME, file_name, read_file
-from congrasp.common.objects.spec import COLOUR_POINTS, SURFACE_POINTS, Colours, GraspObject, Piece
+from congrasp.common.objects.spec import COLOUR_POINTS, PIECE_KINDS, SURFACE_POINTS, Colours, GraspObject, Piece
 from congrasp.common.wire.codec import Message, decode, encode
 
 SUFFIX = ".safetensors"
 MAX_BYTES = 64 << 20
 """Largest size of an object file in bytes."""
 _FORMAT = 1
-_KINDS = ("box", "cylinder", "capsule", "ellipsoid", "mesh")
 _ERRORS = ("surface_error", "volume_error")
 _ARRAYS = ("graspable", "inertia", "points", "normals", "labels", "rest_poses", "visual_vertices", "visual_faces")
 
@@ -114,7 +113,7 @@ def _to_message(obj: GraspObject) -> Message:
         arrays |= {"colour_points": obj.colours.points, "colour_values": obj.colours.values}
     pieces = obj.pieces
     meshes = [np.zeros((0, 3)) if piece.vertices is None else piece.vertices for piece in pieces]
-    arrays["piece_kind"] = np.array([_KINDS.index(piece.kind) for piece in pieces], np.int32)
+    arrays["piece_kind"] = np.array([PIECE_KINDS.index(piece.kind) for piece in pieces], np.int32)
     arrays["piece_part"] = np.array([piece.part for piece in pieces], np.int32)
     for name in ("size", "pos", "quat"):
         arrays[f"piece_{name}"] = np.array([getattr(piece, name) for piece in pieces], np.float64)
@@ -150,7 +149,7 @@ def _from_message(message: Message) -> GraspObject:
     vertices = np.split(arrays["piece_vertices"], ends[:-1])
     pieces = tuple(
         Piece(
-            kind=_KINDS[arrays["piece_kind"][i]],  # type: ignore[arg-type]
+            kind=PIECE_KINDS[arrays["piece_kind"][i]],
             size=tuple(arrays["piece_size"][i].tolist()),
             pos=tuple(arrays["piece_pos"][i].tolist()),
             quat=tuple(arrays["piece_quat"][i].tolist()),

@@ -1,7 +1,15 @@
-"""Privileged inputs of the critic: true parameters of an episode, and the true state if the policy has sensors.
+"""Privileged inputs in training: those of the critic and of a teacher, which policies of robots cannot observe.
 
-The critic is only used in training, so it may observe what the actor and the robot cannot (asymmetric actor-critic,
-Pinto et al. 2018, arXiv 1710.06542). Actors record these inputs; no policy acts on them.
+The critic's are the true parameters of an episode, and the true state if the policy has sensors (asymmetric
+actor-critic, Pinto et al. 2018, arXiv 1710.06542). Actors record these inputs; no policy acts on them.
+
+The teacher's are the full observation, and what converts its actions to those of a student that observes another state.
+A residual is relative to the guidance of its policy. A student's guidance differs if its tracker has errors, so that
+the teacher's residual would move its wrist to another place. Both share the wrist's target: the student's label is
+(u_tgt - u_g) / alpha_w with the teacher's target u_tgt and the student's guidance u_g.
+
+Both share the fingers' targets likewise. The teacher continues from the targets m that the servos follow, the student
+from its newest ones m', which the servos follow later (`SensingConfig.latency`): its label is a_f + (m - m') / alpha_f.
 """
 
 import dataclasses
@@ -9,18 +17,19 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from congrasp.common.hands.motors import tip_forces
+from congrasp.common.hands.motors import motor_positions, tip_forces
 from congrasp.common.hands.spec import Hand
 from congrasp.common.task import observation
 from congrasp.common.task.constraints.base import ObservationField, Scene
+from congrasp.common.task.control import Guided, guided, wrist_lead
 from congrasp.common.task.sensing import Sensors
-from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.settings import GRAVITY, ControlConfig, TaskSettings
 from congrasp.common.task.types import Array
 
-GRAVITY = 9.81
-"""m/s^2."""
 MOST_LOAD = 10.0
 """Upper bound of `load`."""
+_WRIST = (6, 7, 13, 14, 20)
+"""Ends of the wrist's numbers: the teacher's `Guided`, then the lead of the student's guidance alone."""
 
 
 class Parameters(NamedTuple):
@@ -104,3 +113,40 @@ def observe(scene: Scene, parameters: Parameters) -> Array:
 def _full(task: TaskSettings) -> TaskSettings:
     """Returns the task with a policy that observes the full state."""
     return dataclasses.replace(task, observation="full")
+
+
+def extra(hand: Hand) -> int:
+    """Numbers after the observation: the wrist's, and the lag (M) of the motors' followed targets, rad."""
+    return _WRIST[-1] + len(hand.motors)
+
+
+def observe_for_teacher(true: Scene, seen: Scene, control: ControlConfig) -> Array:
+    """Returns the full observation of the true state and the numbers of `extra` (B, S).
+
+    Args:
+      true: the true scene.
+      seen: the scene of the same control step as the student observes it.
+      control: limits and scales.
+    """
+    teacher = guided(true, control)
+    limit, table = teacher.limit[:, None], jnp.asarray(teacher.table, teacher.ahead.dtype)[:, None]
+    own = guided(seen, control).bounded(control)
+    lag = motor_positions(true.hand, true.state.q_target - seen.state.q_target)
+    return jnp.concatenate([observation.observe(true), teacher.ahead, limit, teacher.velocity, table, own, lag], -1)
+
+
+def student_action(hand: Hand, control: ControlConfig, rows: Array, action: Array) -> Array:
+    """Returns the action (..., M + 6) that gives a student the targets of its teacher.
+
+    Args:
+      hand: the hand, for its servos.
+      control: limits and scales.
+      rows: (..., S) of `observe_for_teacher`.
+      action: (..., M + 6) action of the teacher.
+    """
+    numbers = rows[..., -extra(hand) :].astype(action.dtype)
+    ahead, limit, velocity, table, own, lag = jnp.split(numbers, _WRIST, -1)
+    teacher = Guided(ahead, limit[..., 0], velocity, table[..., 0] > 0.5)
+    lead = wrist_lead(hand, control, teacher, action[..., -6:])
+    scale = jnp.repeat(jnp.stack([control.wrist_position_scale, control.wrist_rotation_scale]), 3)
+    return jnp.concatenate([action[..., :-6] + lag / control.finger_scale, (lead - own) / scale], -1)

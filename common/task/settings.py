@@ -8,6 +8,9 @@ from typing import Literal
 
 from congrasp.common.hands.spec import CONTACT_TIME
 
+GRAVITY = 9.81
+"""m/s^2."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ControlConfig:
@@ -120,7 +123,7 @@ class TaskSettings:
     """Time constant of the hand's contacts, s; at least two physics steps. At 0.006 a grasp's contacts are about 1 mm
     deep."""
     impratio: float = 100.0
-    """How much stiffer friction is than normal contact forces, in training (MuJoCo's option). With 1 a control step in
+    """Stiffness of friction in training, relative to normal contact forces (MuJoCo's option). With 1 a control step in
     contact takes half the time on a CPU, but objects creep out of every grasp within seconds. Evaluations and grasps
     always have the default."""
     torsional_friction: float = 0.004

@@ -11,6 +11,7 @@ import json
 import logging
 import re
 import resource
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,9 +20,10 @@ from typing import Any
 import zenoh
 
 from congrasp.common.errors import CongraspError, TransportError
-from congrasp.common.transport.base import join
+from congrasp.common.transport.base import Subscription, join
 from congrasp.common.transport.keys import FLOWS, Flow
 from congrasp.common.transport.security import Credentials, limits, refusal
+from congrasp.common.wire.codec import Message, decode
 
 LONGEST: dict[Flow, int] = {"control": 2 << 20, "log": 32 << 20, "policy": 2 << 20}
 """Largest message that is reassembled, in bytes; each connection may reassemble several at once."""
@@ -39,6 +41,8 @@ _ACCEPT_MS = 5000  # deadline of a connection's handshake, ms
 _PENDING = 4096  # most connections in a handshake, but at most a quarter of the open files
 _FILES = 16384  # limit of the process's open files, if the system allows it: each connection is one
 _SESSIONS = 1000  # most connected peers, but at most a quarter of the open files: Zenoh panics if none is left
+STAMP = struct.Struct("<8sQ")
+"""Sender and count of a sample, by which a subscriber detects gaps."""
 _log = logging.getLogger(__name__)
 
 
@@ -268,6 +272,19 @@ class Sessions:
         with self._changed:
             self._changed.wait_for(lambda: not self._inside, max(0.0, deadline - time.monotonic()))
 
+    def watch_revocations(self, credentials: Credentials, period: float, known: frozenset[str] | None) -> None:
+        """Checks for revoked certificates in a thread, until the sessions are closed.
+
+        Args:
+          credentials: credentials of this process.
+          period: seconds between two checks.
+          known: the certificates that were revoked when a listener's sessions were opened; None if they connect.
+        """
+        if known is None:
+            self.start(heed_revocations, self, credentials, period)
+        else:
+            self.start(follow_revocations, self, credentials, known, period)
+
     def peers(self) -> set[str]:
         """Common names of the certificates of connected peers."""
         return {str(link.auth_identifier) for session in list(self._open.values()) for link in session.info.links()}
@@ -324,3 +341,51 @@ def heed_revocations(sessions: Sessions, credentials: Credentials, period: float
         if sessions.failure:
             _log.error("%s", sessions.failure)
             sessions.close()
+
+
+def received(channel: Any) -> Iterator[Any]:
+    """Yields the items of a channel until it is closed."""
+    with contextlib.suppress(zenoh.ZError):
+        while True:
+            yield channel.recv()
+
+
+def listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:
+    """Moves samples to a subscription, with the number of lost ones before each."""
+    last: dict[str, tuple[bytes, int]] = {}
+    for sample in received(samples):
+        key, lost = str(sample.key_expr), 0
+        stamp = sample.attachment.to_bytes() if sample.attachment else b""
+        if len(stamp) == STAMP.size:
+            sender, count = STAMP.unpack(stamp)
+            known_sender, known_count = last.get(key, (sender, count - 1))
+            lost = max(0, count - known_count - 1) if sender == known_sender else 0
+            last[key] = sender, count
+        subscription.push(key, functools.partial(_decoded, sample.payload, max_message), lost)
+
+
+def _decoded(payload: zenoh.ZBytes, max_message: int) -> Message:
+    """Decodes the message of a payload."""
+    return decode(payload.to_bytes(), max_bytes=max_message)
+
+
+def watch_tokens(samples: Any, on_change: Callable[[str, bool], None], closed: threading.Event) -> None:
+    """Reports liveliness tokens until the session closes; runs in a separate thread.
+
+    When the session is reopened, all known tokens are reported as gone first; otherwise peers that left meanwhile would
+    not be noticed.
+    """
+    shown: set[str] = set()
+
+    def report(key: str, alive: bool) -> None:
+        (shown.add if alive else shown.discard)(key)
+        try:
+            on_change(key, alive)
+        except Exception:
+            _log.exception("Handling the token %s failed.", key)
+
+    for sample in received(samples):
+        report(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+    if not closed.is_set():
+        for key in sorted(shown):
+            report(key, False)

@@ -30,7 +30,7 @@ from congrasp.common.transport.base import Admission, Answerer, Damage, Subscrip
 from congrasp.common.transport.keys import FLOWS, Flow, account, flow
 from congrasp.common.transport.ports import shifted
 from congrasp.common.transport.security import Credentials, secured
-from congrasp.common.transport.zenoh_session import Sessions, first_line
+from congrasp.common.transport.zenoh_session import STAMP, Sessions, first_line, listen_to, received, watch_tokens
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 _SHORTEST, _FIRST, _LONGEST = 8 << 10, 32 << 10, 4 << 20  # bytes of a chunk
@@ -190,7 +190,6 @@ def fetch(head: bytes, first: bytes, ask: Ask, pace: Pace, *, most: int, timeout
 
 _QUEUE = 256  # samples queued for a thread that only moves them on
 _FEW = 4 << 10  # longest query that may be sent twice, bytes
-_STAMP = struct.Struct("<8sQ")  # sender and count, by which a subscriber detects gaps
 _REVOCATION_SECONDS = 5.0  # between two checks of the list of revoked certificates
 _log = logging.getLogger(__name__)
 
@@ -262,11 +261,8 @@ class ZenohTransport(Transport):
         except BaseException:
             self.close()
             raise
-        if listen and credentials:
-            follow = zenoh_session.follow_revocations
-            self._sessions.start(follow, self._sessions, credentials, known, revocation_seconds)
-        elif credentials:
-            self._sessions.start(zenoh_session.heed_revocations, self._sessions, credentials, revocation_seconds)
+        if credentials:
+            self._sessions.watch_revocations(credentials, revocation_seconds, known if listen else None)
 
     def serve(
         self,
@@ -365,7 +361,7 @@ class ZenohTransport(Transport):
                     payload,
                     congestion_control=zenoh.CongestionControl.DROP,
                     express=name == "control",
-                    attachment=_STAMP.pack(self._sender, count),
+                    attachment=STAMP.pack(self._sender, count),
                 )
         except zenoh.ZError:
             if self._sessions.get(name) is session:
@@ -379,7 +375,7 @@ class ZenohTransport(Transport):
             self._sessions.declare(
                 flow(key_expression),
                 lambda session: session.declare_subscriber(key_expression, FifoChannel(_QUEUE)),
-                functools.partial(_listen_to, subscription=subscription, max_message=self._max_message),
+                functools.partial(listen_to, subscription=subscription, max_message=self._max_message),
             )
         )
         return subscription
@@ -394,7 +390,7 @@ class ZenohTransport(Transport):
         def declare(session: zenoh.Session) -> Any:
             return session.liveliness().declare_subscriber(key_expression, FifoChannel(_QUEUE), history=True)
 
-        watch = functools.partial(_watch, on_change=on_change, closed=self._sessions.closed)
+        watch = functools.partial(watch_tokens, on_change=on_change, closed=self._sessions.closed)
         self._sessions.declare(flow(key_expression), declare, watch)
 
     def close(self) -> None:
@@ -425,13 +421,6 @@ class ZenohTransport(Transport):
         return payload
 
 
-def _received(channel: Any) -> Iterator[Any]:
-    """Yields the items of a channel until it is closed."""
-    with contextlib.suppress(zenoh.ZError):
-        while True:
-            yield channel.recv()
-
-
 class _Server(NamedTuple):
     """Handler of the queries of a key, with its options."""
 
@@ -444,7 +433,7 @@ class _Server(NamedTuple):
 
 def _serve(queries: Any, server: _Server) -> None:
     """Answers queries until the session closes; runs in a separate thread."""
-    for query in _received(queries):
+    for query in received(queries):
         key = str(query.key_expr)
         wanted = query.attachment.to_bytes() if query.attachment else b""
         if not is_request(wanted):
@@ -493,44 +482,3 @@ def _reply(
         else:
             with outbox.first(payload, attachment, account(key)) as (piece, head):
                 query.reply(key, piece, attachment=head)
-
-
-def _listen_to(samples: Any, subscription: Subscription, max_message: int) -> None:
-    """Moves samples to a subscription, with the number of lost ones before each."""
-    last: dict[str, tuple[bytes, int]] = {}
-    for sample in _received(samples):
-        key, lost = str(sample.key_expr), 0
-        stamp = sample.attachment.to_bytes() if sample.attachment else b""
-        if len(stamp) == _STAMP.size:
-            sender, count = _STAMP.unpack(stamp)
-            known_sender, known_count = last.get(key, (sender, count - 1))
-            lost = max(0, count - known_count - 1) if sender == known_sender else 0
-            last[key] = sender, count
-        subscription.push(key, functools.partial(_decoded, sample.payload, max_message), lost)
-
-
-def _decoded(payload: zenoh.ZBytes, max_message: int) -> Message:
-    """Decodes the message of a payload."""
-    return decode(payload.to_bytes(), max_bytes=max_message)
-
-
-def _watch(samples: Any, on_change: Callable[[str, bool], None], closed: threading.Event) -> None:
-    """Reports liveliness tokens until the session closes; runs in a separate thread.
-
-    When the session is reopened, all known tokens are reported as gone first; otherwise peers that left meanwhile would
-    not be noticed.
-    """
-    shown: set[str] = set()
-
-    def report(key: str, alive: bool) -> None:
-        (shown.add if alive else shown.discard)(key)
-        try:
-            on_change(key, alive)
-        except Exception:
-            _log.exception("Handling the token %s failed.", key)
-
-    for sample in _received(samples):
-        report(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
-    if not closed.is_set():
-        for key in sorted(shown):
-            report(key, False)

@@ -2,7 +2,7 @@
 
 The student acts, and the teacher, which observes the full state, labels each state with its action (DAgger:
 Ross et al. 2011, arXiv 1011.0686, without its mixture of the two and without keeping old states). The student's mean is
-regressed on the action that gives the teacher's targets (`common.task.teaching`), in units of the teacher's standard
+regressed on the action that gives the teacher's targets (`common.task.privileged`), in units of the teacher's standard
 deviation: up to a constant the KL divergence from the student to the teacher, whose standard deviation the student
 keeps. The critic learns nothing.
 """
@@ -25,14 +25,21 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, PolicySpec, full_layout
 from congrasp.common.policy.network import Layout, Params
-from congrasp.common.policy.normalizer import Affine, Statistics
+from congrasp.common.policy.normalizer import Affine
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task.config import ControlConfig, TaskConfig
-from congrasp.common.task.teaching import extra, student_action
+from congrasp.common.task.privileged import extra, student_action
 from congrasp.common.task.types import Array
-from congrasp.common.wire.schema import RECORDABLE, Schema
-from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
-from congrasp.learner.batch import partition_specs
+from congrasp.common.wire.messages import RECORDABLE, Schema
+from congrasp.learner.algorithms.protocol import (
+    LearnedPolicy,
+    NonFiniteUpdate,
+    TrainState,
+    gathered_moments,
+    of_ranks,
+    partition_specs,
+    random_policy,
+)
 from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 _SCHEMA = {name: RECORDABLE[name] for name in ("observation", "teacher_observation")}
@@ -122,8 +129,7 @@ class Distillation:
                 "Use fewer --distill.minibatches, more environments or longer rollouts.",
             )
         arrays = shard({name: batch[name] for name in _SCHEMA}, mesh, _SPECS)
-        gathered = jax.device_get(unreplicate(_moments(arrays["observation"], mesh=mesh), mesh))
-        moments = [Statistics(*parts) for parts in zip(*gathered, strict=True)]
+        moments = of_ranks(jax.device_get(unreplicate(gathered_moments(arrays["observation"], mesh=mesh), mesh)))
         frozen = state.observation if state.observation.count else normalizer.merge(*moments)
         rate = config.learning_rate * max(1.0 - state.version / max(self._updates, 1), _LAST_RATE)
         given = _Given(normalizer.observation_affine(frozen, self._spec.layout), self._teacher, jnp.float32(rate))
@@ -180,16 +186,6 @@ def _check(teacher: PolicyBundle, spec: PolicySpec, task: TaskConfig) -> None:
 def _transform(max_grad_norm: float) -> optax.GradientTransformation:
     """Adam's steps on clipped gradients, before the learning rate."""
     return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.scale_by_adam())
-
-
-@functools.partial(jax.jit, static_argnames="mesh")
-def _moments(observation: Array, *, mesh: Mesh | None) -> Statistics:
-    """Moments of each rank's observations, stacked."""
-
-    def program(observation: Array) -> Statistics:
-        return Collectives(mesh).gather(normalizer.moments(observation, event_axes=1))
-
-    return shard_map(mesh, program, _SPECS["observation"])(observation)
 
 
 @functools.partial(jax.jit, static_argnames=("layouts", "body", "config", "mesh"))

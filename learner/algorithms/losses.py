@@ -5,16 +5,22 @@ learner's at the start of the update; the current one is being optimised. The tr
 policy, so that old data do not consume it before learning begins; an importance weight corrects for the behaviour
 policy. With the proximal policy equal to the behaviour policy the weight is exactly one and the objective is that of
 plain PPO.
+
+A batch is evaluated once in an update by the proximal policy and the critic; minibatches of the samples then minimise
+the objective.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from congrasp.common.policy import network
+from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.network import Layout, Params
+from congrasp.common.policy.normalizer import Affine
 from congrasp.common.task.types import Array
+from congrasp.learner.algorithms import gae
+from congrasp.learner.distributed.collectives import Collectives
 
 
 class Sample(NamedTuple):
@@ -99,3 +105,127 @@ def objective(
     )
     total = terms.policy_loss + coefficients.value * terms.value_loss - coefficients.entropy * terms.entropy
     return total, terms
+
+
+class Inputs(NamedTuple):
+    """Inputs of an update, in addition to the state."""
+
+    batch: dict[str, Array]
+    observations: Affine
+    """Normalisation of observations, frozen."""
+    privileged: Affine | None
+    """Normalisation of the critic's privileged inputs, frozen; None if there are none."""
+    returns: Affine
+    """Normalisation of returns, frozen."""
+    hyper: dict[str, Any]
+    """Hyperparameters that are arguments of the compiled program; the others are static."""
+
+
+class Evaluation(NamedTuple):
+    """A batch evaluated by the proximal policy and the critic; leading axes (T, B)."""
+
+    samples: Sample
+    """Inputs of the networks, not normalised yet: gathering a minibatch's rows in half precision is cheaper."""
+    log_weight: Array
+    """Log of proximal over behaviour probability."""
+    weight: Array
+    """The same ratio, truncated; not a logarithm."""
+    value: Array
+    """In units of the scaled rewards, like the `returns`."""
+    returns: Array
+    advantage_std: Array
+    """() mean over all ranks."""
+    td_error: Array
+    truncated_error: Array
+    """TD error of a final step without bootstrap, r - V."""
+
+
+def normalised_inputs(affine: Affine | None, privileged: Array | None) -> Array | None:
+    """Normalised privileged inputs of the critic; None if there are none."""
+    return None if affine is None or privileged is None else normalizer.apply(affine, privileged)
+
+
+def evaluate(params: Params, given: Inputs, collectives: Collectives, layout: Layout) -> Evaluation:
+    """Computes advantages, targets and importance weights, which stay fixed during the update."""
+    batch, hyper = given.batch, given.hyper
+    action, behaviour = batch["action"], batch["log_probability"]
+    log_std = params["actor"]["log_std"]
+    observation = normalizer.apply(given.observations, batch["observation"])
+    exact, _ = network.policy(params, layout, observation)
+    log_exact = network.log_probability(exact, log_std, action)
+    weight = importance_weight(log_exact, behaviour, hyper["importance_max"])
+    mean, _ = network.policy(params, layout, observation, exact=False)
+
+    def values(normalised: Array, privileged: Array | None) -> Array:
+        inputs = normalised_inputs(given.privileged, privileged)
+        return network.value(params, layout, normalised, inputs) / given.returns.scale + given.returns.shift
+
+    value = values(observation, batch.get("privileged"))
+    last_observation = normalizer.apply(given.observations, batch["last_observation"])
+    last_value = values(last_observation, batch.get("last_privileged"))
+    reward = batch["reward"] * hyper["reward_scale"]
+    truncated = batch["truncated"] & hyper["bootstrap_truncated"]
+    chunk = reward, value, last_value, batch["terminal"]
+    advantage, returns = gae.advantages(*chunk, hyper["gamma"], hyper["gae_lambda"], truncated)
+    advantage_std = jnp.sqrt(collectives.variance(advantage))
+    samples = Sample(
+        observation=batch["observation"],
+        action=action,
+        log_proximal=jnp.where(hyper["decoupled"], network.log_probability(mean, log_std, action), behaviour),
+        mean_proximal=mean,
+        weight=jnp.where(hyper["decoupled"], weight, 1.0),
+        advantage=(advantage - collectives.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
+        target=(returns - given.returns.shift) * given.returns.scale,
+        stale=jnp.broadcast_to(batch["lag"] > 0, reward.shape),
+        privileged=batch.get("privileged"),
+    )
+    return Evaluation(
+        samples=samples,
+        log_weight=log_exact - behaviour,
+        weight=weight,
+        value=value,
+        returns=returns,
+        advantage_std=advantage_std,
+        td_error=gae.td_errors(*chunk, hyper["gamma"], truncated),
+        truncated_error=reward - value,
+    )
+
+
+def batch_metrics(given: Inputs, evaluation: Evaluation, collectives: Collectives) -> dict[str, Array]:
+    """Scalars about a batch and the age of its policy, over all ranks."""
+    variance = collectives.variance(evaluation.returns)
+    residual = collectives.variance(evaluation.returns - evaluation.value)
+    truncated = evaluation.log_weight > jnp.log(given.hyper["importance_max"])
+    fresh = ~evaluation.samples.stale
+    gap, share = collectives.mean((jnp.mean(jnp.abs(evaluation.log_weight) * fresh), jnp.mean(fresh)))
+    return {
+        # Actor and learner evaluate the same version in different programs: this is rounding, not lag.
+        "log_probability_gap": gap / jnp.maximum(share, 1e-9),
+        "importance_max": collectives.max(jnp.max(evaluation.weight)),
+        "explained_variance": 1.0 - residual / (variance + 1e-8),
+        "advantage_std": evaluation.advantage_std,
+        "td_error_std": jnp.sqrt(collectives.variance(evaluation.td_error)),
+        **_truncation_metrics(given, evaluation, collectives),
+        **collectives.mean(
+            {
+                "importance_mean": jnp.mean(evaluation.weight),
+                "importance_truncated": jnp.mean(truncated.astype(jnp.float32)),
+                "behaviour_kl": -jnp.mean(evaluation.log_weight),
+                "reward_mean": jnp.mean(given.batch["reward"]),
+                "return_mean": jnp.mean(evaluation.returns),
+                "value_mean": jnp.mean(evaluation.value),
+            }
+        ),
+    }
+
+
+def _truncation_metrics(given: Inputs, evaluation: Evaluation, collectives: Collectives) -> dict[str, Array]:
+    """Share of truncated steps, and their mean TD error with and without bootstrap; 0 in a batch without any."""
+    truncated = (given.batch["truncated"] & given.batch["terminal"]).astype(jnp.float32)
+    cut = evaluation.truncated_error
+    bootstrapped = cut + given.hyper["gamma"] * evaluation.value
+    sums = {"td_error_truncated": bootstrapped, "td_error_truncated_as_terminal": cut}
+    share, means = collectives.mean(
+        (jnp.mean(truncated), {name: jnp.mean(truncated * error) for name, error in sums.items()})
+    )
+    return {"truncated": share, **{name: mean / jnp.maximum(share, 1e-9) for name, mean in means.items()}}

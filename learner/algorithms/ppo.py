@@ -13,7 +13,7 @@ so that weights and statistics are bitwise identical on all ranks.
 
 import functools
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,15 +23,22 @@ from jax.sharding import Mesh, PartitionSpec
 
 from congrasp.common.config import PPOConfig
 from congrasp.common.errors import CongraspError
-from congrasp.common.policy import network, normalizer
+from congrasp.common.policy import normalizer
 from congrasp.common.policy.bundle import PolicySpec
 from congrasp.common.policy.network import Layout, Params
 from congrasp.common.policy.normalizer import Affine, Statistics
 from congrasp.common.task.types import Array
-from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, RECORDED, Schema
-from congrasp.learner.algorithms import gae, losses
-from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
-from congrasp.learner.batch import partition_specs
+from congrasp.common.wire.messages import PRIVILEGED, RECORDABLE, RECORDED, Schema
+from congrasp.learner.algorithms import losses
+from congrasp.learner.algorithms.protocol import (
+    LearnedPolicy,
+    NonFiniteUpdate,
+    TrainState,
+    gathered_moments,
+    of_ranks,
+    partition_specs,
+    random_policy,
+)
 from congrasp.learner.distributed.collectives import AXIS, REPLICATED, Collectives, shard, shard_map, unreplicate
 
 _SPECS = {**partition_specs(RECORDABLE), "lag": PartitionSpec(AXIS)}
@@ -57,20 +64,6 @@ _TRUSTED_KL = 4.0  # KL targets; a minibatch with a larger divergence does not u
 Learnt = tuple[Params, Any, Array]
 """Parameters, the optimiser's state and the random key: the device entries of a `TrainState`."""
 _ON_DEVICE = 3  # entries of a TrainState
-
-
-class _Given(NamedTuple):
-    """Inputs of an update, in addition to the state."""
-
-    batch: dict[str, Array]
-    observations: Affine
-    """Normalisation of observations, frozen."""
-    privileged: Affine | None
-    """Normalisation of the critic's privileged inputs, frozen; None if there are none."""
-    returns: Affine
-    """Normalisation of returns, frozen."""
-    hyper: dict[str, Any]
-    """Hyperparameters that are arguments of the compiled program; the others are static."""
 
 
 class PPO:
@@ -124,7 +117,7 @@ class PPO:
             term and holds the state before the update.
           CongraspError: there are more minibatches than transitions.
         """
-        layout, config = self._spec.layout, self._config
+        config = self._config
         if batch["reward"].size < config.minibatches:
             raise CongraspError(
                 f"A batch of {batch['reward'].size} transitions cannot be split into {config.minibatches} minibatches.",
@@ -133,24 +126,19 @@ class PPO:
         lag = batch.get("lag", np.zeros(batch["reward"].shape[1], np.int32))
         arrays = {**{name: batch[name] for name in self.batch_schema}, "lag": lag}
         arrays = shard(arrays, mesh, _specs(arrays))
-        moments = {name: _observed(arrays[name], mesh=mesh) for name in _NORMALISED if name in arrays}
+        moments = {name: gathered_moments(arrays[name], mesh=mesh) for name in _NORMALISED if name in arrays}
         frozen = {name: _first(getattr(state, name), found, mesh) for name, found in moments.items()}
-        given = _Given(
+        given = losses.Inputs(
             batch=arrays,
-            observations=normalizer.observation_affine(frozen["observation"], layout),
+            observations=normalizer.observation_affine(frozen["observation"], self._spec.layout),
             privileged=normalizer.privileged_affine(frozen["privileged"]) if "privileged" in frozen else None,
             returns=normalizer.value_affine(state.value),
-            hyper={name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)}
-            | {
-                "kl_target": config.kl_target_at(state.version, self._updates),
-                "noise_kept": config.noise_kept_at(state.version, self._updates),
-                "least_std": config.least_std_at(state.version, self._updates),
-            },
+            hyper=self._hyperparameters(state.version),
         )
         learnt, returns, failure, scalars = _optimise(
             *shard(state[:_ON_DEVICE], mesh),
             given,
-            layout=layout,
+            layout=self._spec.layout,
             epochs=config.epochs,
             minibatches=config.minibatches,
             mesh=mesh,
@@ -161,15 +149,25 @@ class PPO:
         if failure != _FINE:
             source = "rollouts" if _CHECKED[failure] in _CHECKED_INPUTS else "optimisation"
             raise NonFiniteUpdate(_CHECKED[failure], source, state)
-        value = normalizer.merge(state.value, *_ranks(returns))
+        value = normalizer.merge(state.value, *of_ranks(returns))
         state = state._replace(
             params=_preserve_values(state.params, normalizer.value_affine(state.value), normalizer.value_affine(value)),
             value=value,
             version=state.version + 1,
             transitions=state.transitions + arrays["reward"].size,
-            **{name: normalizer.merge(getattr(state, name), *_ranks(found)) for name, found in moments.items()},
+            **{name: normalizer.merge(getattr(state, name), *of_ranks(found)) for name, found in moments.items()},
         )
         return state, {name: float(scalar) for name, scalar in scalars.items()}
+
+    def _hyperparameters(self, version: int) -> dict[str, Any]:
+        """Hyperparameters of the update of a version that are arguments of the compiled program."""
+        config = self._config
+        fixed = {name: value for name, value in vars(config).items() if isinstance(value, float | tuple | bool)}
+        return fixed | {
+            "kl_target": config.kl_target_at(version, self._updates),
+            "noise_kept": config.noise_kept_at(version, self._updates),
+            "least_std": config.least_std_at(version, self._updates),
+        }
 
 
 @optax.inject_hyperparams
@@ -185,11 +183,6 @@ def _with(optimizer: Any, **hyperparams: Array) -> Any:
     return optimizer._replace(hyperparams={**optimizer.hyperparams, **hyperparams})
 
 
-def _ranks(gathered: Statistics) -> list[Statistics]:
-    """Splits statistics stacked by `Collectives.gather` into those of each rank."""
-    return [Statistics(*(entry[i] for entry in gathered)) for i in range(len(gathered.count))]
-
-
 def _specs(names: Iterable[str]) -> dict[str, PartitionSpec]:
     """Partition specs of the arrays of a batch."""
     return {name: _SPECS[name] for name in names}
@@ -197,17 +190,7 @@ def _specs(names: Iterable[str]) -> dict[str, PartitionSpec]:
 
 def _first(statistics: Statistics, moments: Statistics, mesh: Mesh | None) -> Statistics:
     """Returns the statistics, or those of the batch while there are no samples yet."""
-    return statistics if statistics.count else normalizer.merge(*_ranks(unreplicate(moments, mesh)))
-
-
-@functools.partial(jax.jit, static_argnames="mesh")
-def _observed(observation: Array, *, mesh: Mesh | None) -> Statistics:
-    """Moments of each rank's observations, stacked."""
-
-    def program(observation: Array) -> Statistics:
-        return Collectives(mesh).gather(normalizer.moments(observation, event_axes=1))
-
-    return shard_map(mesh, program, _SPECS["observation"])(observation)
+    return statistics if statistics.count else normalizer.merge(*of_ranks(unreplicate(moments, mesh)))
 
 
 @functools.partial(jax.jit, static_argnames=("layout", "epochs", "minibatches", "mesh"), donate_argnames="optimizer")
@@ -215,7 +198,7 @@ def _optimise(
     params: Params,
     optimizer: Any,
     key: Array,
-    given: _Given,
+    given: losses.Inputs,
     *,
     layout: Layout,
     epochs: int,
@@ -226,86 +209,16 @@ def _optimise(
     program = functools.partial(
         _program, collectives=Collectives(mesh), layout=layout, epochs=epochs, minibatches=minibatches
     )
-    specs = REPLICATED, _Given._make([_specs(given.batch), *[REPLICATED] * 4])
+    specs = REPLICATED, losses.Inputs._make([_specs(given.batch), *[REPLICATED] * 4])
     return shard_map(mesh, program, specs)((params, optimizer, key), given)
 
 
-class _Evaluation(NamedTuple):
-    """A batch evaluated by the proximal policy and the critic; leading axes (T, B)."""
-
-    samples: losses.Sample
-    """Inputs of the networks, not normalised yet: gathering a minibatch's rows in half precision is cheaper."""
-    log_weight: Array
-    """Log of proximal over behaviour probability."""
-    weight: Array
-    """The same ratio, truncated; not a logarithm."""
-    value: Array
-    """In units of the scaled rewards, like the `returns`."""
-    returns: Array
-    advantage_std: Array
-    """() mean over all ranks."""
-    td_error: Array
-    truncated_error: Array
-    """TD error of a final step without bootstrap, r - V."""
-
-
-def _normalised(affine: Affine | None, privileged: Array | None) -> Array | None:
-    """Normalised privileged inputs of the critic; None if there are none."""
-    return None if affine is None or privileged is None else normalizer.apply(affine, privileged)
-
-
-def _evaluate(params: Params, given: _Given, collectives: Collectives, layout: Layout) -> _Evaluation:
-    """Computes advantages, targets and importance weights, which stay fixed during the update."""
-    batch, hyper = given.batch, given.hyper
-    action, behaviour = batch["action"], batch["log_probability"]
-    log_std = params["actor"]["log_std"]
-    observation = normalizer.apply(given.observations, batch["observation"])
-    exact, _ = network.policy(params, layout, observation)
-    log_exact = network.log_probability(exact, log_std, action)
-    weight = losses.importance_weight(log_exact, behaviour, hyper["importance_max"])
-    mean, _ = network.policy(params, layout, observation, exact=False)
-
-    def values(normalised: Array, privileged: Array | None) -> Array:
-        inputs = _normalised(given.privileged, privileged)
-        return network.value(params, layout, normalised, inputs) / given.returns.scale + given.returns.shift
-
-    value = values(observation, batch.get("privileged"))
-    last_observation = normalizer.apply(given.observations, batch["last_observation"])
-    last_value = values(last_observation, batch.get("last_privileged"))
-    reward = batch["reward"] * hyper["reward_scale"]
-    truncated = batch["truncated"] & hyper["bootstrap_truncated"]
-    chunk = reward, value, last_value, batch["terminal"]
-    advantage, returns = gae.advantages(*chunk, hyper["gamma"], hyper["gae_lambda"], truncated)
-    advantage_std = jnp.sqrt(collectives.variance(advantage))
-    samples = losses.Sample(
-        observation=batch["observation"],
-        action=action,
-        log_proximal=jnp.where(hyper["decoupled"], network.log_probability(mean, log_std, action), behaviour),
-        mean_proximal=mean,
-        weight=jnp.where(hyper["decoupled"], weight, 1.0),
-        advantage=(advantage - collectives.mean(jnp.mean(advantage))) / (advantage_std + 1e-8),
-        target=(returns - given.returns.shift) * given.returns.scale,
-        stale=jnp.broadcast_to(batch["lag"] > 0, reward.shape),
-        privileged=batch.get("privileged"),
-    )
-    return _Evaluation(
-        samples=samples,
-        log_weight=log_exact - behaviour,
-        weight=weight,
-        value=value,
-        returns=returns,
-        advantage_std=advantage_std,
-        td_error=gae.td_errors(*chunk, hyper["gamma"], truncated),
-        truncated_error=reward - value,
-    )
-
-
 def _program(
-    learnt: Learnt, given: _Given, *, collectives: Collectives, layout: Layout, epochs: int, minibatches: int
+    learnt: Learnt, given: losses.Inputs, *, collectives: Collectives, layout: Layout, epochs: int, minibatches: int
 ) -> tuple[Learnt, Statistics, Array, dict[str, Array]]:
     """Body of `_optimise` for one rank."""
     (params, optimizer, key), hyper = learnt, given.hyper
-    evaluation = _evaluate(params, given, collectives, layout)
+    evaluation = losses.evaluate(params, given, collectives, layout)
     inputs = [given.batch.get(name, jnp.zeros(())) for name in _CHECKED_INPUTS]
     failure = collectives.max(_first_failure(jnp.int32(_FINE), 0, *inputs, evaluation.value))
     key, epochs_key = jax.random.split(key)
@@ -332,52 +245,12 @@ def _program(
         "learning_rate": learning_rate,
         "action_std": jnp.mean(jnp.exp(moved["actor"]["log_std"])),
     }
-    metrics |= _batch_metrics(given, evaluation, collectives)
+    metrics |= losses.batch_metrics(given, evaluation, collectives)
     moved_optimizer = _with(moved_optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
     params, optimizer = jax.tree.map(
         lambda new, old: jnp.where(failure == _FINE, new, old), (moved, moved_optimizer), (params, optimizer)
     )
     return (params, optimizer, key), collectives.gather(normalizer.moments(evaluation.returns)), failure, metrics
-
-
-def _batch_metrics(given: _Given, evaluation: _Evaluation, collectives: Collectives) -> dict[str, Array]:
-    """Scalars about a batch and the age of its policy, over all ranks."""
-    variance = collectives.variance(evaluation.returns)
-    residual = collectives.variance(evaluation.returns - evaluation.value)
-    truncated = evaluation.log_weight > jnp.log(given.hyper["importance_max"])
-    fresh = ~evaluation.samples.stale
-    gap, share = collectives.mean((jnp.mean(jnp.abs(evaluation.log_weight) * fresh), jnp.mean(fresh)))
-    return {
-        # Actor and learner evaluate the same version in different programs: this is rounding, not lag.
-        "log_probability_gap": gap / jnp.maximum(share, 1e-9),
-        "importance_max": collectives.max(jnp.max(evaluation.weight)),
-        "explained_variance": 1.0 - residual / (variance + 1e-8),
-        "advantage_std": evaluation.advantage_std,
-        "td_error_std": jnp.sqrt(collectives.variance(evaluation.td_error)),
-        **_truncation_metrics(given, evaluation, collectives),
-        **collectives.mean(
-            {
-                "importance_mean": jnp.mean(evaluation.weight),
-                "importance_truncated": jnp.mean(truncated.astype(jnp.float32)),
-                "behaviour_kl": -jnp.mean(evaluation.log_weight),
-                "reward_mean": jnp.mean(given.batch["reward"]),
-                "return_mean": jnp.mean(evaluation.returns),
-                "value_mean": jnp.mean(evaluation.value),
-            }
-        ),
-    }
-
-
-def _truncation_metrics(given: _Given, evaluation: _Evaluation, collectives: Collectives) -> dict[str, Array]:
-    """Share of truncated steps, and their mean TD error with and without bootstrap; 0 in a batch without any."""
-    truncated = (given.batch["truncated"] & given.batch["terminal"]).astype(jnp.float32)
-    cut = evaluation.truncated_error
-    bootstrapped = cut + given.hyper["gamma"] * evaluation.value
-    sums = {"td_error_truncated": bootstrapped, "td_error_truncated_as_terminal": cut}
-    share, means = collectives.mean(
-        (jnp.mean(truncated), {name: jnp.mean(truncated * error) for name, error in sums.items()})
-    )
-    return {"truncated": share, **{name: mean / jnp.maximum(share, 1e-9) for name, mean in means.items()}}
 
 
 def _epochs(
@@ -387,7 +260,7 @@ def _epochs(
     keys: Array,
     samples: losses.Sample,
     log_std_proximal: Array,
-    given: _Given,
+    given: losses.Inputs,
     collectives: Collectives,
     layout: Layout,
     minibatches: int,
@@ -407,7 +280,7 @@ def _epochs(
         minibatch = jax.tree.map(lambda x: x[rows], samples)
         minibatch = minibatch._replace(
             observation=normalizer.apply(given.observations, minibatch.observation),
-            privileged=_normalised(given.privileged, minibatch.privileged),
+            privileged=losses.normalised_inputs(given.privileged, minibatch.privileged),
         )
         (_, terms), gradients = gradient(params, layout, log_std_proximal, minibatch, coefficients)
         terms, gradients = collectives.mean((terms, gradients))

@@ -1,21 +1,31 @@
-"""Interface of an algorithm to the learner: four members on which everything else depends.
+"""Interface of an algorithm to the learner: four members on which everything else depends, and its batches.
 
 The learner's process, its hub, checkpoints and ranks use algorithms only through `Algorithm`, and find them by name
-(`learner.algorithms.ALGORITHMS`).
+(`learner.algorithms.ALGORITHMS`). A batch consists of rollouts concatenated along their axis of worlds, along which
+ranks shard it.
 """
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from jax.sharding import Mesh
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
+from congrasp.common.config import RunConfig
 from congrasp.common.errors import PhysicsError
+from congrasp.common.hands import get_hand
 from congrasp.common.policy import network, normalizer
-from congrasp.common.policy.bundle import PolicySpec
+from congrasp.common.policy.bundle import PolicySpec, full_layout
 from congrasp.common.policy.network import Params
 from congrasp.common.policy.normalizer import Statistics
+from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.privileged import extra
 from congrasp.common.task.types import Array
-from congrasp.common.wire.schema import Schema
+from congrasp.common.wire.messages import RECORDED, TAUGHT, WORLDS, RolloutForm, Schema
+from congrasp.learner.distributed.collectives import AXIS, Collectives, shard_map
 
 
 class LearnedPolicy(NamedTuple):
@@ -62,7 +72,7 @@ class Algorithm(Protocol):
 
     @property
     def batch_schema(self) -> Schema:
-        """Arrays of a rollout used for learning, a subset of `common.wire.schema.RECORDABLE`.
+        """Arrays of a rollout used for learning, a subset of `common.wire.messages.RECORDABLE`.
 
         They determine what actors send, what the hub admits, warm-up batches, and how a batch is sharded over ranks.
         """
@@ -100,3 +110,57 @@ class NonFiniteUpdate(PhysicsError):
     def __init__(self, term: str, source: str, state: TrainState):
         super().__init__(f"Diverged in the {source} of update {state.version + 1}: {term}.")
         self.state = state
+
+
+def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> RolloutForm:
+    """Returns the form of a run's rollouts, with the arrays of `schema` for its algorithm."""
+    return RolloutForm(
+        steps=config.rollout_steps,
+        worlds=config.environments,
+        observation=sum(size for _, size in spec.layout),
+        action=spec.action_size,
+        half=config.half_observations,
+        teacher=0 if TAUGHT.keys().isdisjoint(schema) else _teacher_inputs(config.task),
+        privileged=spec.privileged_size,
+        arrays=schema,
+    )
+
+
+def _teacher_inputs(task: TaskConfig) -> int:
+    """Size of `common.task.privileged.observe_for_teacher`'s rows."""
+    return sum(size for _, size in full_layout(task)) + extra(get_hand(task.hand))
+
+
+def collate(rollouts: Sequence[Mapping[str, Array]], schema: Schema) -> dict[str, Array]:
+    """Concatenates the schema's arrays of several rollouts of equal length, on host or device."""
+    if len(rollouts) == 1:
+        return {name: rollouts[0][name] for name in schema}
+    joined = {}
+    for name, spec in schema.items():
+        parts = [rollout[name] for rollout in rollouts]
+        concatenate = jnp.concatenate if isinstance(parts[0], jax.Array) else np.concatenate
+        joined[name] = concatenate(parts, axis=spec.worlds_axis)
+    return joined
+
+
+def partition_specs(schema: Schema) -> dict[str, PartitionSpec]:
+    """Partition specs of a batch on a mesh of ranks: every rank has different worlds."""
+    return {
+        name: PartitionSpec(*(AXIS if size == WORLDS else None for size in spec.shape or ()))
+        for name, spec in schema.items()
+    }
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def gathered_moments(observation: Array, *, mesh: Mesh | None) -> Statistics:
+    """Moments of each rank's observations (T, B, D), stacked; `of_ranks` splits them."""
+
+    def program(observation: Array) -> Statistics:
+        return Collectives(mesh).gather(normalizer.moments(observation, event_axes=1))
+
+    return shard_map(mesh, program, partition_specs(RECORDED)["observation"])(observation)
+
+
+def of_ranks(gathered: Statistics) -> list[Statistics]:
+    """Splits statistics stacked by `Collectives.gather` into those of each rank."""
+    return [Statistics(*(entry[i] for entry in gathered)) for i in range(len(gathered.count))]

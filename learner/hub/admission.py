@@ -1,7 +1,7 @@
 """Validates the values of rollouts: every number is compared with the task's range, and names are a closed set.
 
 Values within these ranges are trusted. An actor whose rollout is refused must back off, longer each time
-(`learner.hub.rate_limit.PutOff`).
+(`learner.hub.limits.PutOff`).
 
 The ranges are computed by evaluating the task. Engines end environments that exceed `MAX_SPEED` or `MAX_DISTANCE`
 (`common.ranges`). Observation and reward terms are evaluated in random states up to these limits, where every clipped
@@ -31,13 +31,12 @@ from congrasp.common.task.constraints.base import symbol_sizes
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.metrics import DIVERGED, FORCES, episode_fields
 from congrasp.common.task.observation import observe
-from congrasp.common.task.privileged import Parameters
+from congrasp.common.task.privileged import Parameters, observe_for_teacher
 from congrasp.common.task.reward import reward_terms
 from congrasp.common.task.sensing import Readings, draw_sensors
-from congrasp.common.task.teaching import observe_for_teacher
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.learner.hub.rate_limit import PutOff
+from congrasp.learner.hub.limits import PutOff
 
 _DENSITY = (-100.0, 10.0)
 """Bounds of the log probability of each action, nats: the lower is reached 14 standard deviations from the mean, the

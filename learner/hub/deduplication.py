@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from congrasp.common.wire.messages import RolloutHeader
-from congrasp.learner.hub.rate_limit import certificate
+from congrasp.learner.hub.limits import certificate
 from congrasp.learner.hub.staleness import Owner
 
 _INCARNATIONS = 1024  # incarnations whose sequences are kept

@@ -30,8 +30,7 @@ from congrasp.common.wire.messages import (
 )
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.deduplication import SequenceTable
-from congrasp.learner.hub.members import Members
-from congrasp.learner.hub.rate_limit import DAMAGED, RateLimit
+from congrasp.learner.hub.limits import DAMAGED, Members, RateLimit, sender
 from congrasp.learner.hub.staleness import Owner, StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import Identity, Recovered, WriteAheadLog
@@ -103,9 +102,7 @@ class LearnerHub:
         """Reason why the run cannot be saved, and what its end would cost; part of the status."""
         self._audit, self._log = audit, log
         self._rate_limit, self._pull_limit = RateLimit(), RateLimit(per_second=_PIECES, most=4 * _PIECES)
-        if durable is not None:
-            self._restore(durable)
-        self._recovered: Recovered | None = self._begin()
+        self._recovered: Recovered | None = self._begin(durable)
         self._serve()
 
     def has_batch(self, count: int, timeout: float) -> bool:
@@ -259,9 +256,14 @@ class LearnerHub:
         transport.watch_alive(self.keys.everyone, self._on_alive)
         transport.declare_alive(self.keys.alive("learner", self._name, self.session_id))
 
-    def _begin(self) -> Recovered:
-        """Reads the data of earlier sessions from disk, and records the start of this one."""
+    def _begin(self, durable: Mapping[str, Any] | None) -> Recovered:
+        """Restores a checkpoint's part, reads the data of earlier sessions, and records the start of this one."""
         staleness, log = self._staleness, self._log
+        if durable is not None:
+            if durable["run_id"] != self.run_id:
+                raise CongraspError(f"The checkpoint has run id {durable['run_id']}, not {self.run_id}.")
+            staleness.restore(durable["counters"], durable["version"])
+            self._sequences.restore(durable)
         version = staleness.version
         recovered = Recovered([], []) if log is None else log.recover(version, self.run_id, self._form, self._schema)
         if self._audit is not None:
@@ -269,12 +271,6 @@ class LearnerHub:
             session = self.session_id, self.run_id, version, staleness.max_staleness
             staleness.note_undone(self._audit.begin(*session, kept=kept))
         return recovered
-
-    def _restore(self, durable: Mapping[str, Any]) -> None:
-        if durable["run_id"] != self.run_id:
-            raise CongraspError(f"The checkpoint has run id {durable['run_id']}, not {self.run_id}.")
-        self._staleness.restore(durable["counters"], durable["version"])
-        self._sequences.restore(durable)
 
     def _state(self) -> dict[str, Any]:
         version = self._staleness.version if self._bundle else -1
@@ -316,9 +312,9 @@ class LearnerHub:
             _check_sender(key, header.actor)
             self._admission.check(message)
         except CongraspError as error:
-            self._staleness.refuse_damaged((_sender(key), str(meta.get("incarnation"))), ticket)
-            self._admission.refuse(_sender(key))
-            self._event("warning", f"A rollout of {_sender(key)} was refused: {error}", kind="refused")
+            self._staleness.refuse_damaged((sender(key), str(meta.get("incarnation"))), ticket)
+            self._admission.refuse(sender(key))
+            self._event("warning", f"A rollout of {sender(key)} was refused: {error}", kind="refused")
             return self._answer("refused", why=str(error))
         if header.run_id != self.run_id:
             self._staleness.refuse_stale(header.owner, ticket)
@@ -423,12 +419,12 @@ class LearnerHub:
 
     def _reject(self, key: str) -> Message | None:
         """Returns the reply to a deferred or rate-limited actor, before its request is decoded; None for others."""
-        if seconds := self._admission.retry_after(_sender(key)):
+        if seconds := self._admission.retry_after(sender(key)):
             retry = self._answer("retry", why="A rollout of yours was refused: try again later.")
             return Message(meta={**retry.meta, "granted": False, "retry_after": seconds})
         if self._rate_limit.admits(key):
             return None
-        self._event("warning", f"Too many useless requests of {_sender(key)}: rejected.", kind="rejected")
+        self._event("warning", f"Too many useless requests of {sender(key)}: rejected.", kind="rejected")
         retry = self._answer("retry", why="Too many of your requests were useless.")
         return Message(meta={**retry.meta, "granted": False})
 
@@ -480,11 +476,6 @@ def _rates(steps: list[int], seconds: float) -> dict[str, float]:
     return {"rollouts_per_second": len(steps) / seconds, "steps_per_second": sum(steps) / seconds}
 
 
-def _sender(key: str) -> str:
-    """Returns the actor of a key, which access control may reserve for it."""
-    return key.rpartition("/")[2]
-
-
 def _check_sender(key: str, actor: str) -> None:
-    if _sender(key) != actor:
+    if sender(key) != actor:
         raise CongraspError(f"A message of the actor {ascii(actor)[:70]} came under the key {ascii(key)[:140]}.")

@@ -26,7 +26,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Literal, NamedTuple
 
-from congrasp.learner.hub.rate_limit import PutOff, certificate
+from congrasp.learner.hub.limits import PutOff, certificate
 
 _RECENT = 256  # rollouts over which shares and the run's usual duration are measured
 _OWN = 16  # rollouts over which an actor's duration is measured

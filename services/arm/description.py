@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError, MissingPackageError
-from congrasp.common.io.npz import read_npz
+from congrasp.common.io.inputs import read_npz
 from congrasp.services.assets.hands.compile import confined, robot_spec, robot_text
 
 SPEED = 3.14

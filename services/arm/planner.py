@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import arm_file, load_arm
-from congrasp.services.arm.options import ArmOptions
 from congrasp.services.arm.robot import Infeasible, Pose, Robot, build_robot, default_mount, moved_arm
 from congrasp.services.export.frames import NOT_LINKS
 from congrasp.services.export.motion_file import GraspMotion
-from congrasp.services.record.moved_arm import MovedArm
+from congrasp.services.record.episode import MovedArm
 
 try:
     import mink

@@ -15,7 +15,7 @@ from congrasp.common.objects.mjcf import add_object
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.arm.description import Arm
 from congrasp.services.assets.hands.links import geom_mesh
-from congrasp.services.record.moved_arm import UNLIMITED, MovedArm
+from congrasp.services.record.episode import UNLIMITED, MovedArm
 from congrasp.services.viz.shapes import upright
 
 _HAND = "hand/"

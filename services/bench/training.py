@@ -29,9 +29,8 @@ from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.stages import imported, since_start, stages
 from congrasp.learner.run_directory import create_run
-from congrasp.services.train.launch import Launch, Plan, engine_of, leave_gpus_to
 from congrasp.services.train.learn import until_first_update
-from congrasp.services.train.processes import train
+from congrasp.services.train.processes import Launch, Plan, engine_of, leave_gpus_to, train
 
 _WARM_UPDATES = 5
 """Updates before the measurement: the first ones compile, and all environments begin with new episodes."""

@@ -43,7 +43,7 @@ class Actor:
 
     def __call__(self) -> int:
         """Acts until the run ends or a signal comes."""
-        from congrasp.actors.process.actor import run_actor
+        from congrasp.actors.process import run_actor
         from congrasp.common.io.journal import Journal
         from congrasp.common.runtime.parallel import cores
         from congrasp.common.transport import urls

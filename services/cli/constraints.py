@@ -61,7 +61,7 @@ class Generate:
         from congrasp.common.io.inputs import distinct_names
         from congrasp.common.objects.procedural import generate_many
         from congrasp.common.task.config import TaskConfig
-        from congrasp.common.task.sampling.write_sets import make_sets, save
+        from congrasp.common.task.sampling.sets import make_sets, save
         from congrasp.services.assets.objects.named import find_object, objects_of
         from congrasp.services.cli.console import tracked
 
@@ -159,7 +159,7 @@ class Import:
         from congrasp.common.hands.mano import own_mano_model
         from congrasp.common.io.files import write_atomically
         from congrasp.common.objects.store import Catalogue
-        from congrasp.common.task.sampling.write_sets import save
+        from congrasp.common.task.sampling.sets import save
         from congrasp.services.assets.captures.build import Options, import_sets
         from congrasp.services.assets.captures.sequence import Meshes
         from congrasp.services.cli.console import bars, in_range
@@ -261,8 +261,7 @@ def show(
       congrasp constraints show sets/mug_7.constraints.safetensors
       congrasp constraints show sets/mug_7.constraints.safetensors --png mug.png --rest 2
     """
-    from congrasp.common.task.sampling.sets import load
-    from congrasp.common.task.sampling.write_sets import describe
+    from congrasp.common.task.sampling.sets import describe, load
     from congrasp.services.cli.console import in_range, save_drawing, show_facts
 
     constraints = load(file)

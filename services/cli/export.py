@@ -75,8 +75,7 @@ def motion(
       congrasp export motion grasps/mug/grasp.npz --to glb
       congrasp export motion runs/mine --success --to ros2 --out bag
     """
-    from congrasp.services.export.motion_file import at_rate
-    from congrasp.services.export.motion_formats import default_name, export_motions, pick_motion
+    from congrasp.services.export.motion_file import at_rate, default_name, export_motions, pick_motion
 
     if not paths:
         raise CongraspError("No motion was given.", "Pass a .npz of 'congrasp grasp', a recording or a run's folder.")

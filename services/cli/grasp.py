@@ -12,7 +12,7 @@ from typing_extensions import Doc
 from congrasp.common.errors import CongraspError, printable
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.base import Option
-from congrasp.services.arm.options import ArmOptions
+from congrasp.services.arm import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.console import report_error, say
 

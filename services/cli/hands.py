@@ -223,12 +223,12 @@ class Train:
         import jax
 
         from congrasp.services.assets.hands.model_files import Choices
-        from congrasp.services.train import launch
+        from congrasp.services.train import processes
         from congrasp.services.train.own_hand import Request, train_hand
 
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
-        full = launch.accelerators()[0] != "cpu"
+        full = processes.accelerators()[0] != "cpu"
         jax.config.update("jax_platforms", "cpu")  # the stages are separate processes, each with the whole GPU memory
         reference = _taken(self.hand, Choices(self.name, self.palm, self.thumb, self.object_scale))
         found = get_hand(reference)

@@ -50,7 +50,7 @@ COMMANDS = {
     "doctor": "what is wrong with this machine or installation",
 }
 """Commands in the order of the help."""
-_MODULES = {"audit": "ops.audit", "doctor": "ops.doctor"}
+_MODULES = {"audit": "ops.audit", "doctor": "ops.doctor", "status": "ops.status"}
 """Modules in `services` of commands that are not in `services.cli`."""
 
 _READ = {".obj", ".stl", ".ply", ".glb", ".npz", ".csv", ".bvh", ".mcap", ".safetensors", ".urdf", ".xml"}

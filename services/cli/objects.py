@@ -239,7 +239,7 @@ def rests(
 def _reach(obj: "GraspObject", headings: "Headings | None", *, region: bool = False) -> list[str]:
     """Share of the headings, or of those on the graspable region, that the human hand can use in each resting pose."""
     from congrasp.common.hands.closure import outline
-    from congrasp.common.hands.human import HUMAN
+    from congrasp.common.hands.files import HUMAN
     from congrasp.common.task.sampling.headings import above, within_reach
 
     if headings is None:

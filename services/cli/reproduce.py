@@ -12,11 +12,10 @@ from congrasp.common.policy.pretrained import pretrained_hands
 from congrasp.services.cli.console import in_range, tracked
 from congrasp.services.evaluate.lineup import Entrant, read_entrants
 from congrasp.services.ops.children import command
-from congrasp.services.reproduce.comparison import summary
-from congrasp.services.reproduce.page import JSON, LATEX, PAGE
+from congrasp.services.reproduce.comparison import JSON, LATEX, PAGE, summary
 from congrasp.services.reproduce.plan import BASELINES, RequiredPolicy, policies
 from congrasp.services.reproduce.run import Request, reproduce, to_train
-from congrasp.services.train import launch
+from congrasp.services.train import processes
 
 _QUICK, _FULL = (48, 24), (1000, 64)
 """Episodes of a row, and procedural objects."""
@@ -133,7 +132,7 @@ def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[Require
 def _check_device(wanted: list[str]) -> None:
     """Raises a CongraspError if policies must be trained and there is no GPU."""
 
-    if wanted and launch.accelerators()[0] == "cpu":
+    if wanted and processes.accelerators()[0] == "cpu":
         raise CongraspError(
             f"{', '.join(wanted)} must be trained first, and this machine has no GPU.",
             "Use --quick, which takes the pretrained policies, or name policies with --policy.",

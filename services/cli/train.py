@@ -12,8 +12,8 @@ from congrasp.common.hands import get_hand
 from congrasp.common.io.inputs import file_name
 from congrasp.common.task.methods import STUDENT, STUDENTS, with_method
 from congrasp.learner.run_directory import CONFIG_FILE, open_run
-from congrasp.services.train.launch import Launch
 from congrasp.services.train.presets import get_preset, student_of, with_hand
+from congrasp.services.train.processes import Launch
 
 
 def train(

@@ -1,14 +1,35 @@
-"""Interface of policies for control loops, local or remote; needs only NumPy."""
+"""Policies for control loops, local or remote: their interface, memory of one episode and queries; needs only NumPy.
 
+A left hand's policy is that of the right one, with mirrored states and targets.
+"""
+
+import dataclasses
+import math
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from congrasp.common.request import GraspRequest
+from congrasp.common import mirror
+from congrasp.common.errors import LayoutError, RefusedError
+from congrasp.common.request import GraspRequest, Pose
+from congrasp.common.task.resting import resting_mean
+from congrasp.common.wire.codec import Message
 
 State = Mapping[str, np.ndarray]
 """Current state of hand and object, by field; see `Policy.act`."""
+PACKED = "packed"
+"""Name of the one array of a query or a reply."""
+_REQUIRED = ("surface", "q", "wrist", "object_pose")
+_WITH_CAMERA = ("cloud", "q", "wrist")
+_MEASURED = ("q", "u", "object_position", "object_quaternion")
+_FIRST = ("object_position_initial", "object_quaternion_initial")
+_READ = (*_MEASURED, "q_target", "u_target")
+_POINTS = ("cloud", "surface_points", "surface_avoid", "surface_normals")
+NORMALS, CAMERA = "surface_normals", "camera_position"
+"""Names of the normals at the points of a query, and of the position of the camera."""
+_LONGEST = 64  # largest history of a policy, control steps
 
 
 class Answer(NamedTuple):
@@ -108,3 +129,296 @@ class Policy(Protocol):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+class EpisodePolicy(Policy):
+    """A `Policy` whose subclass answers one query at a time (`services.serve.requests` has their form)."""
+
+    def __init__(self) -> None:
+        self._request: GraspRequest | None = None
+        self._fields: dict[str, np.ndarray] = {}  # of all queries of the episode
+        self._layout: Mapping[str, Any] | None = None
+        self._packer: Packer | None = None
+        self._time = 0
+        self._rested = np.asarray(1)  # number of readings in the mean of the object's pose; 0 once it has moved
+        self._past: list[Mapping[str, np.ndarray]] = []  # readings of earlier control steps, newest first
+
+    def _query(self, query: Message) -> Message:
+        """The reply to a query.
+
+        Raises:
+          TransportError: see `Policy.act`.
+        """
+        raise NotImplementedError
+
+    def _described(self) -> dict[str, Any]:
+        """The policy's metadata, without waiting for a server.
+
+        Raises:
+          TransportError: see `Policy.metadata`.
+        """
+        raise NotImplementedError
+
+    def metadata(self) -> dict[str, Any]:
+        """See `Policy.metadata`."""
+        return self._described()
+
+    def reset(self, request: GraspRequest) -> None:
+        """See `Policy.reset`."""
+        self._fields, self._request, self._packer = _episode_fields(request), request, None
+        self._time, self._rested, self._past = 0, np.asarray(1), []
+
+    def act(self, state: State) -> Answer:
+        """See `Policy.act`."""
+        began, packer = time.perf_counter(), self._packing()
+        rest, rested = self._resting(state, packer.settle)
+        (answer,) = self._ask(began, [{**rest, **state}])
+        known = {**self._fields, **state}
+        reading = {name: _numbers(name, known[name]) for name in _READ if name in known}
+        self._past = [reading, *self._past[: _LONGEST - 1]]
+        self._fields.update(rest, q_target=answer.q_target, u_target=answer.u_target)
+        self._time, self._rested = self._time + 1, rested
+        return answer
+
+    def act_each(self, states: Sequence[State]) -> list[Answer]:
+        """See `Policy.act_each`."""
+        if not states:
+            raise RefusedError("There is no state to act in.", "Give one or more.")
+        return self._ask(time.perf_counter(), states)
+
+    def close(self) -> None:
+        """See `Policy.close`."""
+
+    def _packing(self) -> "Packer":
+        """The form of the episode's queries, in the layout that the policy's metadata has had since the connection."""
+        if self._request is None:
+            raise RefusedError("There is no episode yet.", "Begin one with reset.")
+        if self._layout is None:
+            self._layout = self._described()["query"]
+        if self._packer is None:
+            self._packer = Packer(self._layout, self._fields, self._request.constraints)
+        return self._packer
+
+    def _resting(self, state: State, settle: float) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Returns the resting pose with this reading, if the policy uses the mean, and the number of readings."""
+        if not (settle and self._time and {"object_position", "object_quaternion"} <= state.keys()):
+            return {}, self._rested
+        mean = np.concatenate([self._fields[name] for name in _FIRST])
+        reading = np.concatenate([_numbers(name, state[name]) for name in _MEASURED[2:]], axis=None)
+        if reading.shape != mean.shape or not np.isfinite(reading).all():
+            return {}, self._rested  # the policy rejects the query
+        table = np.all(state.get("table", True))
+        mean, rested = resting_mean(np, mean, self._rested, reading, table, settle)
+        return dict(zip(_FIRST, np.split(mean.astype(np.float32), [3]), strict=True)), rested
+
+    def _ask(self, began: float, states: Sequence[State]) -> list[Answer]:
+        """Returns the answers to one query, which is repeated if the policy's layout has changed."""
+        try:
+            reply = self._query(self._packed(states))
+        except LayoutError:  # another server has replaced the one with this layout
+            self._layout = self._packer = None
+            reply = self._query(self._packed(states))
+        version, server_ms = int(reply.meta["version"]), float(reply.meta["total_ms"])
+        spent, fingers = 1e3 * (time.perf_counter() - began), len(self._fields["q_initial"])
+        parts = np.split(reply.arrays[PACKED], [-fingers - 6, -6], 1)
+        return [
+            Answer(q_target, u_target, action, version, tuple(active), spent, server_ms)
+            for action, q_target, u_target, active in zip(*parts, reply.meta["active"], strict=True)
+        ]
+
+    def _packed(self, states: Sequence[State]) -> Message:
+        """The query in each of several states."""
+        packer, fields = self._packing(), self._fields
+        now = {"time": np.asarray(self._time), "table": np.asarray(True)}
+        now |= {name: fields[name] for name in ("q_target", "u_target", *_FIRST) if name in fields}
+        return packer.pack([{**now, **_with_own_normals(state, fields)} for state in states], self._past)
+
+
+class Packer:
+    """An episode's queries as vectors, most of which stays the same.
+
+    Attributes:
+      settle: m, see `SensingConfig`; 0 if the object's first pose is that of the request.
+    """
+
+    def __init__(
+        self,
+        layout: Mapping[str, Any],
+        episode: Mapping[str, np.ndarray],
+        constraints: Mapping[str, Mapping[str, np.ndarray]],
+    ):
+        """Begins an episode.
+
+        Args:
+          layout: `query` of the policy's metadata.
+          episode: fields that stay the same.
+          constraints: goal arrays of each constraint. Those of a constraint that the policy lacks are not packed: the
+            policy refuses its name.
+
+        Raises:
+          RefusedError: a field is unknown, absent or of the wrong shape.
+        """
+        self._layout, self._fields, self.settle = layout, layout["fields"], float(layout["settle"])
+        self._past = {name: self._fields[f"past_{name}"][1] for name in _READ if f"past_{name}" in self._fields}
+        self._meta = {"constraints": list(constraints), "layout": layout["digest"]}
+        needs = layout["constraints"]
+        known = {name: own for name, own in constraints.items() if name in needs}
+        goals = {f"{name}_{field}": value for name, own in known.items() for field, value in own.items()}
+        fields = {**episode, **{name: _numbers(name, value) for name, value in goals.items()}}
+        _require([field for name in known for field in needs[name]], fields)
+        self._vector = np.zeros(layout["size"], np.float32)
+        self._write(self._vector, fields)
+
+    def pack(self, states: Sequence[State], past: Sequence[State] = ()) -> Message:
+        """The query in each of several states, after the control steps of `past`, newest first.
+
+        The oldest step is repeated where the history reaches back beyond the start of the episode.
+
+        Raises:
+          RefusedError: there are too many states, or a field is unknown, absent or of the wrong shape.
+        """
+        if len(states) > self._layout["states"]:
+            raise RefusedError(
+                f"These are {len(states)} states.", f"The policy takes {self._layout['states']} at a time."
+            )
+        vectors = np.tile(self._vector, (len(states), 1))
+        for vector, state in zip(vectors, states, strict=True):
+            _require([name for name in _MEASURED if name in self._fields], state)
+            self._write(vector, {name: _numbers(name, value) for name, value in state.items()})
+            for name, steps in self._past.items():
+                rows = [_numbers(name, reading[name]) for reading in (past or [state])[:steps]]
+                self._write(vector, {f"past_{name}": np.stack(rows + rows[-1:] * (steps - len(rows)))})
+        return Message({PACKED: vectors}, self._meta)
+
+    def _write(self, vector: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
+        """Writes fields to their places in a vector; points are spread over as many as the policy observes."""
+        points = [fields[name].shape[:1] for name in _POINTS if name in fields]
+        for name, value in fields.items():
+            if name not in self._fields and name in (NORMALS, CAMERA):  # the policy does not observe normals
+                continue
+            if name not in self._fields:
+                raise RefusedError(f"The query has an unknown field '{name}'.", f"Known: {', '.join(self._fields)}.")
+            offset, *shape = self._fields[name]
+            given = (max(*points[0], 1), *shape[1:]) if name in _POINTS and points[0] else tuple(shape)
+            if value.shape != given:
+                raise RefusedError(f"The field '{name}' has shape {value.shape}; it must be {given}.")
+            if given != tuple(shape):
+                value = value[np.arange(shape[0]) * len(value) // shape[0]]
+            vector[offset : offset + math.prod(shape)] = value.ravel()
+
+
+def _require(names: Sequence[str], fields: Mapping[str, Any]) -> None:
+    """Raises a RefusedError for the first field that is absent."""
+    if lacking := [name for name in names if name not in fields]:
+        raise RefusedError(f"The query lacks the field '{lacking[0]}'.")
+
+
+def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
+    """The constant fields of an episode's queries, and the first targets."""
+    required = _REQUIRED if request.cloud is None else _WITH_CAMERA
+    lacking = [f"'{name}'" for name in required if getattr(request, name) is None]
+    if lacking or request.wrist is None:
+        raise RefusedError(f"The request lacks {' and '.join(lacking)}.", "A control loop starts from measured poses.")
+    if request.above:
+        raise RefusedError("The request is for a hand from above.", "Give the heading's direction to a control loop.")
+    position, quaternion = request.object_pose or (None, None)
+    given = {
+        "q_initial": request.q,
+        "q_target": request.q,
+        "u_target": np.zeros(6),
+        "base_position": request.wrist[0],
+        "base_quaternion": request.wrist[1],
+        "object_position_initial": position,
+        "object_quaternion_initial": quaternion,
+        "cloud": request.cloud,
+        "surface_points": request.surface,
+        "surface_avoid": request.avoid,
+        "surface_normals": request.normals,
+        "camera_position": request.camera,
+    }
+    return {name: _numbers(name, value) for name, value in given.items() if value is not None}
+
+
+def _with_own_normals(state: State, episode: Mapping[str, np.ndarray]) -> State:
+    """Returns a state whose new points do not get the normals of the episode's first ones: zeros are estimated."""
+    new = [state[name] for name in ("cloud", "surface_points") if name in state]
+    if not new or "surface_normals" in state or "surface_normals" not in episode:
+        return state
+    return {**state, "surface_normals": np.zeros(np.shape(new[0]), np.float32)}
+
+
+def _numbers(name: str, value: Any) -> np.ndarray:
+    """A field's value, unchanged if it is bool, else as float32."""
+    try:
+        array = np.asarray(value)
+        return array if array.dtype == bool else array.astype(np.float32)
+    except (TypeError, ValueError):
+        raise RefusedError(f"The field '{name}' is no array of numbers.") from None
+
+
+class LeftPolicy(Policy):
+    """A `Policy` for the left hand, whose states and targets are mirrored for a policy of the right one."""
+
+    def __init__(self, right: Policy):
+        """Wraps a policy, and takes over its connection.
+
+        Args:
+          right: the policy, in this process or of a server.
+        """
+        self._right = right
+
+    def reset(self, request: GraspRequest) -> None:
+        """See `Policy.reset`."""
+        self._right.reset(mirrored_request(request))
+
+    def act(self, state: State) -> Answer:
+        """See `Policy.act`."""
+        return _answer(self._right.act(mirror.fields(state)))
+
+    def act_each(self, states: Sequence[State]) -> list[Answer]:
+        """See `Policy.act_each`."""
+        return [_answer(answer) for answer in self._right.act_each([mirror.fields(state) for state in states])]
+
+    def metadata(self) -> dict[str, Any]:
+        """See `Policy.metadata`; the limits are those of the left hand."""
+        found = self._right.metadata()
+        limits = found["limits"] and dict(found["limits"])
+        if limits:
+            ends = np.array([mirror.wrist(limits[name]) for name in ("lower", "upper")])
+            limits["lower"], limits["upper"] = ends.min(0).tolist(), ends.max(0).tolist()
+            limits["palm"] = [[-x, *rest] for x, *rest in limits["palm"]]
+        return {**found, "hand": f"{found['hand']}:left", "limits": limits}
+
+    def close(self) -> None:
+        """See `Policy.close`."""
+        self._right.close()
+
+
+def mirrored_request(request: GraspRequest) -> GraspRequest:
+    """The request for the mirror image of its object and hand."""
+    return dataclasses.replace(
+        request,
+        constraints={name: mirror.fields(own) for name, own in request.constraints.items()},
+        surface=_vectors(request.surface),
+        cloud=_vectors(request.cloud),
+        normals=_vectors(request.normals),
+        camera=_vectors(request.camera),
+        wrist=request.wrist and _pose(request.wrist),
+        object_pose=request.object_pose and _pose(request.object_pose),
+    )
+
+
+def _vectors(array: np.ndarray | None) -> np.ndarray | None:
+    """Mirrored points or directions, if there are any."""
+    return None if array is None else mirror.vector(array)
+
+
+def _answer(answer: Answer) -> Answer:
+    """The mirrored answer."""
+    return answer._replace(u_target=mirror.wrist(answer.u_target), action=mirror.wrist(answer.action))
+
+
+def _pose(pose: Pose) -> Pose:
+    """A mirrored pose."""
+    position, quaternion = pose
+    return mirror.vector(position), mirror.quaternion(quaternion)

@@ -9,7 +9,7 @@ from congrasp.common.errors import RefusedError, TransportError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.episode import EpisodePolicy
+from congrasp.services.client.policy import EpisodePolicy
 
 _AGAIN = 0.2  # seconds between two queries of a server that does not respond
 

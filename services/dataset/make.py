@@ -20,8 +20,15 @@ import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects.named import ObjectAt
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.dataset.columns import VERDICTS, grasp_columns, grasp_rows, object_columns, object_rows, table
-from congrasp.services.dataset.shards import Shards
+from congrasp.services.dataset.shards import (
+    VERDICTS,
+    Shards,
+    grasp_columns,
+    grasp_rows,
+    object_columns,
+    object_rows,
+    table,
+)
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.evaluate.plan import plan_row

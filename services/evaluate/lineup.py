@@ -11,6 +11,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands
 from congrasp.common.task.methods import STUDENTS, evaluated_as, get_method
+from congrasp.learner.run_directory import POLICY_FILE
 from congrasp.services.evaluate.plan import objects_label
 
 Table = Literal[
@@ -18,7 +19,6 @@ Table = Literal[
 ]
 ABLATION = ("ours", "no-dynamic-center", "no-feedforward", "single-stage", "two-phase")
 """Methods of the table `ablation`."""
-_POLICY = "policy.safetensors"
 
 
 class Entrant(NamedTuple):
@@ -109,9 +109,11 @@ def read_entrants(texts: Iterable[str], method: str | None = None) -> list[Entra
             path = pathlib.Path(rest)
         files = [policy_file(path)]
         if path.is_dir():
-            files = sorted({*path.glob(_POLICY), *path.glob(f"*/{_POLICY}")})
+            files = sorted({*path.glob(POLICY_FILE), *path.glob(f"*/{POLICY_FILE}")})
             if not files:
-                raise CongraspError(f"The folder {path} holds no {_POLICY}.", "Pass a run's folder, or a policy file.")
+                raise CongraspError(
+                    f"The folder {path} holds no {POLICY_FILE}.", "Pass a run's folder, or a policy file."
+                )
         found += [read_entrant(file, own) for file in files]
     for i, one in enumerate(found):
         if any((one.hand, one.method) == (other.hand, other.method) for other in found[:i]):

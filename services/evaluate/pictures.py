@@ -13,11 +13,10 @@ from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.experiment import Experiment, Result
-from congrasp.services.record.goals import phases_of
+from congrasp.services.record.episode import phases_of
 from congrasp.services.record.palette import OBJECT
 from congrasp.services.viz.render import episode_strip, grasp_steps
-from congrasp.services.viz.scene import Shape
-from congrasp.services.viz.shapes import skin_colours, table_shape
+from congrasp.services.viz.shapes import Shape, skin_colours, table_shape
 from congrasp.services.viz.sheets import contact_sheet, save_png
 from congrasp.services.viz.triangles import triangles_of
 

@@ -21,7 +21,7 @@ import numpy as np
 from congrasp.common.config import ObjectsConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.closure import Outline, outline
-from congrasp.common.io.caches import keep, read_kept
+from congrasp.common.io.files import keep, read_kept
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool, object_scale
 from congrasp.common.objects.spec import GraspObject

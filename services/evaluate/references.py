@@ -18,8 +18,7 @@ import numpy as np
 from congrasp.actors import initial
 from congrasp.actors.initial import PlannedEpisodes
 from congrasp.common.hands import get_hand
-from congrasp.common.io.caches import keep, read_kept
-from congrasp.common.io.files import cache_folder
+from congrasp.common.io.files import cache_folder, keep, read_kept
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
@@ -36,7 +35,7 @@ from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.plan import RowPlan, batches, protocol
 
 HELD_OUT = POSES // 5
-"""References of an object and region that its constraint set holds out (`write_sets`), the last ones."""
+"""References of an object and region that its constraint set holds out (`sampling.sets`), the last ones."""
 _ATTEMPTS = 3 * POSES
 """Most episodes of an object and region; the grasps found by then are used."""
 _SPARE = 1.25

@@ -23,10 +23,10 @@ from congrasp.services.export.frames import (
     facts,
     object_mesh,
     skin_of_motion,
+    unwrapped,
 )
 from congrasp.services.export.motion_file import GraspMotion
-from congrasp.services.export.unwrap import unwrapped
-from congrasp.services.record.moved_arm import Mesh
+from congrasp.services.record.episode import Mesh
 from congrasp.services.viz.kernels import GAMMA
 from congrasp.services.viz.triangles import smooth_corners
 

@@ -8,8 +8,8 @@ import foxglove.layouts as fl
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import parse_json
-from congrasp.services.record.channels import flatten
 from congrasp.services.record.reader import log_files, metrics_of, read_records
+from congrasp.services.record.writer import flatten
 
 CURVES = {
     "Success and return": ("episode/success", "episode/return"),

@@ -25,8 +25,7 @@ from congrasp.services.export.frames import facts, skin_of_motion
 from congrasp.services.export.motion_file import GraspMotion, robot_joints
 from congrasp.services.export.urdf import robot_urdf
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.scene import Camera, Shape
-from congrasp.services.viz.shapes import arm_shapes, fit, object_shape, skin_shape, table_shape
+from congrasp.services.viz.shapes import Camera, Shape, arm_shapes, fit, object_shape, skin_shape, table_shape
 from congrasp.services.viz.sheets import save_video
 
 VERSION = "v3.0"

@@ -1,15 +1,18 @@
-"""A grasp motion as one self-describing NPZ file, the source of exports and other programs.
+"""A grasp motion as one self-describing NPZ file, the source of exports in the formats of this folder's modules.
 
 Metres, radians, seconds, newtons; quaternions are (w, x, y, z) and turn a body's frame into the world. The world's z
 axis points up and the table's top is at z = 0. T frames, F finger joints, L links, C capsules, K waypoints.
 """
 
 import dataclasses
+import importlib
 import io
 import json
 import math
 import os
 import pathlib
+import tempfile
+from collections.abc import Sequence
 from typing import Annotated, Any, get_type_hints
 
 import numpy as np
@@ -17,15 +20,13 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.spec import Hand, capsule_ends
-from congrasp.common.io.files import write_atomically
-from congrasp.common.io.inputs import file_name
-from congrasp.common.io.npz import check_arrays, read_npz
+from congrasp.common.io.files import check_free, write_atomically
+from congrasp.common.io.inputs import check_arrays, file_name, read_npz
 from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.wire.codec import Message
-from congrasp.services.record import moved_arm
-from congrasp.services.record.goals import active_constraints
-from congrasp.services.record.moved_arm import MovedArm
+from congrasp.services.record.episode import ARM_ARRAYS, MovedArm, active_constraints, arm_of, arm_of_episode
+from congrasp.services.record.reader import pick_episode
 
 FORMAT = 2
 MAX_BYTES = 256 << 20
@@ -37,6 +38,31 @@ _INDICES = ("object_colour_values", "object_faces", "joint_link", "link_parent",
 _META = "meta"
 _OLDER = {"pose_joints": "pose_q"}
 """Names of goal arrays in files of format 1."""
+_GOALS = {
+    f"{constraint.name}_{name}": f"({', '.join(map(str, array.shape))}{',' * (len(array.shape) == 1)}) {array.meaning}"
+    for constraint in CONSTRAINTS
+    for name, array in constraint.arrays.items()
+}
+"""Meaning of the goal arrays; like the others, each begins with the shape."""
+_POINTS, _VALUES = "object_colour_points", "object_colour_values"
+_COLOURS = {
+    _POINTS: "(P, 3) m, object frame, points of the surface whose colours are known",
+    _VALUES: "(P, 3) sRGB from 0 to 255 there",
+}
+_OWN = {**_COLOURS, **ARM_ARRAYS}
+"""Arrays of motions whose object has colours, or with an arm."""
+FORMATS = {
+    "glb": ".glb",
+    "usd": ".usda",
+    "bvh": ".bvh",
+    "ros2": "",
+    "lerobot": "",
+}
+"""Name and suffix of each format; `services.export.<name>` writes it. Those without a suffix are folders."""
+DATASETS = ("lerobot",)
+"""Formats that hold several motions, and videos."""
+_QUATERNIONS = ("wrist_quaternion", "link_quaternion", "object_quaternion")
+_UNIT = 1e-3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -95,22 +121,9 @@ class GraspMotion:
     """The arm that carries the hand, if there is one. Its wrist deviates from the hand's by its tracking error."""
 
 
-_GOALS = {
-    f"{constraint.name}_{name}": f"({', '.join(map(str, array.shape))}{',' * (len(array.shape) == 1)}) {array.meaning}"
-    for constraint in CONSTRAINTS
-    for name, array in constraint.arrays.items()
-}
-"""Meaning of the goal arrays; like the others, each begins with the shape."""
 _HINTS = get_type_hints(GraspMotion, include_extras=True)
 _ARRAYS = {name: hint.__metadata__[0] for name, hint in _HINTS.items() if hasattr(hint, "__metadata__")}
 _FACTS = tuple(name for name in _HINTS if name not in _ARRAYS and name not in ("goal", "colours", "arm"))
-_POINTS, _VALUES = "object_colour_points", "object_colour_values"
-_COLOURS = {
-    _POINTS: "(P, 3) m, object frame, points of the surface whose colours are known",
-    _VALUES: "(P, 3) sRGB from 0 to 255 there",
-}
-_OWN = {**_COLOURS, **moved_arm.MEANINGS}
-"""Arrays of motions whose object has colours, or with an arm."""
 
 
 def at_rate(motion: GraspMotion, fps: float) -> GraspMotion:
@@ -159,7 +172,7 @@ def motion_of_episode(episode: Message) -> GraspMotion:
     arrays, meta = {name: np.asarray(value) for name, value in episode.arrays.items()}, dict(episode.meta)
     hand = known_hand(meta.pop("hand"))
     dt = float(meta.pop("control_dt"))
-    arm = moved_arm.arm_of_episode(episode)
+    arm = arm_of_episode(episode)
     meta.pop("arm", None)
     of_hand: dict[str, Any] = hand_arrays(hand)
     return GraspMotion(
@@ -257,7 +270,7 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
         own = _COLOURS if _COLOURS.keys() & arrays.keys() else {}
         _check_arrays({**arrays, **goal}, {**_ARRAYS, **own, **{name: _GOALS[name] for name in goal}})
         colours = Colours(arrays[_POINTS], arrays[_VALUES].astype(np.uint8)) if own else None
-        arm = moved_arm.arm_of(str(meta["arm"]), arrays, len(arrays["time"])) if "arm" in meta else None
+        arm = arm_of(str(meta["arm"]), arrays, len(arrays["time"])) if "arm" in meta else None
         return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal, arm=arm)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise CongraspError(f"{path} is not a grasp motion ({str(error)[:200]}).", remedy) from None
@@ -298,3 +311,81 @@ def _check_arrays(arrays: dict[str, np.ndarray], meanings: dict[str, str]) -> No
         raise ValueError("joint_limits are in the wrong order")
     if not (arrays["capsule_radius"] > 0).all() or not 0 < arrays["object_file_scale"] < _LARGEST:
         raise ValueError("capsule_radius or object_file_scale is not above zero")
+
+
+def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -> GraspMotion:
+    """The motion of an NPZ file, or an episode recorded at `path` (see `pick_episode`).
+
+    Raises:
+      CongraspError: `path` is missing or holds no motion, or an NPZ file's index is neither -1 nor 0.
+    """
+    if not path.exists():
+        raise CongraspError(f"There is no {path}.", "Pass a motion (.npz), a recording (.mcap) or a run's folder.")
+    if path.suffix == ".npz":
+        if index not in (-1, 0):
+            raise CongraspError(f"{path} is one motion and has no number {index}.", "Remove --index.")
+        return load_motion(path)
+    if path.is_file() and path.suffix != ".mcap":
+        raise CongraspError(f"{path} holds no motion.", "Pass a grasp.npz, a recording (.mcap) or a run's folder.")
+    return motion_of_episode(pick_episode(path, index, success=success))
+
+
+def export_motions(
+    motions: Sequence[GraspMotion], kind: str, path: pathlib.Path, *, camera: bool = False, force: bool = False
+) -> None:
+    """Writes motions in a format.
+
+    Args:
+      motions: one, or several if the format supports them.
+      kind: one of `FORMATS`.
+      path: the file or folder to write.
+      camera: also records videos, if the format has them.
+      force: replaces an existing file; a folder is never replaced.
+
+    Raises:
+      CongraspError: `path` exists already, has another suffix or cannot be written, a motion has invalid poses, or the
+        format cannot hold what was given.
+    """
+    if len(motions) > 1 and kind not in DATASETS:
+        raise CongraspError(f"A {kind} file holds one motion, but {len(motions)} were given.", "Pass one at a time.")
+    if camera and kind not in DATASETS:
+        raise CongraspError(f"A {kind} file holds no video.", f"Remove --camera, or pass --to {DATASETS[0]}.")
+    if (suffix := FORMATS[kind]) and path.suffix.lower() != suffix:
+        named = path.with_suffix("") if path.suffix and suffix.startswith(path.suffix) else path
+        name = path / f"grasp{suffix}" if path.is_dir() else f"{named}{suffix}"
+        raise CongraspError(f"The name of a {kind} file ends in {suffix}, and {path} does not.", f"Use --out {name}")
+    if path.is_dir():
+        raise CongraspError(f"The folder {path} exists already.", "Remove it or pass another with --out.")
+    check_free(path, force=force)
+    for motion in motions:
+        _check(motion)
+    module = importlib.import_module(f"congrasp.services.export.{kind}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as workplace:
+            module.write(pathlib.Path(workplace, path.name), motions, **({"camera": True} if camera else {}))
+            written = [(file, path.with_name(file.name)) for file in pathlib.Path(workplace).iterdir()]
+            for _, target in written:
+                check_free(target, force=force)
+            for file, target in written:
+                file.replace(target)
+    except OSError as error:
+        raise CongraspError(
+            f"{path} cannot be written: {error.strerror or error}.", "Pass another with --out."
+        ) from None
+
+
+def default_name(motion: GraspMotion, kind: str) -> pathlib.Path:
+    """Default path of a motion: the object's name in the working directory."""
+    return pathlib.Path(f"{motion.object}{FORMATS[kind] or f'-{kind}'}")
+
+
+def _check(motion: GraspMotion) -> None:
+    """Raises a CongraspError for quaternions that are not normalised; files and recordings are not checked for that."""
+    for owner in (motion, motion.arm):
+        for name in _QUATERNIONS:
+            values = getattr(owner, name, None)
+            if values is not None and not (np.abs(np.linalg.norm(values, axis=-1) - 1) <= _UNIT).all():
+                raise CongraspError(
+                    f"The motion's {name} has quaternions that are not normalised.", "Run 'congrasp grasp' again."
+                )

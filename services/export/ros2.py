@@ -16,10 +16,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from congrasp.common.objects.painting import colours_at
 from congrasp.services.export.frames import COLOURS, OBJECT, arm_meshes, bodies, facts
 from congrasp.services.export.motion_file import GraspMotion, joint_trajectory, robot_joints
 from congrasp.services.export.urdf import robot_urdf
+from congrasp.services.record.palette import colours_at
 
 _WORLD = "world"
 _OFTEN = ("/joint_states", "/tf")

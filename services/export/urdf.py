@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.services.export.frames import capsules, link_origins, pose_matrices
 from congrasp.services.export.motion_file import GraspMotion, robot_joints
-from congrasp.services.record.moved_arm import UNLIMITED, MovedArm
+from congrasp.services.record.episode import UNLIMITED, MovedArm
 
 _MASS, _INERTIA = "0.01", "1e-6"
 """Placeholders for every link: only the kinematics is exported, but some readers need them."""

@@ -25,9 +25,9 @@ from congrasp.services.export.frames import (
     identifiers,
     object_mesh,
     skin_of_motion,
+    unwrapped,
 )
 from congrasp.services.export.motion_file import GraspMotion
-from congrasp.services.export.unwrap import unwrapped
 from congrasp.services.viz.kernels import GAMMA
 
 _NAME = "congrasp:name"

@@ -11,9 +11,8 @@ from congrasp.actors.initial import RequestedEpisodes
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.closure import outline
 from congrasp.common.hands.spec import Hand
-from congrasp.common.objects.shapes import matrix
+from congrasp.common.objects.shapes import DENSE, balanced, matrix, sample_union
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.objects.surface import DENSE, balanced, sample_union
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS, goal_of, optional

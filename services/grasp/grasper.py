@@ -15,8 +15,7 @@ from congrasp.actors.initial import RequestedEpisodes
 from congrasp.common import mirror
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.left import LEFT, right_name
-from congrasp.common.hands.spec import Hand
+from congrasp.common.hands.spec import LEFT, Hand, right_name
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
@@ -28,11 +27,11 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.wire.codec import Message, encode
-from congrasp.services.arm.options import ArmOptions
+from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.client.left import mirrored_request
+from congrasp.services.client.policy import mirrored_request
 from congrasp.services.export.motion_file import motion_of_episode
 from congrasp.services.grasp.approaches import prescribed, surface_of, to_attempt, with_avoid
 from congrasp.services.grasp.motion import Grasp, costs

@@ -33,7 +33,7 @@ from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, up
 from congrasp.services.assets.objects.options import size_in_words
 from congrasp.services.export.motion_file import GraspMotion, load_motion
 from congrasp.services.grasp.wrist_paths import HUGE, read_csv, read_wrist_path
-from congrasp.services.record.goals import grasp_span
+from congrasp.services.record.episode import grasp_span
 
 _LARGEST = 4 << 20  # bytes of a JSON or CSV file
 _FAR = 1.0  # m from an object; places beyond it have another unit or origin

@@ -12,8 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import read_file
-from congrasp.common.io.npz import read_npz
+from congrasp.common.io.inputs import read_file, read_npz
 
 _LARGEST, _DEEPEST = 32 << 20, 200
 """Bytes of a BVH or CSV file, and joints of a BVH chain."""

@@ -121,7 +121,30 @@ def issue(
             f"A certificate of the role {role} cannot name hosts.", f"Only {' and '.join(LISTENERS)} can."
         )
     ca, ca_key = _authority(folder)
-    run = check_name("run", run or read(folder / CA_FILE).run)
+    identity = _free_identity(folder, role, check_name("run", run or read(folder / CA_FILE).run), number, force)
+    key = ec.generate_private_key(ec.SECP256R1())
+    common_name = x509.NameAttribute(NameOID.COMMON_NAME, str(identity))
+    subject = x509.Name([x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION), common_name])
+    builder = _builder(subject, ca.subject, key.public_key(), days, at_most=ca.not_valid_after_utc)
+    made = (
+        _with_uses(builder, role, hosts)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(ca_key.public_key()), critical=False)
+        .sign(ca_key, hashes.SHA256())
+    )
+    target = folder / f"{role}.{identity.number}"
+    if target.exists():
+        shutil.rmtree(target)
+    target.mkdir(mode=0o700)
+    _write_secret(target / KEY_FILE, key)
+    (target / CERTIFICATE_FILE).write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    shutil.copyfile(folder / CA_FILE, target / CA_FILE)
+    if (folder / REVOKED_FILE).exists():
+        shutil.copyfile(folder / REVOKED_FILE, target / REVOKED_FILE)
+    return target
+
+
+def _free_identity(folder: pathlib.Path, role: str, run: str, number: int | None, force: bool) -> Identity:
+    """Returns the identity of a new certificate; see `issue`."""
     revoked = Credentials(folder, role).revoked()
     taken = lambda i: (folder / f"{role}.{i}").exists() or str(Identity(run, role, i)) in revoked  # noqa: E731
     if number is None:
@@ -135,34 +158,18 @@ def issue(
         raise CongraspError(f"{identity} is revoked.", "Pass another --number.")
     if len(str(identity)) > _LONGEST_NAME:
         raise CongraspError(f"{identity} is longer than {_LONGEST_NAME} characters.", "Give the run a shorter name.")
-    key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name(
-        [
-            x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION),
-            x509.NameAttribute(NameOID.COMMON_NAME, str(identity)),
-        ]
-    )
+    return identity
+
+
+def _with_uses(builder: x509.CertificateBuilder, role: str, hosts: Sequence[str]) -> x509.CertificateBuilder:
+    """Restricts a role's certificate to its uses: to connect and, at these hosts and loopback, to listen."""
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    builder = _builder(subject, ca.subject, key.public_key(), days, at_most=ca.not_valid_after_utc)
     if role in LISTENERS:
         uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
         names = [_host(one) for one in dict.fromkeys((*_LOOPBACK, *hosts))]
         builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    made = (
-        builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(ca_key.public_key()), critical=False)
-        .sign(ca_key, hashes.SHA256())
-    )
-    if target.exists():
-        shutil.rmtree(target)
-    target.mkdir(mode=0o700)
-    _write_secret(target / KEY_FILE, key)
-    (target / CERTIFICATE_FILE).write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    shutil.copyfile(folder / CA_FILE, target / CA_FILE)
-    if (folder / REVOKED_FILE).exists():
-        shutil.copyfile(folder / REVOKED_FILE, target / REVOKED_FILE)
-    return target
+    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    return builder.add_extension(x509.ExtendedKeyUsage(uses), critical=False)
 
 
 def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = None) -> str:

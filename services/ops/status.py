@@ -1,16 +1,23 @@
-"""Status of a run: queries its learner, checks its counters, and formats them as tables."""
+"""`congrasp status`: queries the status of a live run, checks its counters, and formats them as tables."""
 
+import dataclasses
+import json
+import pathlib
 import time
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from rich.console import Group
+import tyro
+from rich.console import Console, Group
+from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from congrasp.common.errors import TransportError
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.ports import LEARNER_URL
 from congrasp.common.wire.codec import Message
 
 _TIMEOUT = 5.0
@@ -21,6 +28,7 @@ _SUMS = {
 """Counters that are sums of others: no ticket and no accepted rollout is lost."""
 _ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/s", "steps/s")
 _SHOWN = 100  # most processes in a table
+_RUN = "quickstart"
 
 
 def ask(transport: Transport, run: str) -> dict[str, Any]:
@@ -89,3 +97,67 @@ def tables(status: Mapping[str, Any]) -> Group:
     others = [Text(f"{more} more live process(es).")] if more else []
     wrong = (Text(f"Warning: {text}", style="yellow") for text in status["warnings"])
     return Group(roles, *others, counters, Text(line), *wrong)
+
+
+@dataclasses.dataclass(frozen=True)
+class Status:
+    """Show the processes and the state of a run: versions, lag, rates, and the outcomes of tickets and rollouts.
+
+    The exit code is 1 if there are warnings: counters are inconsistent, or no checkpoint can be written.
+
+    Examples:
+      congrasp status runs/mine --watch
+      congrasp status --connect tcp/10.0.0.5:7447 --run human --json
+    """
+
+    run_dir: Annotated[pathlib.Path | None, tyro.conf.Positional] = None
+    """Folder of a run whose learner runs on this machine, in place of --connect and --run."""
+    connect: str = LEARNER_URL
+    """The learner's endpoint."""
+    run: str = _RUN
+    """Name of the run."""
+    watch: bool = False
+    """Continue until Ctrl-C, also while the learner is disconnected."""
+    every: float = 1.0
+    """Seconds between two queries with --watch."""
+    certs: pathlib.Path | None = None
+    """Folder of an observer's certificate (congrasp certs)."""
+    json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    """Print JSON instead of tables; with --watch one object a line, and null while the learner is disconnected."""
+
+    def __call__(self) -> int:
+        """Prints the status."""
+        connect, run = (self.connect, self.run) if self.run_dir is None else self._of_folder(self.run_dir)
+        with urls.connect(connect, "observer", certs=self.certs, run=run) as transport:
+            found = ask(transport, run)
+            if not self.watch:
+                if self.json:
+                    print(json.dumps(found))
+                else:
+                    Console().print(tables(found))
+            elif self.json:
+                for now in follow(transport, run, self.every):
+                    print(json.dumps(now), flush=True)
+            else:
+                with Live(tables(found), auto_refresh=False) as live:
+                    for now in follow(transport, run, self.every):
+                        live.update(tables(now) if now else f"The learner of '{run}' is disconnected …", refresh=True)
+            return 1 if found["warnings"] else 0
+
+    def _of_folder(self, run_dir: pathlib.Path) -> tuple[str, str]:
+        """Endpoint and name of the run of a folder."""
+        from congrasp.learner.run_directory import learner_url, open_run
+
+        if (self.connect, self.run) != (LEARNER_URL, _RUN):
+            raise CongraspError(
+                f"The folder {run_dir} is in place of --connect and --run.", "Give either the folder or these."
+            )
+        run, connect = open_run(run_dir).name, learner_url(run_dir)
+        if not connect:
+            raise CongraspError(
+                f"No learner is running in {run_dir}.", f"Draw its recordings with 'congrasp plot {run_dir}'."
+            )
+        return connect, run
+
+
+COMMAND = Status

@@ -16,7 +16,7 @@ import urllib.parse
 from typing import Any
 
 from congrasp.common.errors import CongraspError, need_package
-from congrasp.services.record.channels import Channel, Entry
+from congrasp.services.record.writer import Channel, Entry
 
 _HOST, _LOOPBACK = "127.0.0.1", ("127.0.0.1", "localhost", "::1")
 _APP = "foxglove.dev"

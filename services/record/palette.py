@@ -1,4 +1,14 @@
-"""Colours of hand, object and constraints in every picture, recording and export: red, green, blue from 0 to 1."""
+"""Colours of hand, object and constraints in every picture, recording and export: red, green, blue from 0 to 1.
+
+Meshes with the colours of an object are subdivided finely enough for vertex colours to show a texture.
+"""
+
+import functools
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from congrasp.common.objects.spec import Colours
 
 Colour = tuple[float, float, float]
 
@@ -26,3 +36,77 @@ PIECES: tuple[Colour, ...] = (
 """Colours of convex pieces, in turn."""
 INK = "#262b35"
 """Colour of text and titles."""
+
+
+_EDGE, _MOST_FACES = 0.006, 12_000
+"""Edge length below which no edge is split, m; most faces."""
+_OWN_EDGE, _OWN_MOST_FACES = 0.003, 40_000  # for coloured surfaces
+_AMONG = 8  # known points of a mean colour
+
+
+def finer(
+    vertices: np.ndarray, faces: np.ndarray, edge: float = _EDGE, most: int = _MOST_FACES
+) -> tuple[np.ndarray, np.ndarray]:
+    """Subdivides a surface by repeatedly halving its longest edges.
+
+    Args:
+      vertices: (V, 3).
+      faces: (F, 3).
+      edge: edge length at which subdivision stops, m; edges of large surfaces stay longer.
+      most: most faces; a mesh with as many is returned unchanged.
+
+    Returns:
+      Vertices (V', 3) float32 and faces (F', 3) int32.
+    """
+    corners = np.asarray(vertices, float)[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum() / 2
+    longest = max(edge, 2.2 * float(np.sqrt(area / most)))
+    if len(faces) >= most:
+        return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
+    while len(corners) < most:
+        sides = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=-1)
+        order = np.argsort(-sides.max(1))[: most - len(corners)]
+        order = order[sides[order].max(1) > longest]
+        if not len(order):
+            break
+        first = (sides[order].argmax(1)[:, None] + np.arange(3)) % 3
+        start, end, across = np.take_along_axis(corners[order], first[..., None], 1).swapaxes(0, 1)
+        middle = (start + end) / 2
+        corners[order] = np.stack([start, middle, across], 1)
+        corners = np.concatenate([corners, np.stack([middle, end, across], 1)])
+    points, found = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return points.astype(np.float32), found.reshape(-1, 3).astype(np.int32)
+
+
+def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Subdivides a mesh (V, 3), (F, 3); returns it with (V', 3) uint8 sRGB (`colours_at`).
+
+    Results of the last few objects are cached; the arrays are read-only.
+    """
+    kinds = (vertices, float), (faces, np.int64), (colours.points, float), (colours.values, np.uint8)
+    return _painted(*(np.asarray(array, kind).tobytes() for array, kind in kinds))
+
+
+@functools.lru_cache(maxsize=8)
+def _painted(*content: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`painted` by the content of its arrays, as a cache key."""
+    kinds = float, np.int64, float, np.uint8
+    corners, faces, *own = (np.frombuffer(a, kind).reshape(-1, 3) for a, kind in zip(content, kinds, strict=True))
+    vertices, faces = finer(corners, faces, _OWN_EDGE, _OWN_MOST_FACES)
+    found = vertices, faces, colours_at(vertices, Colours(*own))
+    for array in found:
+        array.flags.writeable = False
+    return found
+
+
+def colours_at(points: np.ndarray, colours: Colours) -> np.ndarray:
+    """(n, 3) uint8 sRGB at points (n, 3) of a surface: means of the nearest known points, by their distances.
+
+    The single nearest one would give edges between two colours teeth.
+    """
+    distance, index = cKDTree(colours.points).query(points, k=min(_AMONG, len(colours.points)))
+    distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
+    width = np.maximum(distance.mean(1, keepdims=True), 1e-9)
+    weight = np.exp(-((distance / width) ** 2))
+    mean = np.einsum("nk,nkd->nd", weight / weight.sum(1, keepdims=True), colours.values[index])
+    return np.round(mean).astype(np.uint8)

@@ -3,10 +3,17 @@
 Kinds of `congrasp/<run>/log/<kind>/<role>/<name>`: `metrics` (meta: time, update or version, values), `event` (time,
 level, text), `version` (any scalars), `rollout` (some worlds of an actor's rollout, opaque) and `episode` (see
 `services.record.scene`).
+
+Sinks take the recorder's entries: MCAP files, live viewers and, for the metrics of learners, TensorBoard and Weights &
+Biases.
 """
 
 import collections
+import contextlib
+import dataclasses
+import json
 import pathlib
+import secrets
 import sys
 import threading
 import time
@@ -15,24 +22,26 @@ from typing import Any, Protocol
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
+from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys, check_name
 from congrasp.common.wire.codec import Message, encode, finite
 from congrasp.common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
-from congrasp.learner.hub.rate_limit import certificate
-from congrasp.services.record.channels import (
+from congrasp.learner.hub.limits import certificate
+from congrasp.services.record.scene import check_episode, duration, episode_entries
+from congrasp.services.record.writer import (
     ROLLOUT_SCHEMA,
     Entry,
     JsonChannels,
+    LogWriter,
     check_field,
+    flatten,
     nest,
     opaque_channel,
     protobuf_channel,
 )
-from congrasp.services.record.scene import check_episode, duration, episode_entries
-from congrasp.services.record.writer import LogWriter
 
 Name = tuple[str, str]
 """Role and name of a publisher."""
@@ -41,6 +50,14 @@ _NAMES = 64  # names of one identity
 _IDENTITIES = 1024
 _IDLE = 60.0  # seconds after which a silent name may be replaced
 _PER_SECOND, _MOST = 16 << 20, 256 << 20  # bytes per second of an identity's entries, and their burst
+_AHEAD = 60_000_000_000
+"""Longest queue of an actor's episodes in ns; later ones are dropped."""
+_TIMES = 2**62
+"""Limit of times, ns since 1970."""
+_LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
+FLUSH_SECONDS = 0.5
+"""Seconds between two flushes; a killed recorder loses no more than these."""
+_TOPIC = "/metrics/learner/"
 
 
 class LogBudget:
@@ -95,13 +112,6 @@ class LogBudget:
 def _identity(who: Name) -> Name:
     role, name = who
     return role, certificate(name) if role == "actor" else ""
-
-
-_AHEAD = 60_000_000_000
-"""Longest queue of an actor's episodes in ns; later ones are dropped."""
-_TIMES = 2**62
-"""Limit of times, ns since 1970."""
-_LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR, "fatal": Log.FATAL}
 
 
 class Converter:
@@ -201,10 +211,6 @@ def _scalars(meta: Mapping[str, Any]) -> dict[str, Any]:
         for key, value in meta.items()
         if isinstance(value, bool | int | float | str) and len(str(value)) <= LONGEST_TEXT
     }
-
-
-FLUSH_SECONDS = 0.5
-"""Seconds between two flushes; a killed recorder loses no more than these."""
 
 
 class Sink(Protocol):
@@ -340,3 +346,129 @@ class Recorder:
             )
             self._writer.abandon()
             self._warn(self.error)
+
+
+class MetricWriters:
+    """A sink of `services.record.recorder.Recorder` for learners' metrics; a failed writer is not used again."""
+
+    def __init__(self, writers: Mapping[str, "_TensorBoard | _WeightsAndBiases"]):
+        """Creates a sink with writers by name."""
+        self._writers = dict(writers)
+
+    def write(self, entry: Entry) -> None:
+        """Accepts an entry; entries that are not metrics of a learner are ignored."""
+        if not entry.channel.topic.startswith(_TOPIC):
+            return
+        message = json.loads(entry.data)
+        values = {name: float(value) for name, value in flatten(message["values"]).items()}
+        step = int(message.get("update", message.get("version", 0)))
+        learner = entry.channel.topic.removeprefix(_TOPIC)
+        self._each(lambda writer: writer.write(learner, 1e-9 * entry.time, step, values))
+
+    def close(self) -> None:
+        """Finishes every writer."""
+        self._each(lambda writer: writer.close())
+
+    def _each(self, action: Callable[[Any], None]) -> None:
+        for name, writer in list(self._writers.items()):
+            try:
+                action(writer)
+            except Exception as error:  # a failed writer must not end the training
+                del self._writers[name]
+                text = (
+                    f"congrasp: {name} receives no more metrics ({type(error).__name__}: {error}); the run continues."
+                )
+                print(text, file=sys.stderr, flush=True)
+
+
+class _TensorBoard:
+    """Event files, one folder per learner; written synchronously, so that there is no thread to wait for."""
+
+    def __init__(self, folder: pathlib.Path):
+        self._folder = folder
+        self._files: dict[str, Any] = {}
+
+    def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
+        """Writes the scalars of an update."""
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+        from tensorboardX.proto.summary_pb2 import Summary
+
+        file = self._files.get(learner)
+        if file is None:
+            file = self._files[learner] = self._begin(learner)
+            # A resumed run repeats steps: TensorBoard purges those of an earlier file from here on.
+            file.write_event(Event(wall_time=seconds, step=step, session_log=SessionLog(status=SessionLog.START)))
+        summary = Summary(value=[Summary.Value(tag=name, simple_value=value) for name, value in values.items()])
+        file.write_event(Event(wall_time=seconds, step=step, summary=summary))
+        file.flush()
+
+    def _begin(self, learner: str) -> Any:
+        from tensorboardX.event_file_writer import EventsWriter
+
+        folder = self._folder / f"learner-{learner}"
+        folder.mkdir(parents=True, exist_ok=True)
+        return EventsWriter(str(folder / "events"), f".{secrets.token_hex(4)}")
+
+    def close(self) -> None:
+        """Finishes."""
+        for file in self._files.values():
+            file.close()
+
+
+class _WeightsAndBiases:
+    """A run of Weights & Biases; offline it is stored in the run's folder and uploaded with `wandb sync`."""
+
+    def __init__(self, folder: pathlib.Path, run: str, config: Mapping[str, Any], *, offline: bool):
+        import wandb
+
+        settings = wandb.Settings(console="off", silent=True, x_disable_stats=True, init_timeout=20)
+        self._run = wandb.init(
+            project="congrasp",
+            name=run,
+            group=run,
+            dir=str(folder),
+            config=dict(config),
+            mode="offline" if offline else "online",
+            settings=settings,
+        )
+        self._run.define_metric("*", step_metric="update")
+
+    def write(self, learner: str, seconds: float, step: int, values: Mapping[str, float]) -> None:
+        """Writes the scalars of an update."""
+        prefix = "" if learner == "0" else f"learner-{learner}/"
+        self._run.log({**{f"{prefix}{name}": value for name, value in values.items()}, "update": step})
+
+    def close(self) -> None:
+        """Finishes."""
+        import wandb
+
+        self._run.finish()
+        wandb.teardown()  # waits for the process that writes the file
+
+
+@contextlib.contextmanager
+def recorded(
+    transport: Transport, config: RunConfig, run_dir: pathlib.Path, logs: pathlib.Path, names: Sequence[MetricWriter]
+) -> Iterator[Recorder]:
+    """Context that records a run, and passes its metrics to writers.
+
+    Args:
+      transport: an endpoint of the run.
+      config: the run's configuration.
+      run_dir: the run's folder; TensorBoard's files go to `tensorboard` in it, those of Weights & Biases to `wandb`.
+      logs: folder of the recordings.
+      names: names of the writers.
+
+    Raises:
+      ModuleNotFoundError: a writer's package is not installed.
+    """
+    writers: dict[str, _TensorBoard | _WeightsAndBiases] = {}
+    for name in dict.fromkeys(names):
+        if name == "tensorboard":
+            writers[name] = _TensorBoard(run_dir / name)
+        else:
+            offline = name == "wandb-offline"
+            writers[name] = _WeightsAndBiases(run_dir, config.name, dataclasses.asdict(config), offline=offline)
+    combined = MetricWriters(writers)
+    with contextlib.closing(combined), Recorder(transport, config.name, logs, sinks=[combined]) as recorder:
+        yield recorder

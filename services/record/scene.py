@@ -27,17 +27,25 @@ from congrasp.common.hands.flesh import skeleton_of
 from congrasp.common.hands.mjcf import WRIST_JOINTS, mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of, skin_on
 from congrasp.common.hands.spec import Hand, Link, capsule_ends
-from congrasp.common.objects.painting import colours_at
 from congrasp.common.objects.spec import Colours
 from congrasp.common.objects.store import LARGEST
-from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
+from congrasp.common.task.constraints.base import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import EPISODE, validate
-from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel, protobuf_channel
-from congrasp.services.record.goals import markers
-from congrasp.services.record.moved_arm import MovedArm, arm_of_episode
-from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE, HEADING, OBJECT, TABLE, WAYPOINT, Colour
+from congrasp.services.record.episode import MovedArm, arm_of_episode, markers
+from congrasp.services.record.palette import (
+    AVOID,
+    FLESH,
+    GRASPABLE,
+    HEADING,
+    OBJECT,
+    TABLE,
+    WAYPOINT,
+    Colour,
+    colours_at,
+)
 from congrasp.services.record.palette import MATERIALS as COLOURS
+from congrasp.services.record.writer import Entry, JsonChannels, opaque_channel, protobuf_channel
 
 _OVERLAP = 0.4  # weight of a link on a vertex above which the triangle belongs to the link
 _MOST_FACES = 12_000  # triangles of a hand; meshes of links may have more

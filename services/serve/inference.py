@@ -13,8 +13,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError, ContradictionError, error_of
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.left import right_name
-from congrasp.common.hands.spec import Hand
+from congrasp.common.hands.spec import Hand, right_name
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, mean_action
 from congrasp.common.policy.pretrained import named_policy
@@ -25,10 +24,8 @@ from congrasp.common.task.features import scene_of
 from congrasp.common.task.sensing import seen_by
 from congrasp.common.task.types import SceneState
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.episode import PACKED, EpisodePolicy
-from congrasp.services.client.left import LeftPolicy
 from congrasp.services.client.limits import JointLimits
-from congrasp.services.client.policy import Policy
+from congrasp.services.client.policy import PACKED, EpisodePolicy, LeftPolicy, Policy
 from congrasp.services.serve.requests import STATES_LIMIT, Layout, Query
 
 BATCH_SIZES = (1, 8, STATES_LIMIT)

@@ -3,7 +3,7 @@
 A query is one array `packed` (n, S) of float32: a row for each of n states under the same constraints. Its metadata
 have the names of the `constraints`, the digest of the `layout`, and the `timeout` in seconds. One vector is transferred
 to the device at once, since the overhead of a transfer equals that of thirty times its size. The layout is part of
-`Policy.metadata`. `services.client.episode.Packer` writes and checks the fields; absent ones are zero.
+`Policy.metadata`. `services.client.policy.Packer` writes and checks the fields; absent ones are zero.
 
 The fields, without batch axis, are those of `common.task.types.SceneState`, the object's `surface_points` with
 `surface_avoid`, and the goal arrays of the constraints.
@@ -42,14 +42,12 @@ from congrasp.common.task.normals import estimated_normals
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.episode import PACKED
+from congrasp.services.client.policy import CAMERA, NORMALS, PACKED
 
 STATES_LIMIT = 64
 """Most states in one query."""
 CLOUD = "cloud"
 """Name of the points of a query to a policy with a camera."""
-NORMALS, CAMERA = "surface_normals", "camera_position"
-"""Names of the normals at these points, and of the position of the camera."""
 _UNIT_TOLERANCE = 0.02
 
 

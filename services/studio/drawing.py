@@ -7,10 +7,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.objects.painting import finer, painted
 from congrasp.common.objects.shapes import matrix
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.sampling.headings import INWARD
+from congrasp.services.record.palette import finer, painted
 
 LARGEST = 1e6
 """Bound on each number of a position (m) or direction from a page; its square is finite in single precision."""

@@ -23,8 +23,7 @@ from congrasp.services.assets.objects.materials import MATERIALS, with_mass
 from congrasp.services.assets.objects.options import METRES
 from congrasp.services.ops.logs import log
 from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads
-from congrasp.services.studio.motions import DATA, DRAWN, Motions, data_file, drawing
-from congrasp.services.studio.page import describe, for_page, hand_message
+from congrasp.services.studio.page import DATA, DRAWN, Motions, data_file, describe, drawing, for_page, hand_message
 from congrasp.services.studio.server import BadRequest, Download, Get, Picture, Routes
 from congrasp.services.studio.state import ACTIONS, History, Studio
 from congrasp.services.studio.training import TrainingWindow

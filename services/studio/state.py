@@ -19,7 +19,7 @@ from congrasp.common.task.constraints import Constraint, get_constraint, goal_of
 from congrasp.common.task.constraints.priority import Resolution, explain, resolve
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
 from congrasp.common.task.sampling.headings import BACK_OFF
-from congrasp.common.task.sampling.write_sets import make_sets
+from congrasp.common.task.sampling.sets import make_sets
 from congrasp.common.task.types import Goal, Surface
 from congrasp.common.wire.codec import Message
 from congrasp.services.grasp.approaches import with_avoid

@@ -23,10 +23,17 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.ops import status as statuses
 from congrasp.services.ops.logs import log
-from congrasp.services.record.channels import flatten
-from congrasp.services.record.reader import Record, is_episode, log_files, metrics_of, read_records
-from congrasp.services.record.salvage import DAMAGE, intact_summary
+from congrasp.services.record.reader import (
+    DAMAGE,
+    Record,
+    intact_summary,
+    is_episode,
+    log_files,
+    metrics_of,
+    read_records,
+)
 from congrasp.services.record.scene import EPISODE_SCHEMA
+from congrasp.services.record.writer import flatten
 from congrasp.services.viz.plots import figures
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")

@@ -35,10 +35,9 @@ from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.shutdown import on_signal
 from congrasp.services.serve.load import example_episode, one_answer, serving
-from congrasp.services.train.launch import Launch, Plan
 from congrasp.services.train.learn import learn
 from congrasp.services.train.presets import FULL, easier
-from congrasp.services.train.processes import train
+from congrasp.services.train.processes import Launch, Plan, train
 from congrasp.services.viz.render import episode_sheet
 from congrasp.services.viz.sheets import save_png
 

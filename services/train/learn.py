@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from congrasp.actors.harvest import references_file
-from congrasp.actors.process.actor import run_actor
+from congrasp.actors.process import run_actor
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.policy.bundle import policy_spec
 from congrasp.common.runtime.engines import PhysicsName
@@ -18,16 +18,16 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.memory import PairTransport
 from congrasp.learner.algorithms import make_algorithm
-from congrasp.learner.batch import rollout_form
+from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
 from congrasp.learner.process import run_learner
-from congrasp.learner.run_directory import create_run, has_checkpoints
+from congrasp.learner.run_directory import LOGS, create_run, has_checkpoints
 from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.metrics import LearnerMetrics
 from congrasp.services.ops.shutdown import GRACE
 from congrasp.services.ops.status import ask
-from congrasp.services.record.metric_writers import recorded
-from congrasp.services.train.launch import engine_of
+from congrasp.services.record.recorder import recorded
+from congrasp.services.train.processes import engine_of
 
 _START_SECONDS = 0.5
 """Head start of the learner, which must listen first, over the actor, s."""
@@ -86,7 +86,7 @@ def learn(
             resume=rank == 0 and has_checkpoints(run_dir),
             ranks=ranks,
             audit=inside is None,
-            recorder=recorded(transport, config, run_dir, writers) if rank == 0 else None,
+            recorder=recorded(transport, config, run_dir, run_dir / LOGS, writers) if rank == 0 else None,
             on_update=updated,
             on_event=on_event,
         )

@@ -19,9 +19,8 @@ from congrasp.common.policy.pretrained import own_policy_file, pretrained_hands
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE
 from congrasp.services.assets.hands.check import Finding, read_findings
-from congrasp.services.ops.children import Child, command
+from congrasp.services.ops.children import Child, command, run_child, train_in_background, trained, training_seconds
 from congrasp.services.train.presets import FULL, get_preset
-from congrasp.services.train.unattended import run_child, seconds, train_in_background, trained
 
 HAND, CHECK, REPORT = "hand.json", "check.json", "report.html"
 _ROWS = "report.json"
@@ -164,7 +163,7 @@ def _report(request: Request, policy: pathlib.Path, note: Callable[[str], None])
         _run(request, "report", arguments, (0,), {})
     for row in read_json(rows, _LARGEST)["rows"]:
         note(f"  {row['constraint']:22s} success {100 * row['success']:5.1f} %")
-    took = seconds(request.run_dir)
+    took = training_seconds(request.run_dir)
     note(f"The report is {page}" + (f"; the training took {took / 60:.1f} min." if took else "."))
 
 

@@ -13,8 +13,7 @@ from congrasp.common.hands.skin import Skin
 from congrasp.common.hands.spec import Hand, link_origin
 from congrasp.services.record.palette import HEADING, OBJECT, WAYPOINT
 from congrasp.services.viz.raster import render_fitted, render_scene
-from congrasp.services.viz.scene import Shape
-from congrasp.services.viz.shapes import arrow, beads, fit, object_shape, posed_hand, shape_points, upright
+from congrasp.services.viz.shapes import Shape, arrow, beads, fit, object_shape, posed_hand, shape_points, upright
 from congrasp.services.viz.sheets import contact_sheet, stacked
 
 if TYPE_CHECKING:

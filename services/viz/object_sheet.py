@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import outline
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.resting import rest_tilts
 from congrasp.common.objects.shapes import tessellate
@@ -24,8 +24,16 @@ from congrasp.services.assets.objects.options import length, size_in_words
 from congrasp.services.assets.objects.repair import with_few_faces
 from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, PIECES, WAYPOINT
 from congrasp.services.viz.raster import render_fitted
-from congrasp.services.viz.scene import Shape
-from congrasp.services.viz.shapes import arrow, beads, object_shape, posed_hand, shape_points, table_shape, upright
+from congrasp.services.viz.shapes import (
+    Shape,
+    arrow,
+    beads,
+    object_shape,
+    posed_hand,
+    shape_points,
+    table_shape,
+    upright,
+)
 from congrasp.services.viz.sheets import contact_sheet
 
 _ARROWS, _LENGTH = 24, 0.08  # number of headings, length of their arrows in m

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from congrasp.services.viz.kernels import NOTHING, add_light, averaged, cover, shade
-from congrasp.services.viz.scene import Camera, Shape
-from congrasp.services.viz.shapes import fit, shape_points
+from congrasp.services.viz.shapes import Camera, Shape, fit, shape_points
 from congrasp.services.viz.triangles import Triangles, joined, triangles_of
 
 

@@ -11,9 +11,9 @@ from congrasp.common.errors import CongraspError, need_package
 from congrasp.common.hands import known_hand
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.goals import active_blocks, grasp_span, phases_of
+from congrasp.services.record.episode import active_blocks, grasp_span, phases_of
 from congrasp.services.viz.raster import render_scene
-from congrasp.services.viz.scene import Camera, Shape
+from congrasp.services.viz.shapes import Camera, Shape
 from congrasp.services.viz.sheets import contact_sheet, save_video
 from congrasp.services.viz.views import View, camera_of, episode_shapes, views
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from congrasp.services.viz.kernels import GAMMA
-from congrasp.services.viz.scene import Shape
+from congrasp.services.viz.shapes import Shape
 
 CREASE = np.cos(np.radians(35.0))
 """Faces whose normals differ by more than this angle (given as its cosine) meet in a sharp edge."""

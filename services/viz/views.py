@@ -11,13 +11,14 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import MATERIALS, skin_of
 from congrasp.common.hands.spec import Hand
-from congrasp.common.task.constraints.markers import Arrow, Ghost, Paint, Polyline
+from congrasp.common.task.constraints.base import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.goals import markers
+from congrasp.services.record.episode import markers
 from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, WAYPOINT
 from congrasp.services.viz.raster import visible
-from congrasp.services.viz.scene import Camera, Shape
 from congrasp.services.viz.shapes import (
+    Camera,
+    Shape,
     arrow,
     beads,
     capsule_shapes,

@@ -6,8 +6,8 @@ import time
 import numpy as np
 import pytest
 
-from congrasp.actors.process import link as link_module
-from congrasp.actors.process.link import ActorLink, RunFinished, RunRestarted, Ticket
+from congrasp.actors import link as link_module
+from congrasp.actors.link import ActorLink, RunFinished, RunRestarted, Ticket
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport

@@ -9,10 +9,10 @@ import jax
 import numpy as np
 import pytest
 
+from congrasp.actors import process
 from congrasp.actors.env import episode_fields
-from congrasp.actors.process import actor as process
-from congrasp.actors.process.actor import Follower
-from congrasp.actors.process.link import RunInfo
+from congrasp.actors.link import RunInfo
+from congrasp.actors.process import Follower
 from congrasp.actors.rollout import Rollout, Trace
 from congrasp.actors.training_set import TrainingSet
 from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig, to_json
@@ -29,10 +29,9 @@ from congrasp.common.task.types import Surface
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import encode
-from congrasp.common.wire.messages import EPISODE, validate
-from congrasp.common.wire.schema import PRIVILEGED, RECORDED
+from congrasp.common.wire.messages import EPISODE, PRIVILEGED, RECORDED, validate
 from congrasp.learner.algorithms import make_algorithm
-from congrasp.learner.batch import rollout_form
+from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 

@@ -13,7 +13,7 @@ from congrasp.common.hands.motors import motor_positions
 from congrasp.common.policy.bundle import full_layout
 from congrasp.common.task import observation, privileged
 from congrasp.common.task.config import SensingConfig, TaskConfig
-from congrasp.common.task.teaching import extra
+from congrasp.common.task.privileged import extra
 from tests import task as suite
 from tests.scenes import evaluated
 from tests.task import HAND

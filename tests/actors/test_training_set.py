@@ -22,8 +22,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling import build
 from congrasp.common.task.sampling.bank import rows_of, stacked
 from congrasp.common.task.sampling.build import headings_of
-from congrasp.common.task.sampling.sets import load, load_for
-from congrasp.common.task.sampling.write_sets import make_sets, save
+from congrasp.common.task.sampling.sets import load, load_for, make_sets, save
 from congrasp.common.wire.codec import Message
 from tests import task as suite
 from tests.task import HAND, OBJECTS, TASK

@@ -15,9 +15,9 @@ from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.task.config import TaskConfig
+from congrasp.services.assets.objects.decompose import merge, simplify
 from congrasp.services.assets.objects.fidelity import enclosed, fidelity
 from congrasp.services.assets.objects.named import objects_of
-from congrasp.services.assets.objects.pieces import merge, simplify
 
 _CLOSING = 100
 """Control steps in which the fingers close around the object, which is held where it is."""

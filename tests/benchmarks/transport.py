@@ -23,13 +23,13 @@ import zenoh
 from zenoh import CongestionControl
 from zenoh.handlers import FifoChannel
 
-from congrasp.actors.process.link import ActorLink, RunFinished
+from congrasp.actors.link import ActorLink, RunFinished
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.journal import AUDIT, Journal
 from congrasp.common.transport import urls
 from congrasp.common.transport.ports import free_port, local_url
 from congrasp.common.wire.codec import Message, encode
-from congrasp.common.wire.schema import RolloutForm
+from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager

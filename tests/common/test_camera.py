@@ -20,8 +20,8 @@ from congrasp.common.policy.bundle import PolicyBundle, full_layout, mean_action
 from congrasp.common.task import camera
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import known
+from congrasp.common.task.privileged import extra
 from congrasp.common.task.sensing import draw_sensors
-from congrasp.common.task.teaching import extra
 from congrasp.common.task.types import Goal, Surface
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.learner.algorithms.protocol import random_policy

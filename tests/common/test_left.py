@@ -14,8 +14,7 @@ from congrasp.common.hands.skin import skin_of
 from congrasp.common.objects.procedural import generate
 from congrasp.common.objects.shapes import mesh_of
 from congrasp.common.request import GraspRequest
-from congrasp.services.client.left import LeftPolicy, mirrored_request
-from congrasp.services.client.policy import Answer
+from congrasp.services.client.policy import Answer, LeftPolicy, mirrored_request
 
 SIDES = np.diag([-1.0, 1.0, 1.0])
 

@@ -11,13 +11,14 @@ from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.common.wire.messages import (
     EPISODE,
     EVENT,
+    RECORDED,
     MessageSpec,
+    RolloutForm,
     is_finite,
     validate,
     validate_bundle,
     validate_rollout,
 )
-from congrasp.common.wire.schema import RECORDED, RolloutForm
 
 T, B, D, A, E = 3, 2, 5, 4, 1
 FORM = RolloutForm(T, B, D, A, half=True)

@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from congrasp.common.io.npz import read_npz
+from congrasp.common.io.inputs import read_npz
 from tests.limits import limited
 
 

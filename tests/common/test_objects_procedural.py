@@ -24,9 +24,9 @@ from congrasp.common.objects.procedural import (
     generate_many,
 )
 from congrasp.common.objects.resting import TableScene
+from congrasp.common.objects.shapes import sample_union
 from congrasp.common.objects.spec import MAX_MESH_VERTICES, PRIMITIVE_SLOTS, SURFACE_POINTS
 from congrasp.common.objects.store import digest
-from congrasp.common.objects.surface import sample_union
 from tests.solids import mujoco_mass_properties
 
 MOST_MESHES = 13  # what environments have room for is sized by the object with the most

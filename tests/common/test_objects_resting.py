@@ -10,8 +10,8 @@ from congrasp.common.objects import shapes
 from congrasp.common.objects.mjcf import CONTACT, add_object
 from congrasp.common.objects.procedural import generate
 from congrasp.common.objects.resting import TableScene, quasi_static_poses, rest_poses, settle
+from congrasp.common.objects.shapes import mass_properties, sample_union
 from congrasp.common.objects.spec import GraspObject, Piece
-from congrasp.common.objects.surface import mass_properties, sample_union
 
 
 def make(*pieces, density=800.0):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from congrasp.common.objects import shapes
+from congrasp.common.objects.shapes import halves, mass_properties, sample_mesh, sample_union
 from congrasp.common.objects.spec import Piece
-from congrasp.common.objects.surface import halves, mass_properties, sample_mesh, sample_union
 from tests.solids import mujoco_mass_properties
 
 QUAT = tuple(np.array([0.8, 0.3, -0.4, 0.33]) / np.linalg.norm([0.8, 0.3, -0.4, 0.33]))

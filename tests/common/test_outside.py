@@ -16,8 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
-from congrasp.common.task.constraints.base import Constraint, ErrorSpec, GoalArray, ObservationField, Option, Weight
-from congrasp.common.task.constraints.markers import Polyline
+from congrasp.common.task.constraints.base import (
+    Constraint,
+    ErrorSpec,
+    GoalArray,
+    ObservationField,
+    Option,
+    Polyline,
+    Weight,
+)
 from tests.conftest import ROOT
 
 
@@ -213,7 +220,7 @@ def file():
 
 def marker():
     """What pictures, recordings and the studio's player draw of it."""
-    from congrasp.services.record.goals import markers
+    from congrasp.services.record.episode import markers
 
     heading = {"position": np.zeros(3), "direction": np.array([0.0, 0.0, -1.0]), "cross": np.array([1.0, 0.0, 0.0])}
     arrays = {f"goal/heading_{name}": value for name, value in heading.items()}

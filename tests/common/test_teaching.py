@@ -13,7 +13,7 @@ from congrasp.common.task.config import ControlConfig, TaskConfig
 from congrasp.common.task.control import decode, guided
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.observation import observe
-from congrasp.common.task.teaching import extra, observe_for_teacher, student_action
+from congrasp.common.task.privileged import extra, observe_for_teacher, student_action
 from tests.scenes import HAND, N, evaluated, scene
 from tests.scenes import scene_of as compiled_scene
 

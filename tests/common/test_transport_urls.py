@@ -11,7 +11,7 @@ import threading
 import pytest
 
 import tests.socket_transport  # noqa: F401  adds its scheme
-from congrasp.actors.process.link import ActorLink
+from congrasp.actors.link import ActorLink
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import FLOWS, Keys, flow

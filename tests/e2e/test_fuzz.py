@@ -36,7 +36,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, decode, encode
-from congrasp.common.wire.schema import RolloutForm
+from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.services.assets.objects.mesh_files import read_mesh

@@ -11,7 +11,7 @@ import numpy as np
 import psutil
 import pytest
 
-from congrasp.actors.process.link import ActorLink
+from congrasp.actors.link import ActorLink
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.ports import local_url, shifted

@@ -12,7 +12,7 @@ import pytest
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from congrasp.actors.process.link import ActorLink
+from congrasp.actors.link import ActorLink
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.certificates import read
 from congrasp.common.transport.keys import Keys, below
@@ -434,7 +434,7 @@ def test_who_is_revoked_is_out_and_the_others_stay(fresh):
 
 ACTOR = """
 import sys
-from congrasp.actors.process.link import ActorLink
+from congrasp.actors.link import ActorLink
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
 

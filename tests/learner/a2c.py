@@ -11,10 +11,15 @@ import optax
 
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.normalizer import Statistics
-from congrasp.common.wire.schema import RECORDED
+from congrasp.common.wire.messages import RECORDED
 from congrasp.learner.algorithms import gae
-from congrasp.learner.algorithms.protocol import LearnedPolicy, NonFiniteUpdate, TrainState, random_policy
-from congrasp.learner.batch import partition_specs
+from congrasp.learner.algorithms.protocol import (
+    LearnedPolicy,
+    NonFiniteUpdate,
+    TrainState,
+    partition_specs,
+    random_policy,
+)
 from congrasp.learner.distributed.collectives import REPLICATED, Collectives, shard, shard_map, unreplicate
 
 SCHEMA = {name: spec for name, spec in RECORDED.items() if name != "log_probability"}

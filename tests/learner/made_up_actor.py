@@ -5,7 +5,7 @@ import threading
 import jax
 import numpy as np
 
-from congrasp.actors.process.link import ActorLink, RunFinished
+from congrasp.actors.link import ActorLink, RunFinished
 from congrasp.common.errors import TransportError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle

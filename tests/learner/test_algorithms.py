@@ -11,7 +11,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.learner.algorithms import ALGORITHMS, make_algorithm
-from congrasp.learner.batch import collate, partition_specs
+from congrasp.learner.algorithms.protocol import collate, partition_specs
 from congrasp.learner.hub.admission import Ranges
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run

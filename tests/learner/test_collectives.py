@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from congrasp.common.config import RunConfig
 from congrasp.learner.algorithms.ppo import PPO
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate
-from congrasp.learner.batch import collate
+from congrasp.learner.algorithms.protocol import collate
 from congrasp.learner.distributed.collectives import AXIS, shard
 from tests.learner import toy
 from tests.learner.test_ppo import fresh, rollout

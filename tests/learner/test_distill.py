@@ -13,7 +13,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, PolicySpec, mean_action, policy_spec
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.teaching import extra, student_action
+from congrasp.common.task.privileged import extra, student_action
 from congrasp.learner.algorithms.distill import Distillation
 from congrasp.learner.algorithms.protocol import NonFiniteUpdate, random_policy
 from congrasp.services.train.presets import TRACKERS

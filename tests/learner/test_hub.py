@@ -15,11 +15,11 @@ from congrasp.common.errors import CongraspError, RefusedError
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message, encode
-from congrasp.common.wire.schema import RolloutForm
+from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.hub import hub
 from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.deduplication import Sequences
-from congrasp.learner.hub.rate_limit import RateLimit
+from congrasp.learner.hub.limits import RateLimit
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.write_ahead import PART, WriteAheadLog
 from tests import rollouts

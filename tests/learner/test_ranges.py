@@ -11,7 +11,7 @@ from congrasp.common.task.config import RewardWeights, TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.metrics import episode_fields
 from congrasp.common.wire.codec import Message
-from congrasp.common.wire.schema import RECORDED
+from congrasp.common.wire.messages import RECORDED
 from congrasp.learner.hub.admission import Admission, task_ranges
 from tests import task as suite
 

@@ -19,7 +19,7 @@ def example() -> Any:
 @pytest.fixture(scope="session")
 def constraint_sets() -> Any:
     """Constraint sets of the suite's objects."""
-    from congrasp.common.task.sampling.write_sets import make_sets
+    from congrasp.common.task.sampling.sets import make_sets
     from tests.task import HAND, OBJECTS, TASK
 
     return make_sets(HAND, TASK, OBJECTS, 0)

@@ -15,8 +15,8 @@ from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.task.sampling import sets as constraint_sets
 from congrasp.common.task.sampling import sets as stored_sets
-from congrasp.common.task.sampling import write_sets as constraint_sets
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.record.reader import read_records

@@ -9,7 +9,6 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_json
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.grasp import wrist_paths
-from congrasp.services.record.channels import Entry, JsonChannels, opaque_channel
 from congrasp.services.record.reader import (
     metrics_of,
     pick_episode,
@@ -18,7 +17,7 @@ from congrasp.services.record.reader import (
     read_records,
 )
 from congrasp.services.record.scene import EPISODE_SCHEMA
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import Entry, JsonChannels, LogWriter, opaque_channel
 from tests.episodes import episode
 
 BVH = """HIERARCHY

@@ -14,14 +14,15 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
+    Marker,
     ObservationField,
     Option,
+    Paint,
     Relation,
     Scene,
     Weight,
 )
 from congrasp.common.task.constraints.heading import HeadingGoal
-from congrasp.common.task.constraints.markers import Marker, Paint
 from congrasp.common.task.geometry import FAR, flat, least_distance_to_segment, nearest_index, share, squash
 from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.sampling.headings import INWARD, MAX_WIDTH

@@ -2,6 +2,8 @@
 
 A constraint's module defines a subclass of `Constraint`, and `common.task.constraints.CONSTRAINTS` contains an
 instance. All methods are pure functions of batched arrays (leading axis B) that may be traced; the defaults do nothing.
+
+Its markers are drawn in pictures, recordings and the studio; all of them are in the object frame.
 """
 
 import dataclasses
@@ -16,11 +18,44 @@ import numpy as np
 from congrasp.common.errors import CongraspError, UnknownConstraintError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.task.constraints.markers import Marker
 from congrasp.common.task.sampling.bank import ConstraintBank, Draw
 from congrasp.common.task.sensing import Readings
 from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Contacts, Features, Goal, SceneState, Surface
+
+
+class Arrow(NamedTuple):
+    """A direction that ends at a point."""
+
+    tip: np.ndarray
+    """(3,) m."""
+    direction: np.ndarray
+    """(3,) unit vector."""
+
+
+class Polyline(NamedTuple):
+    """A sequence of connected points."""
+
+    points: np.ndarray
+    """(n, 3) m."""
+
+
+class Ghost(NamedTuple):
+    """A translucent hand."""
+
+    position: np.ndarray
+    """(3,) position of the wrist, m."""
+    quaternion: np.ndarray
+    """(4,) orientation of the wrist."""
+    q: np.ndarray | None
+    """(F,) finger angles, rad; None draws only the wrist's axes."""
+
+
+class Paint(NamedTuple):
+    """The avoid region, painted on the object."""
+
+
+Marker = Arrow | Polyline | Ghost | Paint
 
 Window = Literal["approach", "hold"]
 """Steps over which an error is averaged: before the table's removal, or in the `hold_steps` after it."""

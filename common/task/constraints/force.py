@@ -20,12 +20,11 @@ from congrasp.common.task.constraints.base import (
 )
 from congrasp.common.task.geometry import FORCE_SCALE
 from congrasp.common.task.sampling.bank import Draw
-from congrasp.common.task.settings import TaskSettings
+from congrasp.common.task.settings import GRAVITY, TaskSettings
 from congrasp.common.task.types import Array, Surface
 
 LEAST, MOST = 1.0, 20.0
 """Limits drawn in training, N, as far as the object's weight allows."""
-_GRAVITY = 9.81
 _LOWEST, _HIGHEST = 0.5, 50.0  # range of a request's limit, N
 _FAR = 10.0  # N beyond the limit at which the cost saturates
 _SUGGESTED = 5.0
@@ -120,7 +119,7 @@ def least_force(mass: Array, friction: Array) -> Array:
     Thumb and fingers press on opposite sides, each of which carries half of the weight by friction. The fingers share
     their side; the thumb carries the other.
     """
-    return jnp.clip(mass * _GRAVITY / (2.0 * friction), LEAST, MOST)
+    return jnp.clip(mass * GRAVITY / (2.0 * friction), LEAST, MOST)
 
 
 def _limit(scene: Scene) -> Array:

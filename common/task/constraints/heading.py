@@ -12,16 +12,17 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
+    Arrow,
     Constraint,
     ErrorSpec,
     GoalArray,
+    Marker,
     ObservationField,
     Option,
     Scene,
     Weight,
 )
 from congrasp.common.task.constraints.fingers import chosen_fingers
-from congrasp.common.task.constraints.markers import Arrow, Marker
 from congrasp.common.task.geometry import flat, hand_center, in_world
 from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.settings import TaskSettings

@@ -20,7 +20,9 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
+    Ghost,
     GoalArray,
+    Marker,
     ObservationField,
     Option,
     Relation,
@@ -28,7 +30,6 @@ from congrasp.common.task.constraints.base import (
     Weight,
 )
 from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
-from congrasp.common.task.constraints.markers import Ghost, Marker
 from congrasp.common.task.geometry import flat, in_world, square, squared_distances, wrist_to_joints
 from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.settings import TaskSettings

@@ -14,15 +14,16 @@ from congrasp.common.task.constraints.base import (
     Constraint,
     ErrorSpec,
     GoalArray,
+    Marker,
     ObservationField,
     Option,
+    Polyline,
     Relation,
     Scene,
     Weight,
 )
 from congrasp.common.task.constraints.fingers import chosen_fingers
 from congrasp.common.task.constraints.heading import TURNED, heading_of_wrist, heading_turn, object_pose
-from congrasp.common.task.constraints.markers import Marker, Polyline
 from congrasp.common.task.constraints.pose import disturbed_wrist, heading_message, wrist_numbers
 from congrasp.common.task.geometry import flat, in_world, least_distance, square, wrist_to_joints
 from congrasp.common.task.sampling.bank import Draw

@@ -18,8 +18,7 @@ from congrasp.common.hands import kinematics
 from congrasp.common.hands.closure import CENTER, Outline, outline
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.caches import keep, read_kept, source_digest
-from congrasp.common.io.files import cache_folder
+from congrasp.common.io.files import cache_folder, keep, read_kept, source_digest
 from congrasp.common.objects import store
 from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
@@ -252,16 +251,8 @@ def headings_of(
       CongraspError: the object is too wide (`TooWideError`), or cannot be approached in any of its resting poses.
     """
     rng = np.random.default_rng(seed)
-    inward, width = scale * INWARD, max_width(hand, scale)
     opposed = task.headings != "center" and given is None
-    whole, graspable = (
-        given
-        or sample_headings(
-            obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width, opposed=opposed
-        )
-        for use in (False, True)
-    )
-    assert whole is not None, "only the graspable region may be unreachable"
+    whole, graspable = (given, given) if given else _sampled(obj, rng, scale, hand, opposed=opposed)
     sets = [whole, graspable or whole]
     # Captured headings may be off by a centimetre, but a hand did hold their objects.
     avoid = obj.non_graspable_points if graspable is not None and given is None else None
@@ -277,7 +268,7 @@ def headings_of(
     positions = np.array([[region[rest].position for rest in usable] for region in cleared])
     index = np.array([[_repeated(row) for row in region] for region in reachable])
     back = np.linalg.norm(positions - np.array([headings.position for headings in sets])[:, None], axis=-1)
-    chosen = [_spread(rng, region) for region in reachable]
+    references = _reference_headings(rng, sets, positions, reachable)
     keep = rng.permutation(SURFACE_POINTS)[: task.surface_points]
     avoided = obj.non_graspable_points[keep]
     floats = {
@@ -286,9 +277,7 @@ def headings_of(
         "rest": obj.rest_poses[usable],
         **{f"heading_{name}": np.stack([getattr(s, name) for s in sets]) for name in Headings._fields},
         "heading_back": np.take_along_axis(back, index, -1),
-        "chosen_position": np.stack([p[r, h] for p, (r, h) in zip(positions, chosen, strict=True)]),
-        "chosen_direction": np.stack([s.direction[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
-        "chosen_cross": np.stack([s.cross[h] for s, (_, h) in zip(sets, chosen, strict=True)]),
+        **{f"chosen_{name}": value for name, value in references._asdict().items()},
     }
     return {
         **{name: value.astype(np.float32) for name, value in floats.items()},
@@ -297,6 +286,19 @@ def headings_of(
         "weight": np.float32(not too_flat),
         "has_affordance": (graspable is not None) & avoided.any() & reachable[1].any(-1),
     }
+
+
+def _sampled(
+    obj: GraspObject, rng: np.random.Generator, scale: float, hand: Outline, *, opposed: bool
+) -> tuple[Headings, Headings | None]:
+    """Headings for the whole surface and for the graspable region, None if that is out of reach; see `headings_of`."""
+    inward, width = scale * INWARD, max_width(hand, scale)
+    whole, graspable = (
+        sample_headings(obj, rng, count=HEADINGS, use_affordance=use, inward=inward, max_width=width, opposed=opposed)
+        for use in (False, True)
+    )
+    assert whole is not None, "only the graspable region may be unreachable"
+    return whole, graspable
 
 
 def _reachable(
@@ -336,6 +338,26 @@ def _repeated(which: np.ndarray) -> np.ndarray:
     """Indices (H,) of the true entries of a mask (H,), repeated; zeros if there are none."""
     indices = np.flatnonzero(which)
     return np.resize(indices, HEADINGS) if len(indices) else np.zeros(HEADINGS, int)
+
+
+def _reference_headings(
+    rng: np.random.Generator, sets: Sequence[Headings], positions: np.ndarray, reachable: np.ndarray
+) -> Headings:
+    """Headings (V, M, 3) of the references, drawn among those that are feasible.
+
+    Args:
+      rng: generator of the draws.
+      sets: H headings for each of V regions.
+      positions: (V, R, H, 3) their positions in each resting pose, m.
+      reachable: (V, R, H) bool, feasible headings.
+    """
+    drawn = [
+        Headings(position[rest, heading], region.direction[heading], region.cross[heading])
+        for region, position, (rest, heading) in zip(
+            sets, positions, [_spread(rng, allowed) for allowed in reachable], strict=True
+        )
+    ]
+    return Headings(*(np.stack(parts) for parts in zip(*drawn, strict=True)))
 
 
 def _spread(rng: np.random.Generator, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

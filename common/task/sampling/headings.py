@@ -1,4 +1,19 @@
-"""Heading sets: directions and positions from which a hand may approach an object (paper, section Constraint Setup)."""
+"""Heading sets: directions and positions from which a hand may approach an object (paper, section Constraint Setup).
+
+The heading position is a few centimetres inward from a surface point of the graspable region (or of the whole surface),
+along a direction in the cone around its inward normal. The cross-finger axis is drawn from a few random rolls,
+preferring narrow ones. A candidate is rejected if
+
+* the object's local width along the cross-finger axis exceeds the limit; it is measured on the surface points
+  that the closing fingers sweep (3 cm to both sides of the hand's middle plane, down to 1 cm beyond the position);
+* there are no opposing surfaces: among the points of that slab, within 1.5 cm of either end of the width, one
+  whose normal is within 45 degrees of the axis (ours: at friction 1, two fingers that press along the axis slip
+  off anything steeper, such as two edges of a board's corner);
+* another part of the object is in front of the surface point (the point would not be hit first);
+* with affordance, the approach comes within 1 cm of the avoid region, or the position lies nearer to it than to
+  the graspable one, or it is as wide as that where the fingers close, so that they would meet it first (ours: the
+  paper's regions were held by humans, so they can be held).
+"""
 
 from typing import Any, NamedTuple
 
@@ -61,21 +76,7 @@ def sample_headings(
     at: np.ndarray | None = None,
     opposed: bool = True,
 ) -> Headings | None:
-    """Samples an object's heading set by the paper's rules.
-
-    The heading position is `inward` from a surface point of the graspable region (or of the whole surface), along a
-    direction in the cone around its inward normal. The cross-finger axis is drawn from a few random rolls, preferring
-    narrow ones. A candidate is rejected if
-
-    * the object's local width along the cross-finger axis exceeds `max_width`; it is measured on the surface points
-      that the closing fingers sweep (3 cm to both sides of the hand's middle plane, down to 1 cm beyond the position);
-    * there are no opposing surfaces: among the points of that slab, within 1.5 cm of either end of the width, one
-      whose normal is within 45 degrees of the axis (ours: at friction 1, two fingers that press along the axis slip
-      off anything steeper, such as two edges of a board's corner);
-    * another part of the object is in front of the surface point (the point would not be hit first);
-    * with affordance, the approach comes within 1 cm of the avoid region, or the position lies nearer to it than to
-      the graspable one, or it is as wide as that where the fingers close, so that they would meet it first (ours: the
-      paper's regions were held by humans, so they can be held).
+    """Samples an object's heading set by the module's rules.
 
     Behind a small handle there is no room for fingertips: if fewer than 16 headings of a graspable region remain after
     `attempts` batches, others with half the `inward` are tried. Fewer than `count` are repeated. If none remains on the
@@ -104,37 +105,11 @@ def sample_headings(
       TooWideError: the object is wider than `max_width` wherever it can be approached.
     """
     avoid = obj.non_graspable_points & use_affordance
-    sources = _sources(obj, avoid, along)
     surface = _Surface(obj.points.astype(np.float32), obj.normals.astype(np.float32), avoid)
-
-    def draw(depth: float) -> Headings:
-        source = rng.choice(sources, _BATCH)
-        direction = _in_cone(-obj.normals[source], _CONE, rng)
-        if along is not None:
-            direction = np.broadcast_to(np.float32(along), direction.shape)
-        position = surface.points[source] + np.float32(depth) * direction
-        if at is not None:
-            position = np.broadcast_to(np.float32(at), position.shape)
-        return Headings(position, direction, direction)
-
-    def sample(depth: float) -> tuple[Headings, Headings, np.ndarray]:
-        found: list[Headings] = []
-        for _ in range(attempts):
-            drawn = draw(depth)
-            faults = _faults(surface.points, avoid, drawn.position, drawn.direction, depth, BACK_OFF)
-            order = faults.argsort(kind="stable")
-            drawn, faults = Headings(*(part[order] for part in drawn)), faults[order]
-            clean = int((faults == 0).sum())
-            cross, width = _roll(surface, drawn.position[:clean], drawn.direction[:clean], rng, opposed=opposed)
-            good = np.flatnonzero(width <= max_width)
-            found.append(Headings(drawn.position[good], drawn.direction[good], cross[good]))
-            if sum(len(part.position) for part in found) >= count:
-                break
-        return Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True))), drawn, faults
-
-    pool, drawn, faults = sample(inward)
+    sampler = _Sampler(obj, surface, _sources(obj, avoid, along), along, at, max_width, opposed, rng)
+    pool, drawn, faults = sampler.sample(inward, count, attempts)
     if avoid.any() and _different(pool) < _FEW:
-        pool = max(pool, sample(inward / 2)[0], key=_different)
+        pool = max(pool, sampler.sample(inward / 2, count, attempts)[0], key=_different)
     if not len(pool.position):
         last = _last_resort(surface, drawn.position, drawn.direction, faults, rng, lenient=lenient)
         if last is None:
@@ -176,6 +151,54 @@ class _Surface(NamedTuple):
     def some(self, which: np.ndarray | slice) -> "_Surface":
         """Selected points."""
         return _Surface(*(part[which] for part in self))
+
+
+class _Sampler(NamedTuple):
+    """Draws candidates for an object in batches; the fields are arguments of `sample_headings`, but for two."""
+
+    obj: GraspObject
+    surface: _Surface
+    """The object's surface."""
+    sources: np.ndarray
+    """Indices of the surface points that candidates approach."""
+    along: np.ndarray | None
+    at: np.ndarray | None
+    max_width: float
+    opposed: bool
+    rng: np.random.Generator
+
+    def sample(self, depth: float, count: int, attempts: int) -> tuple[Headings, Headings, np.ndarray]:
+        """Draws at most `attempts` batches at a depth in m, until `count` headings satisfy the rules.
+
+        Returns:
+          These headings, and the candidates (N, 3) of the last batch, without axes, with the number (N,) of rules that
+          each violates, ascending.
+        """
+        found: list[Headings] = []
+        for _ in range(attempts):
+            drawn = self._draw(depth)
+            faults = _faults(self.surface.points, self.surface.avoid, drawn.position, drawn.direction, depth, BACK_OFF)
+            order = faults.argsort(kind="stable")
+            drawn, faults = Headings(*(part[order] for part in drawn)), faults[order]
+            clean = int((faults == 0).sum())
+            position, direction = drawn.position[:clean], drawn.direction[:clean]
+            cross, width = _roll(self.surface, position, direction, self.rng, opposed=self.opposed)
+            good = np.flatnonzero(width <= self.max_width)
+            found.append(Headings(position[good], direction[good], cross[good]))
+            if sum(len(part.position) for part in found) >= count:
+                break
+        return Headings(*(np.concatenate(parts) for parts in zip(*found, strict=True))), drawn, faults
+
+    def _draw(self, depth: float) -> Headings:
+        """Positions and directions (N, 3) of a batch; the axes are still missing."""
+        source = self.rng.choice(self.sources, _BATCH)
+        direction = _in_cone(-self.obj.normals[source], _CONE, self.rng)
+        if self.along is not None:
+            direction = np.broadcast_to(np.float32(self.along), direction.shape)
+        position = self.surface.points[source] + np.float32(depth) * direction
+        if self.at is not None:
+            position = np.broadcast_to(np.float32(self.at), position.shape)
+        return Headings(position, direction, direction)
 
 
 def _last_resort(
@@ -315,7 +338,7 @@ def closes_on(headings: Headings, points: np.ndarray, avoid: np.ndarray) -> np.n
     """(H,) bool, True where fingers that close at the position meet the graspable region, on both sides and first.
 
     The position is nearer to that region than to the avoid region, which along the cross-finger axis ends at least 5 mm
-    farther inside (`sample_headings`).
+    farther inside (see the module's rules).
 
     Args:
       headings: headings in the object frame.
@@ -333,7 +356,7 @@ def closes_on(headings: Headings, points: np.ndarray, avoid: np.ndarray) -> np.n
 def local_width(headings: Headings, points: np.ndarray) -> np.ndarray:
     """Widths (..., H) in m of objects along the cross-finger axes where fingers close.
 
-    The width is measured in the slab of `sample_headings`; it is 0 if the slab contains no surface point.
+    The width is measured in the slab of the module's rules; it is 0 if the slab contains no surface point.
 
     Args:
       headings: headings with fields (..., H, 3), NumPy or JAX arrays.

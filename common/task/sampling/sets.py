@@ -1,5 +1,6 @@
-"""Constraint sets as files: headings, reference poses and wrist trajectories of one object for one hand."""
+"""Files of constraint sets: headings, reference poses and wrist trajectories of one object for one hand."""
 
+import dataclasses
 import pathlib
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -8,13 +9,18 @@ import numpy as np
 
 from congrasp.common.config import Split
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import file_name, read_file
-from congrasp.common.io.npz import check_arrays
+from congrasp.common.hands.spec import Hand
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import check_arrays, file_name, read_file
 from congrasp.common.objects import store
+from congrasp.common.objects.pool import object_scale, scale_objects
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
+from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.constraints import OURS
 from congrasp.common.task.normals import estimated_normals
-from congrasp.common.task.sampling.bank import ConstraintBank, stacked
-from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode
+from congrasp.common.task.sampling.bank import ConstraintBank, rows_of, stacked
+from congrasp.common.task.sampling.build import build_bank
+from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 
 SUFFIX = ".constraints.safetensors"
 REGIONS = ("whole surface", "graspable region")
@@ -43,6 +49,7 @@ MEANING = {
     "visual/vertices": "(n, 3) m, object frame",
     "visual/faces": "(m, 3) indices of vertices",
 }
+_TRAINING = 0.8
 
 
 def bank_of(sets: Sequence[Message], split: Split = "all") -> ConstraintBank:
@@ -203,3 +210,168 @@ def load_for(
                 chosen.append(obj)
                 sets.append(made)
     return chosen, sets
+
+
+def make_sets(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int, bank: ConstraintBank | None = None
+) -> list[Message]:
+    """Generates the constraint set of each object in the same way as training and evaluation.
+
+    Args:
+      hand: the hand.
+      task: geometry of the approach.
+      objects: the objects.
+      seed: seed of the constraints.
+      bank: an existing bank of these objects, scaled for the hand, whose reference poses are used. None builds one.
+
+    Raises:
+      CongraspError: see `build_bank`.
+    """
+    fitting = scale_objects(hand, task, objects)
+    rows = rows_of(bank or build_bank(hand, dataclasses.replace(task, constraints=OURS), fitting, seed))
+    scale = object_scale(hand, task)
+    return [
+        set_of(
+            hand,
+            rows[n],
+            fitting[n],
+            seed,
+            {"object_scale": scale, "object_digest": store.digest(obj)},
+        )
+        for n, obj in enumerate(objects)
+    ]
+
+
+def set_of(
+    hand: Hand,
+    row: ConstraintBank,
+    obj: GraspObject,
+    seed: int,
+    about: dict[str, Any] | None = None,
+    *,
+    pose_training: np.ndarray | None = None,
+    heading_training: np.ndarray | None = None,
+) -> Message:
+    """Returns the constraint set of one object.
+
+    Args:
+      hand: the hand.
+      row: row of the constraint bank, without the axis of the objects.
+      obj: the object.
+      seed: seed of the constraints.
+      about: additional metadata of the file.
+      pose_training: (M,) bool, references for training; by default the first 80 %, as references are arranged
+        (`services.evaluate.references`).
+      heading_training: (H,) bool, headings for training; by default 80 % drawn with the seed.
+    """
+    # The bank pads an object's resting poses to the most of any object by repetition.
+    again = np.flatnonzero((row.rest[1:] == row.rest[0]).all(-1))
+    rests = int(again[0]) + 1 if len(again) else len(row.rest)
+    allowed, back = _allowed_headings(row, rests)
+    if pose_training is None:
+        pose_training = for_training(row.pose_q.shape[1])
+    if heading_training is None:
+        heading_training = for_training(row.heading_position.shape[1], seed)
+    arrays = {
+        "surface/points": row.points,
+        "surface/normals": row.normals,
+        "surface/avoid": row.avoid,
+        "rest": row.rest[:rests],
+        "heading/position": row.heading_position,
+        "heading/direction": row.heading_direction,
+        "heading/cross": row.heading_cross,
+        "heading/allowed": allowed,
+        "heading/back": back,
+        "pose/q": row.pose_q,
+        "pose/position": row.pose_position,
+        "pose/quaternion": row.pose_quaternion,
+        "trajectory/position": row.trajectory_position,
+        "trajectory/quaternion": row.trajectory_quaternion,
+        "pose/allowed": row.pose_valid[:, :rests],
+        "heading/training": _twice(heading_training),
+        "pose/training": _twice(pose_training),
+        "visual/vertices": np.asarray(obj.visual_vertices, np.float32),
+        "visual/faces": np.asarray(obj.visual_faces, np.int32),
+    }
+    return Message(arrays, {**_description(hand, obj, seed), **(about or {})})
+
+
+def _allowed_headings(row: ConstraintBank, rests: int) -> tuple[np.ndarray, np.ndarray]:
+    """Headings that a row allows in its first R resting poses: (V, R, H) bool, and the distances back in m."""
+    allowed = np.zeros((len(REGIONS), rests, row.heading_position.shape[1]), bool)
+    back = np.zeros(allowed.shape, np.float32)
+    for v, r in np.ndindex(allowed.shape[:2]):
+        if v == 0 or row.has_affordance[r] or not row.avoid.any():
+            allowed[v, r, row.heading_index[v, r]] = True
+            back[v, r, row.heading_index[v, r]] = row.heading_back[v, r]
+    return allowed, back
+
+
+def _description(hand: Hand, obj: GraspObject, seed: int) -> dict[str, Any]:
+    """Metadata of a set of an object that was not scaled."""
+    return {
+        "kind": "constraints",
+        "format": FORMAT,
+        "hand": hand.name,
+        "hand_reference": hand.reference,
+        "object": obj.name,
+        "object_digest": store.digest(obj),
+        "object_scale": 1.0,
+        "object_mass": float(obj.mass),
+        "seed": seed,
+        "variants": list(REGIONS),
+        "finger_joints": [joint.name for joint in hand.joints],
+        "quaternions": "(w, x, y, z)",
+        "object_frame": "origin at the centre of mass, orientation of the object file, lengths times object_scale",
+        "arrays": MEANING,
+    }
+
+
+def for_training(count: int, seed: int | None = None) -> np.ndarray:
+    """(count,) bool, True for 80 % (rounded up): drawn with the seed or, without a seed, the first ones."""
+    order = np.arange(count) if seed is None else np.random.default_rng(seed).permutation(count)
+    return np.asarray(order < np.ceil(_TRAINING * count))
+
+
+def _twice(training: np.ndarray) -> np.ndarray:
+    """Repeats (M,) for both regions: (V, M)."""
+    return np.tile(training, (len(REGIONS), 1))
+
+
+def save(constraints: Message, folder: pathlib.Path) -> pathlib.Path:
+    """Writes a set to a file named after its object; returns the file."""
+    path = folder / f"{file_name(constraints.meta['object'], 'a constraint set')}{SUFFIX}"
+    write_atomically(path, encode(constraints))
+    return path
+
+
+def _scale_text(scale: float) -> str:
+    """Describes the scale of the object relative to its file; empty for 1."""
+    return "" if scale == 1.0 else f", {scale:g} times as large, for this hand"
+
+
+def describe(constraints: Message) -> dict[str, str]:
+    """Describes the content of a set as text by name."""
+    arrays, meta = constraints.arrays, constraints.meta
+    allowed, poses = arrays["heading/allowed"], arrays["pose/allowed"]
+    waypoints = arrays["trajectory/position"]
+    length = np.linalg.norm(np.diff(waypoints, axis=2), axis=-1).sum(-1)
+    rows = {
+        "hand": f"{meta['hand']}, {len(meta['finger_joints'])} finger joints",
+        "object": f"{meta['object']} ({meta['object_digest']}){_scale_text(meta['object_scale'])}",
+        "avoid region": f"{arrays['surface/avoid'].mean():.0%} of {len(arrays['surface/points'])} surface points",
+        "headings": f"{allowed.shape[2]} for each of: {', '.join(meta['variants'])}",
+        "reference poses": f"{poses.shape[2]} for each",
+        "wrist trajectories": f"equally many, {waypoints.shape[2]} waypoints, "
+        f"{100 * length.min():.0f} to {100 * length.max():.0f} cm long; "
+        "each ends at its pose",
+    }
+    if "source" in meta:
+        rows["captured"] = f"{meta['source']}: {', '.join(meta['demonstrations'])}"
+    for r, rest in enumerate(arrays["rest"]):
+        counts = [
+            f"{region}: {int(allowed[v, r].sum())} headings, {int(poses[v, r].sum())} poses"
+            for v, region in enumerate(meta["variants"])
+        ]
+        rows[f"resting pose {r + 1}"] = f"{100 * rest[2]:.1f} cm high; clear of the table on the {'; '.join(counts)}"
+    return rows

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.closure import CENTER, outline
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.inputs import distinct_names, safe_name
 from congrasp.common.objects import store
@@ -29,7 +29,7 @@ from congrasp.common.task.sampling.build import (
     height_over_table,
 )
 from congrasp.common.task.sampling.headings import Headings
-from congrasp.common.task.sampling.write_sets import for_training, set_of
+from congrasp.common.task.sampling.sets import for_training, set_of
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import BEYOND, Demonstration, Surface, extract
 from congrasp.services.assets.captures.references import (

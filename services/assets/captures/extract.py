@@ -18,7 +18,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.rotations import continuous
 from congrasp.services.assets.captures.human import Fit, fit

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.mano import MANO_FINGERS, TIP_VERTICES, ManoModel
 from congrasp.common.hands.mjcf import posed
 from congrasp.common.hands.spec import link_origin

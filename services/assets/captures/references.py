@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.closure import widest_gap
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.common.hands.motors import transmission
 from congrasp.common.hands.spec import Hand

@@ -29,6 +29,7 @@ from congrasp.common.objects.pool import HELD_OUT_SEED
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.settings import GRAVITY
 from congrasp.services.assets.hands.trials import Grip, Response, closed_overlap, grips, responses
 
 Verdict = Literal["passed", "doubt", "failed"]
@@ -241,7 +242,7 @@ def _strength(hand: Hand) -> Finding:
     """Checks that the fingertips press hard enough to carry a median object by friction."""
     forces = tip_forces(hand)
     mass = hand.object_scale**3 * float(np.median([obj.mass for obj in _objects()]))
-    weight, carried = protocols.GRAVITY * mass, 2 * float(min(forces[0], forces[1:].sum()))
+    weight, carried = GRAVITY * mass, 2 * float(min(forces[0], forces[1:].sum()))
     return _finding(
         "strength",
         _verdict(carried / weight, *_CARRIED),

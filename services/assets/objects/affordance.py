@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.closure import outline
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
+from congrasp.common.objects.shapes import halves
 from congrasp.common.objects.spec import GraspObject, Piece
-from congrasp.common.objects.surface import halves
 from congrasp.common.task.sampling.headings import max_width, sample_headings, within_reach
 from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh, upright
 

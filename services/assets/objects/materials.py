@@ -8,9 +8,8 @@ import numpy as np
 import trimesh
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.objects.shapes import tessellate
+from congrasp.common.objects.shapes import mass_properties, tessellate
 from congrasp.common.objects.spec import GraspObject, Piece
-from congrasp.common.objects.surface import mass_properties
 from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.repair import encloses
 

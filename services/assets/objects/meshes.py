@@ -18,15 +18,14 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import cache_folder
 from congrasp.common.objects import shapes, store
 from congrasp.common.objects.resting import rest_poses
+from congrasp.common.objects.shapes import halves, sample_mesh
 from congrasp.common.objects.spec import Colours, GraspObject, Piece
-from congrasp.common.objects.surface import halves, sample_mesh
 from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
-from congrasp.services.assets.objects.colours import sample_colours
 from congrasp.services.assets.objects.fidelity import enclosed
 from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
-from congrasp.services.assets.objects.mesh_files import read_mesh, up_of
+from congrasp.services.assets.objects.mesh_files import read_mesh, sample_colours, up_of
 from congrasp.services.assets.objects.options import ImportOptions, Up, check_options, metres_per_unit
 from congrasp.services.assets.objects.repair import encloses
 

@@ -15,16 +15,15 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands import get_hand
+from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import SPEED, arm_file, load_arm
-from congrasp.services.arm.files import CSV, PICTURE, TRAJECTORY
-from congrasp.services.arm.options import ArmOptions
 from congrasp.services.arm.planner import ANGLE, POSITION, ArmPlanner, Path, follow
 from congrasp.services.arm.robot import Infeasible, build_robot, default_mount
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.cli.main import load
-from congrasp.services.export.motion_file import load_motion, robot_joints
-from congrasp.services.export.motion_formats import pick_motion
+from congrasp.services.export.motion_file import load_motion, pick_motion, robot_joints
+from congrasp.services.grasp.files import ARM_CSV, ARM_PICTURE, ARM_TRAJECTORY
 from tests.services.conftest import quick_imports
 
 LINKS = [("0 0 1", 0.3, 170), ("0 1 0", 0.0, 120), ("0 0 1", 0.4, 170), ("0 1 0", 0.0, 140), ("0 0 1", 0.4, 170),
@@ -230,7 +229,7 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
     assert facts["arm"] == "seven" and facts["arm_base"] == [-0.6, 0, 0, 0] and facts["success"]
     assert "seven carries the hand within" in capsys.readouterr().out
     assert 0 < facts["arm_error_mm"] < 1e3 * POSITION and 0 < facts["arm_speed_share"] <= 1 + 1e-6
-    with (tmp_path / "block" / CSV).open() as file:
+    with (tmp_path / "block" / ARM_CSV).open() as file:
         rows = [*csv.reader(file)]
     names = [f"j{i}" for i in range(1, 8)] + [joint.name for joint in get_hand("allegro").joints]
     assert rows[0] == ["time", *names]
@@ -249,7 +248,7 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
     np.testing.assert_array_equal(recorded.link_position, motion.arm.link_position)
     assert recorded.link_names.tolist() == motion.arm.link_names.tolist()
     assert [m.colour for m in recorded.meshes] == [m.colour for m in motion.arm.meshes]
-    message = json.loads((tmp_path / "block" / TRAJECTORY).read_text())
+    message = json.loads((tmp_path / "block" / ARM_TRAJECTORY).read_text())
     assert message["joint_names"] == names and len(message["points"]) == len(rows) - 1
     last = message["points"][-1]
     np.testing.assert_allclose(last["positions"], [float(x) for x in rows[-1][1:]], atol=1e-6)
@@ -258,7 +257,7 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
     speeds = np.array([point["velocities"] for point in message["points"]])
     assert speeds.shape == (len(rows) - 1, len(names)) and np.abs(speeds).max() > 0.1
     assert not speeds[[0, -1]].any()  # controllers reject a goal that still moves
-    assert np.asarray(Image.open(tmp_path / "block" / PICTURE)).std() > 10
+    assert np.asarray(Image.open(tmp_path / "block" / ARM_PICTURE)).std() > 10
     frames = imageio_ffmpeg.read_frames(str(tmp_path / "block" / "grasp.mp4"))
     assert next(frames)["size"] == (320, 240)
     first, *_, last = (np.frombuffer(frame, np.uint8).reshape(240, 320, 3).astype(int) for frame in frames)

@@ -29,8 +29,7 @@ from congrasp.services.evaluate.report import (
     write_report,
 )
 from congrasp.services.evaluate.tables import Found
-from congrasp.services.record.channels import JsonChannels
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import JsonChannels, LogWriter
 from congrasp.services.train.command import untrained
 from congrasp.services.viz.shapes import skin_shape
 from congrasp.services.viz.sheets import save_png

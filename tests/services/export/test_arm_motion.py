@@ -20,7 +20,7 @@ from congrasp.common.objects import procedural
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.arm.description import load_arm
 from congrasp.services.arm.robot import Pose, build_robot, default_mount, moved_arm
-from congrasp.services.export import frames, motion_formats, urdf
+from congrasp.services.export import frames, motion_file, urdf
 from congrasp.services.export.lerobot import camera_for, pictures
 from congrasp.services.export.motion_file import (
     GraspMotion,
@@ -31,8 +31,8 @@ from congrasp.services.export.motion_file import (
     robot_joints,
     save_motion,
 )
-from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.scene import check_episode, episode_entries
+from congrasp.services.record.writer import JsonChannels
 from tests.episodes import episode
 from tests.motion_readers import FROM_Y_UP, READERS, error_mm, forward_kinematics
 
@@ -112,11 +112,11 @@ WRITTEN = ("glb", "usd", "lerobot")
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in WRITTEN)) for kind in motion_formats.FORMATS]
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in WRITTEN)) for kind in motion_file.FORMATS]
 )
 def test_every_reader_finds_the_arm_where_it_was(motion: GraspMotion, kind: str, tmp_path: pathlib.Path) -> None:
-    path = tmp_path / f"motion{motion_formats.FORMATS[kind]}"
-    motion_formats.export_motions([motion], kind, path)
+    path = tmp_path / f"motion{motion_file.FORMATS[kind]}"
+    motion_file.export_motions([motion], kind, path)
     (track,) = READERS[kind](path)
     assert "arm_palm" in track.poses and error_mm(motion, track) < 0.01
 
@@ -165,7 +165,7 @@ def test_a_dataset_has_the_arms_joints_before_the_hands(motion: GraspMotion, tmp
         name: getattr(motion, name) + 0.1 for name in ("link_position", "wrist_position")
     })  # fmt: skip
     path = tmp_path / "data"
-    motion_formats.export_motions([motion, other], "lerobot", path)
+    motion_file.export_motions([motion, other], "lerobot", path)
     for one, track in zip([motion, other], READERS["lerobot"](path), strict=True):
         assert error_mm(one, track) < 0.01
     info = json.loads((path / "meta" / "info.json").read_text())
@@ -184,14 +184,14 @@ def test_a_dataset_has_the_arms_joints_before_the_hands(motion: GraspMotion, tmp
     np.testing.assert_allclose(np.array(rows["action"].to_pylist())[:, :4], following, atol=1e-6)
     assert [file.name for file in (path / "meta").glob("*.urdf")] == ["robot.urdf"]
     with pytest.raises(CongraspError, match="one robot"):
-        motion_formats.export_motions([motion, dataclasses.replace(motion, arm=None)], "lerobot", tmp_path / "mixed")
+        motion_file.export_motions([motion, dataclasses.replace(motion, arm=None)], "lerobot", tmp_path / "mixed")
 
 
 def test_other_readers_find_meshes_and_colours(motion: GraspMotion, tmp_path: pathlib.Path) -> None:
     arm = motion.arm
     assert arm is not None
     for kind in ("glb", "usd"):
-        motion_formats.export_motions([motion], kind, tmp_path / f"motion{motion_formats.FORMATS[kind]}")
+        motion_file.export_motions([motion], kind, tmp_path / f"motion{motion_file.FORMATS[kind]}")
     scene = trimesh.load_scene(tmp_path / "motion.glb")
     seen = {name: scene.graph.get(name)[0] for name in ("odd_base", "sledge", "arm_palm")}
     for i, pose in enumerate(seen.values()):

@@ -9,10 +9,9 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.layout import export_layout
-from congrasp.services.record.channels import flatten
 from congrasp.services.record.reader import read_records
 from congrasp.services.record.recorder import Converter
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import LogWriter, flatten
 from tests.episodes import episode
 
 

@@ -10,8 +10,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import outline
 from congrasp.common.objects import store
+from congrasp.common.task.sampling import sets
 from congrasp.common.task.sampling import sets as stored_sets
-from congrasp.common.task.sampling import write_sets
 from congrasp.common.task.sampling.headings import Headings, within_reach
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.main import load
@@ -24,7 +24,7 @@ BOX, _, MUG, _ = OBJECTS
 @pytest.fixture(scope="module")
 def file(constraint_sets, tmp_path_factory):
     """That of the mug."""
-    return write_sets.save(constraint_sets[2], tmp_path_factory.mktemp("sets"))
+    return sets.save(constraint_sets[2], tmp_path_factory.mktemp("sets"))
 
 
 def test_every_array_is_explained_and_has_the_shape_that_is_written_down(constraint_sets):
@@ -91,7 +91,7 @@ def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypat
 def test_generate_takes_names_files_and_families(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
-        write_sets, "make_sets", lambda hand, task, objects, seed, bank: made.extend(obj.name for obj in objects) or []
+        sets, "make_sets", lambda hand, task, objects, seed, bank: made.extend(obj.name for obj in objects) or []
     )
     store.Catalogue(tmp_path / "objects").add(BOX)
     folder = ["--folder", str(tmp_path / "objects"), "--out", str(tmp_path / "sets")]
@@ -112,6 +112,6 @@ def test_a_reference_is_refused_for_another_object_or_size(constraint_sets, file
     with pytest.raises(CongraspError, match=r"is for an object of .* cm, .*; 'box_0' has .*Name the set of this"):
         read_request(BOX, HAND, 15, trajectory=str(file))
     larger = Message(constraint_sets[2].arrays, {**constraint_sets[2].meta, "object_scale": 1.4})
-    file = write_sets.save(larger, tmp_path)
+    file = sets.save(larger, tmp_path)
     with pytest.raises(CongraspError, match=r"1\.4 times as large, as the human hand is trained: add --scale 1\.4"):
         read_request(MUG.scaled(1 / 1.4), HAND, 15, pose=str(file))

@@ -16,11 +16,10 @@ from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
-from congrasp.common.wire.schema import RolloutForm
+from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.run_directory import POLICY_FILE, create_run, listening
-from congrasp.services.cli.status import Status
 from congrasp.services.cli.view import View
-from congrasp.services.ops.status import ask, tables, warnings
+from congrasp.services.ops.status import Status, ask, tables, warnings
 from tests.rollouts import bundle, learner_hub, rollout
 from tests.waits import eventually
 

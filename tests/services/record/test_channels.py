@@ -6,7 +6,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from congrasp.services.record.channels import JsonChannels, flatten, nest
+from congrasp.services.record.writer import JsonChannels, flatten, nest
 
 NAMES = st.lists(st.text("abc_", min_size=1, max_size=3), min_size=1, max_size=3).map("/".join)
 

@@ -15,9 +15,8 @@ from mcap.reader import make_reader
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message, encode
-from congrasp.services.record.channels import CONVENTIONS, Entry, JsonChannels, opaque_channel
 from congrasp.services.record.reader import log_files, read_metrics, read_records
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import CONVENTIONS, Entry, JsonChannels, LogWriter, opaque_channel
 from tests.recordings import is_complete
 
 SECOND = 10**9

@@ -15,9 +15,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.channels import JsonChannels
 from congrasp.services.record.live import LiveServer
 from congrasp.services.record.recorder import Recorder
+from congrasp.services.record.writer import JsonChannels
 from tests.episodes import CONTROL_DT, episode
 
 MESSAGE_DATA = 1  # operation code of a binary frame with a message

@@ -12,16 +12,16 @@ from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
-from congrasp.services.record import metric_writers
-from congrasp.services.record.metric_writers import recorded
+from congrasp.services.record import recorder
 from congrasp.services.record.reader import read_metrics
+from congrasp.services.record.recorder import recorded
 from tests.episodes import episode
 
 
 def publish(folder: pathlib.Path, names: Sequence[MetricWriter], updates: Sequence[int]) -> None:
     """A run of which a learner, an actor and an episode are recorded."""
-    keys = Keys("r")
-    with MemoryTransport(MemoryHub()) as transport, recorded(transport, RunConfig(name="r"), folder, names) as recorder:
+    keys, config, logs = Keys("r"), RunConfig(name="r"), folder / "logs"
+    with MemoryTransport(MemoryHub()) as transport, recorded(transport, config, folder, logs, names) as running:
         for update in updates:
             values = {"episode/success": update / 10, "kl": 0.25, "bad": float("nan")}
             transport.publish(
@@ -29,7 +29,7 @@ def publish(folder: pathlib.Path, names: Sequence[MetricWriter], updates: Sequen
             )
         transport.publish(keys.log("metrics", "actor", "a"), Message({}, {"time": 0.0, "values": {"pace": 1.0}}))
         transport.publish(keys.log("episode", "actor", "a"), episode(3))
-    assert recorder.error == ""
+    assert running.error == ""
 
 
 def events(folder: pathlib.Path) -> list[list[Event]]:
@@ -76,7 +76,7 @@ def test_a_writer_that_fails_is_left_out_and_the_recording_goes_on(tmp_path, mon
     def refuse(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(metric_writers._TensorBoard, "write", refuse)
+    monkeypatch.setattr(recorder._TensorBoard, "write", refuse)
     publish(tmp_path, ["tensorboard"], range(4))
     assert len(read_metrics(tmp_path / "logs")["learner/0/kl"][0]) == 4
     assert capsys.readouterr().err.count("tensorboard receives no more metrics") == 1

@@ -21,10 +21,9 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.channels import Entry
 from congrasp.services.record.reader import log_files, read_episodes, read_metrics, read_records, read_rollouts
 from congrasp.services.record.recorder import Recorder
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import Entry, LogWriter
 from tests.episodes import episode
 from tests.recordings import is_complete
 from tests.waits import eventually

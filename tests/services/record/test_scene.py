@@ -25,13 +25,12 @@ from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.record import scene
-from congrasp.services.record.channels import Entry
-from congrasp.services.record.goals import active_blocks, active_constraints
+from congrasp.services.record.episode import active_blocks, active_constraints
 from congrasp.services.record.palette import JOINT, SKIN
 from congrasp.services.record.palette import MATERIALS as COLOURS
 from congrasp.services.record.recorder import Converter
 from congrasp.services.record.scene import SPACING, check_episode, surface_parts, surface_points
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import Entry, LogWriter
 from tests.episodes import CONTROL_DT, FORCE, episode, older
 
 HAND = get_hand("human")

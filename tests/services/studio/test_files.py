@@ -11,7 +11,7 @@ from PIL import Image
 from congrasp.common.errors import CongraspError
 from congrasp.common.request import GraspRequest
 from congrasp.services.studio.grasping import why_nothing_held
-from congrasp.services.studio.motions import drawing
+from congrasp.services.studio.page import drawing
 from tests.episodes import episode
 
 VIEW = {"position": [0.5, -0.6, 0.4], "target": [0.0, 0.0, 0.06], "field_of_view": 32.0}

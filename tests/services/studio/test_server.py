@@ -23,7 +23,7 @@ from congrasp.common.wire.codec import decode
 from congrasp.services.cli.main import main
 from congrasp.services.export.motion_file import load_motion
 from congrasp.services.record.reader import read_episodes
-from congrasp.services.studio import motions
+from congrasp.services.studio import page as page_module
 from congrasp.services.studio import server as server_module
 from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
@@ -399,7 +399,7 @@ def test_a_mesh_that_comes_during_a_job_is_refused(page, grasping, monkeypatch):
 
 
 def test_a_motion_may_be_named_by_a_number(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(motions, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)])
+    monkeypatch.setattr(page_module, "render_episode_frames", lambda *asked: [np.zeros((2, 2, 3), np.uint8)])
     page.do("grasp")
     number = int(page.wait()["made"])
     camera = {"position": [0.5, 0.5, 0.5], "target": [0.0, 0.0, 0.0], "field_of_view": 40.0}

@@ -13,8 +13,8 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
 from congrasp.services.train.command import EPISODE, _next_steps, _Progress
-from congrasp.services.train.launch import Launch
 from congrasp.services.train.presets import get_preset
+from congrasp.services.train.processes import Launch
 
 LAUNCH = Launch(actors=1)
 CONFIG = RunConfig(name="quickstart", updates=10, environments=4, rollout_steps=5)  # 40 steps an update

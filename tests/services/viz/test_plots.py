@@ -13,8 +13,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.metrics import episode_fields
 from congrasp.services.cli.plot import plot
-from congrasp.services.record.channels import JsonChannels, nest
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import JsonChannels, LogWriter, nest
 from congrasp.services.viz.plots import LEARNING, Panel, draw, figures, plot_runs, smooth, titled
 
 METRICS = {

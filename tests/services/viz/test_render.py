@@ -18,10 +18,9 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.wire.codec import encode
 from congrasp.services.cli.main import load
-from congrasp.services.record.channels import Entry, opaque_channel
 from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE
 from congrasp.services.record.reader import pick_episode
-from congrasp.services.record.writer import LogWriter
+from congrasp.services.record.writer import Entry, LogWriter, opaque_channel
 from congrasp.services.viz.hand_sheets import hand_sheet
 from congrasp.services.viz.raster import render_scene, visible
 from congrasp.services.viz.render import (
@@ -33,8 +32,7 @@ from congrasp.services.viz.render import (
     render_episode_frames,
     save_episode_video,
 )
-from congrasp.services.viz.scene import Camera, Shape, between
-from congrasp.services.viz.shapes import arrow, beads, capsule_shapes, fit, skin_colours
+from congrasp.services.viz.shapes import Camera, Shape, arrow, beads, between, capsule_shapes, fit, skin_colours
 from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
 from congrasp.services.viz.triangles import cut, smooth_corners
 from congrasp.services.viz.views import TOUCHING, View, camera_of, episode_shapes, view_of, views

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.mano import MANO_FINGERS
 from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.services.assets.captures.human import TO_HUMAN, joint_positions

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.build import Report, _from_below

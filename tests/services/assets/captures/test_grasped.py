@@ -10,7 +10,7 @@ import pytest
 
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.closure import widest_gap
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.common.objects.procedural import generate, plain_object
 from congrasp.common.objects.spec import Piece

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common import rotations
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.services.assets.captures.build import _resting_poses
 

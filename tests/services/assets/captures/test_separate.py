@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import link_transforms
 from congrasp.common.hands.motors import coupled
 from congrasp.common.hands.spec import Capsule, Coupling, Hand, Joint, Link

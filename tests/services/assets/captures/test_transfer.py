@@ -6,11 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.human import HUMAN
+from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
 from congrasp.common.task.sampling.build import HEADINGS
-from congrasp.common.task.sampling.sets import bank_of
-from congrasp.common.task.sampling.write_sets import describe
+from congrasp.common.task.sampling.sets import bank_of, describe
 from congrasp.services.assets.captures.human import joint_positions
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write

@@ -1,4 +1,6 @@
-"""The arm that carries the hand of a motion: joints, frames of the links, and their meshes with colours.
+"""Content of an episode's message: its constraints and phases, and the arm that carries the hand.
+
+The arm has joints, frames of the links, and their meshes with colours.
 
 Quaternions are (w, x, y, z) and rotate a link's frame into the world. T frames, N joints, A links, M meshes,
 V vertices, E triangles.
@@ -6,19 +8,75 @@ V vertices, E triangles.
 
 import dataclasses
 import functools
-from collections.abc import Mapping
-from typing import Annotated, NamedTuple, get_type_hints
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.npz import check_arrays
+from congrasp.common.io.inputs import check_arrays
+from congrasp.common.task.constraints import CONSTRAINTS
+from congrasp.common.task.constraints.base import Marker
 from congrasp.common.wire.codec import Message
 
+_LATEST = 1e4  # s
+_OLDER = ("affordance", "pose_finger", "pose_wrist", "trajectory")
+"""Default blocks of the `goal/mask` of recordings without names."""
 UNLIMITED = 1e3
 """Limit of joints without limits, rad or m."""
 _PREFIX = "arm_"
 _FOLDER, _META = "arm/", "arm"  # of the arrays, and of name and texts, in an episode's message
+_INDICES = {
+    "joint_link": "A",
+    "link_parent": "A",
+    "hand_link": "A",
+    "mesh_link": "A",
+    "mesh_faces": "V",
+    "face_mesh": "M",
+}
+
+
+def active_blocks(arrays: Mapping[str, np.ndarray]) -> dict[str, bool]:
+    """Activity of each block of the observation, by name."""
+    if "goal/mask" in arrays:
+        return dict(zip(_OLDER, (np.asarray(arrays["goal/mask"]) > 0).tolist(), strict=True))
+    found = {name.removeprefix("active/"): value for name, value in arrays.items() if name.startswith("active/")}
+    return {name: bool(np.asarray(value)) for name, value in found.items()}
+
+
+def active_constraints(arrays: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """Names of the active constraints, weakest first; the heading is always included."""
+    blocks = active_blocks(arrays)
+    return tuple(c.name for c in CONSTRAINTS if not c.optional or any(blocks.get(block) for block in c.blocks))
+
+
+def markers(arrays: Mapping[str, np.ndarray]) -> Iterator[tuple[str, Marker]]:
+    """Yields the markers of each active constraint, with its name."""
+    blocks = [name for name, active in active_blocks(arrays).items() if active]
+    for constraint in CONSTRAINTS:
+        if not constraint.optional or set(constraint.blocks) & set(blocks):
+            own = constraint.goal(*(arrays[f"goal/{constraint.name}_{field}"] for field in constraint.arrays))
+            yield from ((constraint.name, marker) for marker in constraint.markers(own, blocks))
+
+
+def grasp_span(meta: Mapping[str, Any], control_dt: float, table: np.ndarray) -> tuple[int, int]:
+    """First step of the grasp, and first step after it: that of the lift, or without the table.
+
+    Args:
+      meta: metadata of the episode or motion.
+      control_dt: length of a control step, s.
+      table: (T,) bool, True where the table is present.
+    """
+    phases, steps = phases_of(meta), len(table)
+    end = round(min(phases["lift"] / control_dt, steps)) if "lift" in phases else int(np.sum(table))
+    return min(round(min(phases.get("grasp", 0.0) / control_dt, steps)), end), end
+
+
+def phases_of(meta: Mapping[str, Any]) -> dict[str, float]:
+    """Start times of the phases of an episode or a motion (approach, grasp, lift, hold), s, without invalid times."""
+    found = meta.get("phases")
+    times = found.items() if isinstance(found, dict) else ()
+    return {str(name): float(time) for name, time in times if isinstance(time, int | float) and 0 <= time < _LATEST}
 
 
 class Mesh(NamedTuple):
@@ -82,23 +140,13 @@ class MovedArm:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Returns the arrays by the names that they have in files."""
-        return {name: getattr(self, name.removeprefix(_PREFIX)) for name in MEANINGS}
+        return {name: getattr(self, name.removeprefix(_PREFIX)) for name in ARM_ARRAYS}
 
 
 _HINTS = get_type_hints(MovedArm, include_extras=True)
-MEANINGS = {f"{_PREFIX}{name}": hint.__metadata__[0] for name, hint in _HINTS.items() if name != "name"}
+ARM_ARRAYS = {f"{_PREFIX}{name}": hint.__metadata__[0] for name, hint in _HINTS.items() if name != "name"}
 """Meaning of each array in files, with its shape."""
-_TIMED = [name.removeprefix(_PREFIX) for name, meaning in MEANINGS.items() if meaning.startswith("(T,")]
-_INDICES = {
-    "joint_link": "A",
-    "link_parent": "A",
-    "hand_link": "A",
-    "mesh_link": "A",
-    "mesh_faces": "V",
-    "face_mesh": "M",
-}
-INDICES = tuple(f"{_PREFIX}{name}" for name in _INDICES)
-"""Arrays of integers."""
+_TIMED = [name.removeprefix(_PREFIX) for name, meaning in ARM_ARRAYS.items() if meaning.startswith("(T,")]
 
 
 def arm_of(name: str, arrays: Mapping[str, np.ndarray], frames: int) -> MovedArm:
@@ -112,8 +160,10 @@ def arm_of(name: str, arrays: Mapping[str, np.ndarray], frames: int) -> MovedArm
     Raises:
       ValueError, KeyError: an array is missing, or does not match its meaning.
     """
-    sizes = check_arrays(arrays, MEANINGS, indices=INDICES, largest=1e6, sizes={"T": frames})
-    arm = MovedArm(name, **{key.removeprefix(_PREFIX): arrays[key] for key in MEANINGS})
+    sizes = check_arrays(
+        arrays, ARM_ARRAYS, indices=tuple(f"{_PREFIX}{name}" for name in _INDICES), largest=1e6, sizes={"T": frames}
+    )
+    arm = MovedArm(name, **{key.removeprefix(_PREFIX): arrays[key] for key in ARM_ARRAYS})
     for key, letter in _INDICES.items():
         values = getattr(arm, key)
         if values.min() < -(key == "link_parent") or values.max() >= sizes[letter]:

@@ -5,7 +5,7 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message
-from congrasp.learner.hub.rate_limit import RateLimit
+from congrasp.learner.hub.limits import RateLimit
 
 A, B = "congrasp/r/rollout/0.a", "congrasp/r/rollout/1.b"
 

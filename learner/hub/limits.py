@@ -1,22 +1,28 @@
-"""Rate limit of useless work by a token bucket for each actor's certificate, and exponential backoff of offenders.
+"""Limits for the owners of each certificate: rate of useless work, exponential backoff of offenders, listed tokens.
 
 A request that helps training is free: a granted ticket, an accepted rollout. All others (denied, refused, stale,
 duplicate) cost tokens by size. An actor without tokens gets the reply to retry later before its request is decoded, so
-that a flood costs the learner little and other actors nothing.
+that a flood costs the learner little and other actors nothing. The rate limit is a token bucket for each certificate.
 """
 
 import collections
+import itertools
 import threading
 import time
 from collections.abc import Callable
 
 from congrasp.common.transport.base import Handler
+from congrasp.common.transport.keys import Alive
 from congrasp.common.wire.codec import Message
 
 DAMAGED = 1 << 20
 """Bytes charged for a message that cannot be decoded."""
 _NAMES = 1024
 _LONGEST = 600.0  # longest backoff, s
+_EACH = 64
+"""Most listed tokens of one role and certificate."""
+_LISTED = 1024
+"""Most entries of one listing, whose reply must fit into a message."""
 
 
 class RateLimit:
@@ -50,13 +56,13 @@ class RateLimit:
     def admits(self, key: str) -> bool:
         """True if a request under an actor's key may be processed; counts it otherwise."""
         with self._lock:
-            fine = self._level(_account(key)) > 0
+            fine = self._level(certificate(sender(key))) > 0
             self.rejected += not fine
             return fine
 
     def charge(self, key: str, size: int) -> None:
         """Charges a useless request of `size` bytes."""
-        name = _account(key)
+        name = certificate(sender(key))
         with self._lock:
             self._levels[name] = self._level(name) - 1 - size / self._unit, self._clock()
             self._levels.move_to_end(name)
@@ -121,5 +127,42 @@ def certificate(actor: str) -> str:
     return actor.partition(".")[0]
 
 
-def _account(key: str) -> str:
-    return certificate(key.rpartition("/")[2])
+def sender(key: str) -> str:
+    """Returns the actor of a key, which access control may reserve for it."""
+    return key.rpartition("/")[2]
+
+
+class Members:
+    """Processes of a run by their tokens; the caller serialises access."""
+
+    def __init__(self) -> None:
+        """Starts without members."""
+        self._known: dict[tuple[str, str], set[Alive]] = collections.defaultdict(set)
+        self._beyond: collections.Counter[tuple[str, str]] = collections.Counter()
+
+    def note(self, who: Alive, alive: bool) -> bool:
+        """Records a token that appeared or disappeared; returns True if it is a listed one."""
+        account = who.role, certificate(who.id)
+        known = self._known[account]
+        if alive and (who in known or len(known) < _EACH):
+            known.add(who)
+            return True
+        if who in known:
+            known.discard(who)
+            return True
+        self._beyond[account] += 1 if alive else -1
+        if self._beyond[account] <= 0:
+            del self._beyond[account]
+        return False
+
+    def listed(self) -> list[Alive]:
+        """Listed members, in order; if there are too many, the first of each certificate precedes all second ones."""
+        ranks = (enumerate(sorted(known)) for _, known in sorted(self._known.items()))
+        first = sorted(itertools.chain.from_iterable(ranks), key=lambda ranked: ranked[0])
+        return sorted(who for _, who in first[:_LISTED])
+
+    @property
+    def unlisted(self) -> int:
+        """Number of live tokens that are not listed."""
+        known = sum(map(len, self._known.values()))
+        return sum(self._beyond.values()) + max(0, known - _LISTED)

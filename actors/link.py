@@ -254,7 +254,7 @@ class RunInfo(NamedTuple):
     schema: str
     """Required policy schema of rollouts."""
     arrays: tuple[str, ...]
-    """Names of the required arrays of rollouts (`common.wire.schema.RECORDABLE`)."""
+    """Names of the required arrays of rollouts (`common.wire.messages.RECORDABLE`)."""
 
 
 class Ticket(NamedTuple):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.common.objects import painting
-from congrasp.common.objects.painting import colours_at, finer, painted
 from congrasp.common.objects.spec import Colours
+from congrasp.services.record import palette
+from congrasp.services.record.palette import colours_at, finer, painted
 
 
 @pytest.mark.parametrize("sections", [8, 512, 2048])
@@ -60,7 +60,7 @@ def test_a_painted_mesh_is_cut_once_until_it_or_its_colours_change(monkeypatch):
         cuts.append(mesh)
         return finer(*mesh)
 
-    monkeypatch.setattr(painting, "finer", counted)
+    monkeypatch.setattr(palette, "finer", counted)
     ball = trimesh.creation.icosphere(2, 0.0317)
     colours = Colours(np.array([[0, 0, -1], [0, 0, 1]], np.float32), np.array([[255, 0, 0], [0, 0, 255]], np.uint8))
     first = painted(ball.vertices, ball.faces, colours)

@@ -13,8 +13,8 @@ import numpy as np
 from congrasp.actors.env import EnvState, episode_fields
 from congrasp.actors.episode import episode_message
 from congrasp.actors.harvest import save_references, with_kept_references
+from congrasp.actors.link import ActorLink, RunFinished, RunInfo, RunRestarted, Ticket
 from congrasp.actors.physics import make_physics
-from congrasp.actors.process.link import ActorLink, RunFinished, RunInfo, RunRestarted, Ticket
 from congrasp.actors.rollout import Rollout, Trace, finished_episodes
 from congrasp.actors.training_set import FailureWeights, training_set
 from congrasp.actors.worker import RolloutWorker
@@ -30,7 +30,7 @@ from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.transport.base import Transport
 from congrasp.common.wire.codec import Message, finite
-from congrasp.common.wire.schema import PRIVILEGED, RECORDABLE, TAUGHT
+from congrasp.common.wire.messages import PRIVILEGED, RECORDABLE, TAUGHT
 
 
 class Followed(NamedTuple):
