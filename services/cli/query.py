@@ -15,6 +15,7 @@ def query(
     repeat: int = 1,
     concurrency: int = 1,
     states: int = 1,
+    rate: float = 0.0,
     timeout: float = 1.0,
     certs: pathlib.Path | None = None,
     health: bool = False,
@@ -29,6 +30,7 @@ def query(
       repeat: Total number of queries.
       concurrency: Number of concurrent clients, each with a separate connection.
       states: States in one query, up to 64; each gets an answer.
+      rate: Queries a second of each client; 0 sends the next after each answer.
       timeout: Deadline of one query, s.
       certs: Folder of a client's certificate (congrasp certs).
       health: Only check whether the server is ready; the exit code is 0 if it is, else 4.
@@ -37,6 +39,7 @@ def query(
     Examples:
       congrasp query --connect tcp/127.0.0.1:7457
       congrasp query --repeat 1000 --concurrency 4 --json
+      congrasp query --repeat 4000 --concurrency 200 --rate 2
     """
     import json as json_module
 
@@ -45,6 +48,7 @@ def query(
     from congrasp.services.serve.load import example_episode, measure, one_answer
 
     in_range(1, repeat=repeat, concurrency=concurrency, states=states)
+    in_range(0, rate=rate)
     if health:
         with PolicyClient(connect, name, timeout=timeout, wait=timeout, certs=certs) as client:
             print(json_module.dumps(client.health()))
@@ -55,7 +59,7 @@ def query(
         if repeat == states == 1 and not json:
             print(one_answer(client, episode))
             return 0
-    result = measure(connect, name, episode, repeat, concurrency, timeout, certs, states)
+    result = measure(connect, name, episode, repeat, concurrency, timeout, certs, states, rate)
     if json:
         print(json_module.dumps(result))
     else:

@@ -28,7 +28,7 @@ from congrasp.services.client.limits import JointLimits
 from congrasp.services.client.policy import PACKED, EpisodePolicy, LeftPolicy, Policy
 from congrasp.services.serve.requests import STATES_LIMIT, Layout, Query
 
-BATCH_SIZES = (1, 8, STATES_LIMIT)
+BATCH_SIZES = (1, 4, 16, STATES_LIMIT)
 """Batches are padded to one of these sizes, so that nothing compiles after the warm-up."""
 
 

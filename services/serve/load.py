@@ -85,11 +85,13 @@ def measure(
     timeout: float,
     certs: pathlib.Path | None = None,
     states: int = 1,
+    rate: float = 0.0,
 ) -> dict[str, float]:
     """Latencies of `repeat` queries from `concurrency` clients; the first query of each client is not counted.
 
-    With `states` > 1 each query holds that many, and each state counts as an answer. The rate begins when all clients
-    have had their first answer.
+    With `states` > 1 each query holds that many, and each state counts as an answer. Each client sends `rate` queries a
+    second, spread over the second, or its next query after the answer if that is 0. The measurement begins when all
+    clients have had their first answer.
     """
     share = max(1, repeat // concurrency)
 
@@ -99,9 +101,11 @@ def measure(
         client.act(episode.state)
         return client
 
-    def ask(client: PolicyClient) -> tuple[list[float], int, int]:
+    def ask(index: int, client: PolicyClient) -> tuple[list[float], int, int]:
         times, failed, overloaded, state = [], 0, 0, episode.state
-        for _ in range(share):
+        for number in range(share):
+            if rate:
+                time.sleep(max(0.0, began + (number + index / concurrency) / rate - time.perf_counter()))
             try:
                 answer = client.act(state) if states == 1 else client.act_each([state] * states)[0]
                 times.append(answer.round_trip_ms)
@@ -114,7 +118,7 @@ def measure(
     with contextlib.ExitStack() as stack, concurrent.futures.ThreadPoolExecutor(concurrency) as pool:
         clients = list(pool.map(connected, range(concurrency)))
         began = time.perf_counter()
-        results = list(pool.map(ask, clients))
+        results = list(pool.map(ask, range(concurrency), clients))
         spent = time.perf_counter() - began
     times = np.concatenate([np.array(part) for part, _, _ in results])
     return {

@@ -31,7 +31,7 @@ DEPTH = 64
 SHARE = 16
 """Limit of queued queries of one peer."""
 SHARED = BATCH_SIZES[1]
-"""Limit of a batch's states while several peers share it: small enough for their control loops."""
+"""Limit of a batch's states while several peers share it: takes hardly longer than a single state."""
 _TIMEOUT, _MAX_TIMEOUT = 1.0, 60.0  # deadline of a query by default and at most, s
 _FOLLOW_SECONDS = 0.5
 

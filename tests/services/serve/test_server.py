@@ -21,6 +21,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.metrics import ServerMetrics, exposed
 from congrasp.services.serve.inference import Inference, PolicyFunction
+from congrasp.services.serve.load import measure
 from congrasp.services.serve.requests import Query
 from congrasp.services.serve.server import DEPTH, SHARE, PolicyServer, follow_file, follow_run
 from congrasp.services.train.command import untrained
@@ -112,9 +113,16 @@ def test_a_hundred_swaps_of_weights_under_the_queries_of_four_clients_fail_none(
             assert len(set(versions)) > 10
 
 
+def test_a_latency_test_sends_no_more_than_its_rate(served):
+    _, endpoint, episode = served
+    result = measure(endpoint, "policy", episode, repeat=6, concurrency=2, timeout=5.0, rate=10.0)
+    assert result["failed"] == result["overloaded"] == 0
+    assert result["answers_per_s"] <= 6 / 0.25  # the last is sent after two and a half periods
+
+
 @pytest.mark.parametrize("beside_others", [False, True])
 def test_several_states_are_answered_as_one_by_one_and_the_episode_does_not_go_on(served, beside_others, monkeypatch):
-    """Beside other clients the eleven are inferred in two parts."""
+    """Beside other clients the eleven are inferred in three parts."""
     _, endpoint, episode = served
     monkeypatch.setattr("congrasp.services.serve.batching._ALONE", 1e6 if beside_others else 0.0)
     if beside_others:
