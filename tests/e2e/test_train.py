@@ -24,7 +24,7 @@ SMALL = (
     *("--environments", str(ENVIRONMENTS), "--rollout-steps", str(STEPS), "--checkpoint-every", "3"),
     *("--log-rollout-worlds", "3", "--episode-every", "1", "--objects.count", "4", "--objects.families", "box"),
     *("--network.hidden", "16", "--network.encoder", "4", "--ppo.epochs", "1", "--ppo.minibatches", "2"),
-    *("--rollouts-per-update", "2", "--evaluation", "0"),
+    *("--rollouts-per-update", "2", "--evaluation", "0", "--task.constraints", "heading", "pose"),  # with references
 )
 
 

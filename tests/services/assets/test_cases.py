@@ -124,14 +124,13 @@ def test_a_confined_process_reads_what_this_one_does(name, tmp_path):
 
 
 def test_a_description_that_takes_all_time_or_memory_is_refused(tmp_path, monkeypatch):
-    """The limits are those of the confined process; its start counts as well here."""
+    """By the processor time of the confined process, however busy the machine is."""
     monkeypatch.setattr(compiling, "SECONDS", 2)
-    monkeypatch.setattr(compiling, "_START", 4)
     geom = '<body><geom size="0.1"/></body>'
     nested = '<replicate count="999">' * 3 + geom + "</replicate>" * 3
     (tmp_path / "a.xml").write_text(f"<mujoco><worldbody>{nested}</worldbody></mujoco>")
     for read in (import_hand, load_arm):
-        with pytest.raises(CongraspError, match=r"a\.xml (was not read within 2 s|cannot be read: .* 3 GB)"):
+        with pytest.raises(CongraspError, match=r"a\.xml cannot be read: .* the limits are 2 s and 3 GB"):
             read(tmp_path / "a.xml")
 
 
