@@ -63,9 +63,7 @@ def query(
     if json:
         print(json_module.dumps(result))
     else:
-        latency = (
-            f"p50 {result['p50_ms']:.2f} ms, p99 {result['p99_ms']:.2f} ms, {result['answers_per_s']:.0f} answers/s"
-        )
+        latency = "p50 {p50_ms:.2f} ms, p99 {p99_ms:.2f} ms, {answers_per_s:.0f} answers/s".format(**result)
         lost = f"{result['failed']:.0f} failed, {result['overloaded']:.0f} overloaded"
         print(f"{repeat} queries of {states} state(s) from {concurrency} client(s): {latency}, {lost}")
     return 0 if result["failed"] == 0 else 1
