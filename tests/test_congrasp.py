@@ -3,6 +3,8 @@
 import importlib.metadata
 import inspect
 import re
+import subprocess
+import sys
 import textwrap
 
 import numpy as np
@@ -72,6 +74,13 @@ def test_client_guard_and_errors_need_numpy_and_zenoh_alone():
         "The request lacks 'surface' and 'q' and 'wrist' and 'object_pose'. A control loop starts from measured poses.",
         "follow (16,) True",
     ]
+
+
+def test_a_probe_of_a_server_s_health_loads_neither_jax_nor_mujoco():
+    code = "import sys, congrasp.services.cli.query, congrasp.services.serve.load as _\n"
+    code += "print({'jax', 'mujoco'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
 
 
 def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_policy):

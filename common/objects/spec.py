@@ -45,7 +45,7 @@ class Piece:
 
 
 class Colours(NamedTuple):
-    """Colours of surface points; elsewhere the colour is a mean of the nearest ones, by distance."""
+    """Colours of points of a surface; pictures take a mean of those nearby, by distance."""
 
     points: np.ndarray
     """(P, 3) float32, m."""

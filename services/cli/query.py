@@ -45,7 +45,6 @@ def query(
 
     from congrasp.services.cli.console import in_range
     from congrasp.services.client.policy_client import PolicyClient
-    from congrasp.services.serve.load import example_episode, measure, one_answer
 
     in_range(1, repeat=repeat, concurrency=concurrency, states=states)
     in_range(0, rate=rate)
@@ -53,6 +52,8 @@ def query(
         with PolicyClient(connect, name, timeout=timeout, wait=timeout, certs=certs) as client:
             print(json_module.dumps(client.health()))
         return 0
+    from congrasp.services.serve.load import example_episode, measure, one_answer
+
     with PolicyClient(connect, name, timeout=timeout, certs=certs) as client:
         episode = example_episode(object_seed, str(client.health()["hand"]))
     with PolicyClient(connect, name, hand=episode.hand, timeout=timeout, certs=certs) as client:

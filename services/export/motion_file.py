@@ -26,7 +26,6 @@ from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.episode import ARM_ARRAYS, MovedArm, active_constraints, arm_of, arm_of_episode
-from congrasp.services.record.reader import pick_episode
 
 FORMAT = 2
 MAX_BYTES = 256 << 20
@@ -327,6 +326,8 @@ def pick_motion(path: pathlib.Path, index: int = -1, *, success: bool = False) -
         return load_motion(path)
     if path.is_file() and path.suffix != ".mcap":
         raise CongraspError(f"{path} holds no motion.", "Pass a grasp.npz, a recording (.mcap) or a run's folder.")
+    from congrasp.services.record.reader import pick_episode  # with MCAP's packages
+
     return motion_of_episode(pick_episode(path, index, success=success))
 
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
-from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE, has_checkpoints
 from congrasp.services.ops.shutdown import PARENT_VARIABLE, register_child
 
 CHILD_GRACE = 2.0
@@ -96,6 +95,8 @@ def end_all(children: Sequence[Child]) -> None:
 
 def trained(run_dir: pathlib.Path) -> pathlib.Path | None:
     """Policy file of a finished run; None if it is not finished."""
+    from congrasp.learner.run_directory import POLICY_FILE  # with JAX
+
     policy = run_dir / POLICY_FILE
     return policy if (run_dir / _TRAINED).exists() and policy.exists() else None
 
@@ -150,6 +151,8 @@ def train_in_background(
     Raises:
       CongraspError: it failed, or took too long.
     """
+    from congrasp.learner.run_directory import CONFIG_FILE, POLICY_FILE, has_checkpoints
+
     name = run_dir.name
     resume = has_checkpoints(run_dir)
     if not resume and (run_dir / CONFIG_FILE).exists():

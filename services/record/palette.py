@@ -104,8 +104,8 @@ def colours_at(points: np.ndarray, colours: Colours) -> np.ndarray:
 
     The single nearest one would give edges between two colours teeth.
     """
-    distance, index = cKDTree(colours.points).query(points, k=min(_AMONG, len(colours.points)))
-    distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1)
+    among = np.arange(min(_AMONG, len(colours.points))) + 1
+    distance, index = cKDTree(colours.points).query(points, k=among)
     width = np.maximum(distance.mean(1, keepdims=True), 1e-9)
     weight = np.exp(-((distance / width) ** 2))
     mean = np.einsum("nk,nkd->nd", weight / weight.sum(1, keepdims=True), colours.values[index])

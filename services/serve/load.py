@@ -28,7 +28,8 @@ def serving(policy: pathlib.Path, log: pathlib.Path) -> Iterator[tuple[str, int]
       log: file for the server's output.
     """
     endpoint = local_url()
-    server = Child("server", command("serve", policy=policy, listen=endpoint), log)
+    shared = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # a GPU's memory, with this process
+    server = Child("server", command("serve", policy=policy, listen=endpoint), log, shared)
     try:
         yield endpoint, server.start()
     finally:
