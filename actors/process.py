@@ -25,7 +25,7 @@ from congrasp.common.io.journal import Journal
 from congrasp.common.policy.bundle import PolicyBundle, acting, policy_spec
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.stages import stage
-from congrasp.common.task.constraints import from_references
+from congrasp.common.task.constraints import draws_references
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.transport.base import Transport
@@ -176,7 +176,7 @@ class _Actor:
             what = f"The learner's policies have the schema {info.schema}; this actor's have {self._spec.schema}."
             raise CongraspError(what, remedy)
         self._number = zlib.crc32(link.actor.encode())
-        self._own_references = config.task.own_references and from_references(config.task)
+        self._own_references = config.task.own_references and draws_references(config.task)
         self._references = references if self._own_references else None
         self._saved = time.monotonic()
         self._objects, bank = training_set(self._hand, config, self._number)

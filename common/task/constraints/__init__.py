@@ -56,7 +56,7 @@ def optional(task: TaskSettings) -> tuple[Constraint, ...]:
     return tuple(constraint for constraint in known(task) if constraint.optional)
 
 
-def from_references(task: TaskSettings) -> bool:
+def draws_references(task: TaskSettings) -> bool:
     """True if a constraint of the task is drawn from reference poses or trajectories."""
     return any(constraint.from_reference for constraint in known(task))
 
@@ -107,8 +107,8 @@ __all__ = [
     "Constraint",
     "blocks",
     "center_fingers",
+    "draws_references",
     "error_specs",
-    "from_references",
     "get_constraint",
     "goal_of",
     "known",

@@ -24,7 +24,7 @@ from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import SURFACE_POINTS, GraspObject
 from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.task.config import TaskConfig
-from congrasp.common.task.constraints import from_references, known
+from congrasp.common.task.constraints import draws_references, known
 from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
 from congrasp.common.task.sampling.headings import (
@@ -96,7 +96,7 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
     chosen = [columns.pop(f"chosen_{name}") for name in Headings._fields]
     surfaces = [np.stack([getattr(obj, name) for obj in objects]).astype(np.float32) for name in ("points", "normals")]
     key, waypoints = jax.random.key(seed), task.trajectory_points
-    make = _references if from_references(task) else _no_references  # closing a hand around objects takes seconds
+    make = _references if draws_references(task) else _no_references  # closing a hand around objects takes seconds
     references = make(hand, *surfaces, *chosen, columns["rest"], key, waypoints=waypoints)
     own = {"renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
     own["mass"] = np.array([obj.mass for obj in objects], np.float32)
