@@ -47,8 +47,8 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
     Args:
       run_dir: path of the directory.
       config: the run.
-      initial: initial policy instead of random weights: its networks and normalisers. Privileged inputs that its critic
-        lacks get zero weight.
+      initial: initial policy instead of random weights: its networks and normalisers. Inputs of the state and of the
+        critic that it lacks get zero weight.
 
     Raises:
       CongraspError: the directory already has a run, or remains of one; or the initial policy does not match the run.
@@ -62,9 +62,9 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
         )
     if initial is not None:
         spec = bundles.policy_spec(config.task, config.network)
-        spec.require(initial.spec, "to begin with")
+        begun = bundles.with_inputs_of(spec, config.task, initial)
         run_dir.mkdir(parents=True, exist_ok=True)
-        bundles.save(bundles.with_critic_of(spec, initial), run_dir / INITIAL_FILE)
+        bundles.save(begun, run_dir / INITIAL_FILE)
     write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
     (run_dir / LOGS).mkdir(exist_ok=True)
 

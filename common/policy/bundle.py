@@ -21,6 +21,7 @@ import numpy as np
 from congrasp.common.config import NetworkConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import check_reference, get_hand
+from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
 from congrasp.common.policy import network, normalizer
@@ -40,6 +41,7 @@ _MOST_COUNT = 1 << 53
 _LARGEST, _LARGEST_STATISTIC, _LARGEST_LOG_STD = 1e4, 1e30, 10.0
 """Limits of the magnitude of weights, statistics, and logarithms of standard deviations: beyond them, inference in
 float32 overflows."""
+_SAMPLES_KEPT = 1e5
 _MALFORMED = (LookupError, AttributeError, TypeError, ValueError, OverflowError)
 _REMEDY = "Use a bundle from 'congrasp train' of this version."
 
@@ -207,12 +209,48 @@ class PolicyBundle:
         )
 
 
-def with_critic_of(spec: PolicySpec, bundle: PolicyBundle) -> PolicyBundle:
-    """Returns the bundle with the privileged inputs of another spec of its schema; new inputs get zero weight."""
-    if bundle.spec.privileged == spec.privileged:
-        return bundle
-    params = network.with_privileged(bundle.params, bundle.spec.privileged_size, spec.privileged_size)
-    return dataclasses.replace(bundle, spec=spec, params=params, privileged=None)
+def with_inputs_of(spec: PolicySpec, task: TaskConfig, bundle: PolicyBundle) -> PolicyBundle:
+    """Returns the bundle with the inputs of another spec; new ones of state and critic get zero weight.
+
+    Args:
+      spec: spec of the result: that of the task.
+      task: the task.
+      bundle: a policy of the same hand and networks.
+
+    Raises:
+      CongraspError: the policy has another hand, other networks, or inputs that the spec lacks.
+    """
+    size, count = bundle.spec.layout[0][1], float(bundle.observation.count)
+    state = np.arange(size)
+    if spec.schema != bundle.spec.schema:
+        hand = get_hand(spec.hand)
+        now, before = (_state_inputs(hand, each) for each in (task, bundle.task))
+        grown = dataclasses.replace(bundle.spec, layout=(("state", len(now)), *bundle.spec.layout[1:]))
+        spec.require(grown if len(before) == size and {*before} <= {*now} else bundle.spec, "to begin with")
+        index = {name: i for i, name in enumerate(before)}
+        state = np.array([index.get(name, -1) for name in now])
+    same_critic = spec.privileged == bundle.spec.privileged
+    privileged = np.arange(spec.privileged_size) if same_critic else np.full(spec.privileged_size, -1)
+    rows = np.concatenate([state, np.arange(size, len(bundle.observation.mean))])
+    # So few samples that those of the new inputs soon outweigh the unit variance with which they begin.
+    fewer = min(count, _SAMPLES_KEPT) if (state < 0).any() else count
+    scale = fewer / count if count else 1.0
+    mean = np.where(rows < 0, 0.0, bundle.observation.mean[rows])
+    m2 = np.where(rows < 0, fewer, bundle.observation.m2[rows] * scale)
+    return dataclasses.replace(
+        bundle,
+        spec=spec,
+        task=task,
+        params=network.with_inputs(bundle.params, state, privileged),
+        observation=Statistics(np.float64(fewer), mean, m2),
+        privileged=bundle.privileged if same_critic else None,
+    )
+
+
+def _state_inputs(hand: Hand, task: TaskConfig) -> list[tuple[str, int]]:
+    """Field and index within the field of each input of the state."""
+    state = task_observation.fields(hand, task)["state"]
+    return [(field.name, i) for field in state for i in range(field.size)]
 
 
 def content_hash(encoded: bytes) -> str:

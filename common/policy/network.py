@@ -216,15 +216,26 @@ def value(params: Params, layout: Layout, observation: Array, privileged: Array 
     return output[..., 0]
 
 
-def with_privileged(params: Params, before: int, after: int) -> Params:
-    """Returns the parameters with `after` privileged inputs of the critic instead of `before`.
+def with_inputs(params: Params, state: np.ndarray, privileged: np.ndarray) -> Params:
+    """Returns the parameters of networks with more inputs, which get zero weight: results do not change yet.
 
-    New inputs get zero weight: the critic's estimates do not change, and it learns to use them.
+    Args:
+      params: parameters of actor and critic.
+      state: for each input of the new state its index in the old one, all of which must occur, or -1 if it is new.
+      privileged: the same for the critic's privileged inputs, of which some may be dropped.
     """
-    first = params["critic"]["trunk_0"]
-    kernel = np.asarray(first["kernel"])
-    kernel = np.concatenate([kernel[: len(kernel) - before], np.zeros((after, kernel.shape[1]), kernel.dtype)])
-    return {**params, "critic": {**params["critic"], "trunk_0": {**first, "kernel": kernel}}}
+    before = len(params["actor"]["network"]["trunk_0"]["kernel"])
+    kept = np.concatenate([state, np.arange(np.count_nonzero(state >= 0), before)])
+    rows = np.concatenate([kept, np.where(privileged < 0, -1, before + privileged)])
+    actor = {**params["actor"], "network": _with_rows(params["actor"]["network"], kept)}
+    return {**params, "actor": actor, "critic": _with_rows(params["critic"], rows)}
+
+
+def _with_rows(layers: Params, rows: np.ndarray) -> Params:
+    """Returns a network whose first layer has these rows of its kernel; -1 is a row of zeros."""
+    first = layers["trunk_0"]
+    kernel = np.where(rows[:, None] < 0, np.float32(0), np.asarray(first["kernel"])[rows])
+    return {**layers, "trunk_0": {**first, "kernel": kernel}}
 
 
 def log_probability(mean: Array, log_std: Array, action: Array) -> Array:

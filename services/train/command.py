@@ -115,9 +115,10 @@ def _prepare(run_dir: pathlib.Path, config: RunConfig, initial: pathlib.Path | N
     _check(config)
     policy = None if initial is None else bundles.load(initial)
     create_run(run_dir, config, policy)
-    if policy is not None and policy.spec.privileged != policy_spec(config.task, config.network).privileged:
+    spec = policy_spec(config.task, config.network)
+    if policy is not None and (policy.spec.layout, policy.spec.privileged) != (spec.layout, spec.privileged):
         console.print(
-            f"The critic of {initial} has other privileged inputs than this run; the new ones start at zero weight.",
+            f"{initial} has other inputs than this run's policy or critic; the new ones start at zero weight.",
             markup=False,
         )
 

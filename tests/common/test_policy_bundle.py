@@ -7,11 +7,13 @@ import safetensors.numpy
 
 from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.bundle import PolicyBundle, PolicySpec
 from congrasp.common.policy.normalizer import Statistics
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.observation import fields
 from congrasp.common.wire.codec import Message, decode, encode
 
 LAYOUT = (
@@ -174,7 +176,7 @@ def test_spec_of_the_real_task():
 def test_a_bundle_says_what_its_critic_sees(bundle, tmp_path):
     seen = (("mass", 1), ("observation", 4))
     statistics = Statistics(np.float64(3), np.arange(5.0), np.ones(5))
-    wide = bundles.with_critic_of(dataclasses.replace(SPEC, privileged=seen), bundle)
+    wide = bundles.with_inputs_of(dataclasses.replace(SPEC, privileged=seen), bundle.task, bundle)
     assert wide.spec.schema == bundle.spec.schema and wide.spec.privileged_size == 5
     bundles.save(dataclasses.replace(wide, privileged=statistics), tmp_path / "p")
     loaded = bundles.load(tmp_path / "p")
@@ -187,3 +189,27 @@ def test_a_bundle_says_what_its_critic_sees(bundle, tmp_path):
     for wrong in ([["mass", -5]], [["mass", 1 << 20]], [["mass", 4]], [["mass"]], 7):
         with pytest.raises(CongraspError, match=r"p\.safetensors"):
             PolicyBundle.from_message(Message(message.arrays, {**message.meta, "privileged": wrong}), "p.safetensors")
+
+
+def test_a_policy_that_observes_less_begins_with_the_same_actions():
+    sizes = NetworkConfig(hidden=(8, 4), encoder=3)
+    plain, normals = TaskConfig(surface_normals=False), TaskConfig(surface_normals=True)
+    spec, wider = (bundles.policy_spec(task, sizes) for task in (plain, normals))
+    rng = np.random.default_rng(2)
+    names = [field.name for field in fields(get_hand("human"), normals)["state"] for _ in range(field.size)]
+    kept = np.ones(sum(size for _, size in wider.layout), bool)
+    kept[: len(names)] = [name not in ("normal", "height") for name in names]
+    count, size = 1e9, np.count_nonzero(kept)
+    seen = Statistics(np.float64(count), rng.normal(size=size), count * rng.uniform(0.5, 2.0, size))
+    params = network.init(5, spec.layout, spec.action_size, sizes, spec.privileged_size)
+    less = PolicyBundle(spec, plain, params, seen, normalizer.empty(), 3, "ab", 4)
+    more = bundles.with_inputs_of(wider, normals, less)
+    raw = rng.normal(size=(6, len(kept))).astype(np.float32)
+    before = bundles.mean_action(spec.layout, less.inference_parameters, raw[:, kept])
+    after = bundles.mean_action(wider.layout, more.inference_parameters, raw)
+    np.testing.assert_allclose(after, before, rtol=1e-4, atol=1e-6)
+    batch = normalizer.moments(raw, 1)
+    news = normalizer.merge(more.observation, batch._replace(count=np.float64(1e6), m2=batch.m2 * 1e6 / 6))
+    np.testing.assert_allclose(news.mean[~kept], raw[:, ~kept].mean(0), rtol=0.1, atol=1e-3)
+    with pytest.raises(CongraspError, match="to begin with is for hand 'human'"):
+        bundles.with_inputs_of(spec, plain, more)

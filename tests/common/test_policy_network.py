@@ -115,9 +115,16 @@ def test_privileged_inputs_reach_the_critic_alone(params):
     assert first != second
 
 
-def test_new_privileged_inputs_leave_a_critic_s_estimates_unchanged(params):
+def test_new_inputs_leave_results_unchanged(params):
     rng = np.random.default_rng(0)
     x, inputs = rng.normal(size=(5, SIZE)).astype(np.float32), rng.normal(size=(5, 3)).astype(np.float32)
-    wide = network.with_privileged(params, 0, 3)
+    states = np.arange(dict(LAYOUT)["state"])
+    wide = network.with_inputs(params, states, np.full(3, -1))
     np.testing.assert_allclose(value_of(wide, x, inputs), value_of(params, x), rtol=1e-5)
-    jax.tree.map(np.testing.assert_array_equal, network.with_privileged(wide, 3, 0), jax.device_get(params))
+    back = network.with_inputs(wide, states, np.arange(0))
+    jax.tree.map(np.testing.assert_array_equal, back, jax.device_get(params))
+    swapped = network.with_inputs(wide, np.array([1, -1, 0, *states[2:]]), np.array([2, -1, 0]))
+    wider = np.concatenate([x[:, 1:2], rng.normal(size=(5, 1)), x[:, :1], x[:, 2:]], -1).astype(np.float32)
+    layout = (("state", len(states) + 1), *LAYOUT[1:])
+    means = [network.policy(tree, *given)[0] for tree, given in ((params, (LAYOUT, x)), (swapped, (layout, wider)))]
+    np.testing.assert_allclose(*means, rtol=1e-5, atol=1e-7)

@@ -324,7 +324,8 @@ def test_a_privileged_input_that_is_not_finite_is_named(field):
 
 def test_a_policy_without_privileged_inputs_begins_with_the_same_values():
     state, _ = step(fresh(), rollout(toy.bundle_of(fresh()), 0))
-    wide = bundles.with_critic_of(WIDE, toy.bundle_of(state))
+    narrow = toy.bundle_of(state)
+    wide = bundles.with_inputs_of(WIDE, narrow.task, narrow)
     algorithm = PPO(WIDE, toy.SETTINGS)
     begun = algorithm.init(0, LearnedPolicy(wide.params, wide.observation, wide.value, wide.privileged))
     assert begun.privileged.count == 0
