@@ -1,21 +1,26 @@
 """One rank of a run with a made-up actor in its process, to be started, killed and resumed by tests.
 
-Arguments: rank, ranks, port of the coordinator, run directory, number of updates, `fresh` or `resume`.
+Arguments: rank, ranks, port of the coordinator, run directory, number of updates, `fresh` or `resume`, and optionally
+the rank that kills itself, with one of `PHASES` ("1:update").
 """
 
 import dataclasses
+import os
 import pathlib
+import signal
 import sys
 import threading
 import time
 import zlib
+
+import jax
 
 from congrasp.common.config import NetworkConfig, PPOConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import encode
 from congrasp.learner.distributed.ranks import Ranks, end_process
-from congrasp.learner.process import run_learner
+from congrasp.learner.process import _Learner, run_learner
 from tests.learner.made_up_actor import MadeUpActor
 
 CONFIG = RunConfig(
@@ -28,6 +33,30 @@ CONFIG = RunConfig(
 )
 
 
+PHASES = {
+    "join": (jax.distributed, "initialize", 1),
+    "wait": (_Learner, "_wait", 4),
+    "update": (_Learner, "_update", 2),
+    "publish": (_Learner, "_publish", 3),
+    "checkpoint": (pathlib.Path, "replace", 8),
+    "leave": (Ranks, "close", 1),
+}
+"""Function, and the number of its call at which a rank dies: others wait in a collective, a round, or JAX itself."""
+
+
+def die_in(phase: str) -> None:
+    """Kills this process at that call, as the kernel would."""
+    place, name, number = PHASES[phase]
+    given, calls = getattr(place, name), iter(range(1, number))
+
+    def last(*args: object, **options: object) -> object:
+        if next(calls, None) is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return given(*args, **options)
+
+    setattr(place, name, last)
+
+
 def end_slowly(text: str) -> None:
     """Ends the process as on a busy machine, where JAX has the time to abort it before."""
     time.sleep(1.0)
@@ -35,7 +64,10 @@ def end_slowly(text: str) -> None:
 
 
 def main() -> None:
-    rank, count, port, run_dir, goal, mode = sys.argv[1:]
+    rank, count, port, run_dir, goal, mode, *doom = sys.argv[1:]
+    for victim, _, phase in (each.partition(":") for each in doom):
+        if victim == rank:
+            die_in(phase)
     ranks = Ranks.join(int(rank), int(count), f"127.0.0.1:{port}", end_slowly)
     broker = MemoryHub()
     actor = MadeUpActor(MemoryTransport(broker), f"actor-{rank}", seed=int(rank))

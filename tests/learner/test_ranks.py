@@ -187,7 +187,7 @@ class Job:
         self.run_dir, self._port = run_dir, port
         self.processes: list[subprocess.Popen[str]] = []
 
-    def start(self, goal: int, mode: str, count: int = 2) -> None:
+    def start(self, goal: int, mode: str, count: int = 2, *doom: str) -> None:
         self._port += 2
         command = [sys.executable, "-m", "tests.learner.rank_process"]
         environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
@@ -195,7 +195,7 @@ class Job:
         environment |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
         self.processes = [
             subprocess.Popen(
-                [*command, str(rank), str(count), str(self._port), str(self.run_dir), str(goal), mode],
+                [*command, str(rank), str(count), str(self._port), str(self.run_dir), str(goal), mode, *doom],
                 env=environment,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
@@ -218,8 +218,13 @@ class Job:
         return [text for text, _ in output]
 
     def kill(self, victim: int) -> str:
-        """The last words of the other rank, which are one line."""
+        """Kills a rank; returns the last words of the other."""
         self.processes[victim].send_signal(signal.SIGKILL)
+        return self.last_words(victim)
+
+    def last_words(self, victim: int) -> str:
+        """What the other rank says when this one was killed: one line."""
+        assert self.processes[victim].wait(timeout=120.0) == -signal.SIGKILL
         other = self.processes[1 - victim]
         _, words = other.communicate(timeout=60.0)
         assert other.returncode == TransportError.exit_code, words
@@ -265,3 +270,20 @@ def test_two_processes_train_die_and_resume_as_one_or_two(job):
     (alone,) = job.finish()
     assert "The checkpoint has 2 rank(s), this run has 1" in alone
     assert int(alone.split()[-1]) == steps * (kept + 3) + steps // 2 * 2
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.slow
+def test_a_rank_that_dies_in_any_phase_ends_the_other_and_any_number_of_ranks_resumes(job):
+    kept, mode = 0, "fresh"
+    for doom in ("1:join", "1:wait", "0:update", "1:publish", "0:checkpoint", "1:leave"):
+        victim = int(doom[0])
+        job.start(kept + 2 if doom == "1:leave" else 10**6, mode, 2, doom)
+        assert f"Rank {victim} ended. Rank {1 - victim} cannot continue alone" in job.last_words(victim), doom
+        checkpoints = sorted((job.run_dir / "checkpoints").glob("checkpoint_*.safetensors"))
+        assert bool(checkpoints) == (doom != "1:join")
+        kept, mode = (int(checkpoints[-1].stem.removeprefix("checkpoint_")), "resume") if checkpoints else (0, "fresh")
+    job.start(kept + 2, "resume", 3)
+    (bundle,) = {text.split("bundle")[1] for text in job.finish()}
+    steps = CONFIG.rollouts_per_update * CONFIG.rollout_steps * CONFIG.environments
+    assert int(bundle.split()[1]) == steps * (2 * kept + 3 * 2)
