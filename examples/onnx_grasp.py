@@ -84,13 +84,15 @@ class Grasp:
         self.ctrl = [model.actuator(name).id for name in (*meta["wrist_joints"], *motors)]
         self.free = model.joint("object").dofadr[0]
 
-        # Points on the cylinder's surface, as many as the policy was trained with.
+        # Points on the cylinder's surface with its normals there, as many as the policy was trained with.
         rng = np.random.default_rng(0)
         angle, n = rng.uniform(0, 2 * np.pi, self.task["surface_points"]), self.task["surface_points"]
         height, radius = rng.uniform(-HALF_HEIGHT, HALF_HEIGHT, n), np.full(n, RADIUS)
         lid = rng.random(n) < RADIUS / (RADIUS + 2 * HALF_HEIGHT)
         radius[lid], height[lid] = RADIUS * np.sqrt(rng.random(lid.sum())), np.sign(height[lid]) * HALF_HEIGHT
-        self.points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], 1)
+        outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], 1)
+        self.points = radius[:, None] * outward + height[:, None] * [0.0, 0.0, 1.0]
+        self.normals = np.where(lid[:, None], np.sign(height)[:, None] * [0.0, 0.0, 1.0], outward)
 
         # The thumb and the fingers close around the cylinder's axis: across both the axis and the heading.
         self.heading_position = np.array([0.0, 0.0, 0.01])
@@ -187,6 +189,7 @@ class Grasp:
         force = force @ wrist
         points = self.points @ local.T + seen["object_position"]
         nearest = np.linalg.norm(seen["keypoints"][:, None] - points, axis=-1).argmin(1)
+        normal = self.normals[nearest] @ local.T
         now = data.xmat[self.object].reshape(3, 3)
         q, u = data.qpos[self.fingers], data.qpos[self.wrist]
         position = local @ self.heading_position + seen["object_position"]
@@ -200,6 +203,8 @@ class Grasp:
             "touching": touching,
             "force": force / (np.linalg.norm(force, axis=1, keepdims=True) + self.meta["force_scale"]),
             "nearest": points[nearest] - seen["keypoints"],
+            "normal": normal,
+            "height": ((seen["keypoints"] - points[nearest]) * normal).sum(1),
             "object_velocity": data.qvel[self.free : self.free + 3] @ wrist,
             "object_angular_velocity": now @ data.qvel[self.free + 3 : self.free + 6] @ wrist,
             "object_displacement": (data.xpos[self.object] - self.object_position) @ wrist,

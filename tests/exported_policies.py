@@ -13,7 +13,7 @@ from congrasp.common.policy.network import gated
 
 
 def difference(bundle: PolicyBundle, path: pathlib.Path) -> float:
-    """Largest difference of an action, in action units, over observations far beyond the policy's range, too."""
+    """Largest difference over the largest action, both rounded to float32, also far beyond the policy's range."""
     observations = sample_observations(bundle, 64)
     expected = np.asarray(mean_action(bundle.spec.layout, bundle.inference_parameters, observations))
     assert np.abs(expected).max() > 1e-3
@@ -22,7 +22,7 @@ def difference(bundle: PolicyBundle, path: pathlib.Path) -> float:
             found = jax.export.deserialize(bytearray(archive.read("policy.jax"))).call(observations)
     else:
         (found,) = onnxruntime.InferenceSession(path.read_bytes()).run(None, {"observation": observations})
-    return float(np.abs(found - expected).max())
+    return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
 def sample_observations(bundle: PolicyBundle, count: int) -> np.ndarray:

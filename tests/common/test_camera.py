@@ -176,7 +176,7 @@ def test_bundles_and_exports_keep_the_cloud_s_layers(tmp_path):
     assert other.schema != loaded.spec.schema
     for kind in ("onnx", "stablehlo"):
         export_policy(loaded, kind, tmp_path / kind)
-        assert difference(loaded, tmp_path / kind) <= 1e-5
+        assert difference(loaded, tmp_path / kind) <= 3e-6
 
 
 def test_a_student_learns_what_only_its_cloud_shows(tmp_path):
