@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.skin import skin_of
+from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import encode
 from congrasp.services.cli.main import load
-from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE
+from congrasp.services.record.palette import FLESH
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.record.writer import Entry, LogWriter, opaque_channel
 from congrasp.services.viz.hand_sheets import hand_sheet
@@ -109,10 +110,8 @@ def test_a_ball_darkens_the_ground_beneath_it() -> None:
 def test_painted_regions_meet_where_their_points_do() -> None:
     mesh = trimesh.creation.box((0.2, 0.2, 0.2))
     points = np.array([[0.1, y, z] for y in np.linspace(-0.1, 0.1, 11) for z in np.linspace(-0.1, 0.1, 11)])
-    colours = np.where(points[:, 2:] > 0, RED, BLUE)
-    painted = Shape(
-        "mesh", (0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint_points=points, paint_colours=colours
-    )
+    paint = Colours(points, np.where(points[:, 2:] > 0, (255, 0, 0), (0, 0, 255)).astype(np.uint8))
+    painted = Shape("mesh", (0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint=paint)
     image = render_scene([painted], FRONT, (60, 60)).astype(int)
     assert image[20, 30, 0] > 2 * image[20, 30, 2] and image[40, 30, 2] > 2 * image[40, 30, 0]
 
@@ -195,10 +194,10 @@ def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
     thumb = skinned.colours[skin_of(hand).weights[:, hand.tip_links[0]] > 0.99]
     # FORCE of 1.5 N is three quarters of the full contact colour's 2 N: 0.3 + 0.3 * 0.75 of it.
     np.testing.assert_allclose(thumb[0], np.array(FLESH) + 0.525 * np.subtract(TOUCHING, FLESH), atol=0.01)
-    assert body.paint_colours is not None
+    assert body.paint is not None
     minus = episode().arrays["surface_avoid"]
-    np.testing.assert_allclose(body.paint_colours, np.where(minus[:, None], AVOID, GRASPABLE))
-    assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint_points is None
+    np.testing.assert_array_equal(body.paint.values, np.where(minus[:, None], (204, 41, 41), (51, 166, 82)))
+    assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint is None
 
 
 def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_through() -> None:
