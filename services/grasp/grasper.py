@@ -23,7 +23,6 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime.parallel import cores
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.wire.codec import Message, encode
@@ -107,7 +106,7 @@ class Grasper:
         self._arm = arm
         self._hand, self._left = get_hand(policy.spec.hand), left
         self.hand = get_hand(self._hand.name + LEFT) if left else self._hand
-        self.task = dataclasses.replace(policy.task, end_when_fallen=False, impratio=TaskConfig.impratio)
+        self.task = policy.task.evaluated()
         self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
         self._compiled = False
         self._attempts = Attempts(self._hand, self.task, policy, threads=threads or cores(), phases=phases)

@@ -62,7 +62,7 @@ class PolicyGrasping:
         self._source, self._name, self._policy = source, name, first
         self._trouble = ""
         self.hand = get_hand(first.spec.hand)
-        self.task = dataclasses.replace(first.task, end_when_fallen=False)
+        self.task = first.task.evaluated()
         self._attempts = Attempts(self.hand, self.task, first, threads=threads or cores())
         self._compiled, self._free = False, threading.Lock()
 
