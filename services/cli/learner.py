@@ -9,7 +9,7 @@ from congrasp.common.config import MetricWriter, RunConfig, run_config_from_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.ports import LEARNER_URL, rank_url, reachable_url
 from congrasp.services.cli.train import defaults as defaults
-from congrasp.services.ops.logs import Watch, log, logging_as
+from congrasp.services.ops.logs import Watch, log, log_error, logging_as
 from congrasp.services.train.presets import with_hand
 
 
@@ -119,6 +119,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
             return stop.exit_code
     except CongraspError as error:
         if options.ranks > 1:
+            log_error(str(error))
             end_process(str(error), error.exit_code)
         raise
 
