@@ -173,10 +173,10 @@ class _Placed:
 
 
 def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.ndarray:
-    """Six pictures of the object in one of its resting poses, with some of its constraints drawn by the seed.
+    """Six pictures of the object in one of its resting poses, with a random sample of its constraints.
 
-    Approach arrows end before the surface, two centimetres short of the heading positions;
-    the graspable region is green, and the avoid region red.
+    Heading arrows end before the surface, two centimetres short of the heading positions. The graspable region is
+    green, the avoid region red.
 
     Returns:
       (H, W, 3) uint8.
@@ -272,7 +272,7 @@ def import_sheet(
         Body(rest.apply(vertices), faces, PIECES[i % len(PIECES)]) for i, (vertices, faces) in pieces
     ]
     images = [render_fitted(_beside(hand, bodies), _CORNER, _PANEL) for bodies in parts.values()]
-    title = f"{obj.name} beside the {hand.name} hand at true scale"
+    title = f"{obj.name} and the {hand.name} hand at true scale"
     return contact_sheet(images, list(parts), columns=len(parts), title="  |  ".join([title, *obj.notes]))
 
 

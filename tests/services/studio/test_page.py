@@ -1,4 +1,4 @@
-"""The page in a real browser, operated as a person does: by clicking, dragging, and looking at the picture."""
+"""The page in a real browser, operated with the mouse, and checked by its picture."""
 
 import io
 import json
@@ -27,7 +27,7 @@ REFERENCE = pathlib.Path(__file__).with_name("first_picture.png")
 
 
 class Site:
-    """A studio that a page can be opened on, with what is behind it."""
+    """A studio with its server, session and fake policy."""
 
     def __init__(self, folder: pathlib.Path):
         when = BEGIN + 10 * DIP
@@ -70,7 +70,7 @@ def opened(page: Any, site: Site) -> Any:
 
 
 def picture(page: Any) -> np.ndarray:
-    """(H, W, 3) the three-dimensional picture, 0 to 255, after everything that was asked for is done."""
+    """(H, W, 3) the three-dimensional picture, 0 to 255, once all requests are done."""
     page.wait_for_selector("body:not([data-busy])")
     page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     image = Image.open(io.BytesIO(page.locator("#scene").screenshot())).convert("RGB")
@@ -86,7 +86,7 @@ def red(image: np.ndarray) -> np.ndarray:
 
 
 def on_object(page: Any) -> tuple[float, float]:
-    """A point of the page where the object is, away from the arrow."""
+    """A point of the page on the object, away from the arrow."""
     found = orange(picture(page))
     rows, columns = np.nonzero(found)
     low = rows > np.percentile(rows, 70)
@@ -105,7 +105,7 @@ def drag(page: Any, points: list[tuple[float, float]]) -> None:
 def grasp(page: Any, site: Site) -> str:
     """Grasps; returns the motion's number once it is shown.
 
-    What the server does and what the page shows of it have deadlines of their own: on a busy machine either takes long.
+    Server and page have separate deadlines, since either may take long on a busy machine.
     """
     before = {motion["id"] for motion in site.session.state()["motions"]}
     page.click("#grasp")
@@ -137,7 +137,7 @@ def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
 
 
 @pytest.mark.slow
-def test_the_brush_paints_what_it_goes_over(opened: Any, site: Site) -> None:
+def test_the_brush_paints_the_surface_along_its_stroke(opened: Any, site: Site) -> None:
     x, y = on_object(opened)
     before = red(picture(opened)).sum()
     opened.click("[data-tool=avoid]")
@@ -198,7 +198,7 @@ def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
 
 
 @pytest.mark.slow
-def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: Any) -> None:
+def test_constraints_without_a_drawing_tool_are_set_by_flags(page: Any) -> None:
     grasping = made_up.MadeUpGrasping()
     grasping.task = TaskConfig(constraints=("heading", "affordance", "fingers"))
     session = made_up.session(grasping)

@@ -1,4 +1,4 @@
-"""What is known of a run: curves, a hundred actors, and episodes found by their time."""
+"""The training window: curves, a hundred actors, and episodes found by their time."""
 
 import pathlib
 import struct
@@ -44,7 +44,7 @@ def test_success_is_shown_for_every_constraint_of_the_learners_metrics() -> None
     assert window.view()["constraints"]["fingers"] == 0.25
 
 
-def test_an_actors_newer_episode_takes_the_place_of_the_one_before() -> None:
+def test_an_actors_newer_episode_replaces_the_older_one() -> None:
     window = made_up.window(actors=2)
     newer = made_up.actor_episode(77)
     window.take(KEYS.log("episode", "actor", "a001"), newer, time.time())
@@ -52,7 +52,7 @@ def test_an_actors_newer_episode_takes_the_place_of_the_one_before() -> None:
     assert [row["episodes"] for row in window.view()["actors"]] == [1, 2]
 
 
-def test_actors_that_are_gone_are_forgotten_after_a_while_and_an_absent_learner_is_shown() -> None:
+def test_departed_actors_expire_and_an_absent_learner_is_shown() -> None:
     window = made_up.window(actors=3)
     now = time.time()
     window.take_status(made_up.status(2), now + 5)
@@ -71,7 +71,7 @@ def test_thinned_curves_keep_every_dip() -> None:
     assert curve["times"][curve["steps"].index(DIP)] == BEGIN + 10 * DIP
 
 
-def test_a_run_that_went_back_to_a_checkpoint_overwrites_its_curve() -> None:
+def test_a_run_resumed_from_a_checkpoint_overwrites_its_curve() -> None:
     curve = Curve()
     for step, value in ((1, 0.1), (2, 0.2), (3, 0.3), (2, 0.9)):
         curve.add(step, value, 10.0 * step)
@@ -136,7 +136,7 @@ def test_episodes_around_a_time_come_from_finished_and_from_growing_files(tmp_pa
         recordings.episode("nothing")
 
 
-def test_damage_to_a_finished_file_costs_no_more_than_what_is_damaged(tmp_path: pathlib.Path, caplog: Any) -> None:
+def test_only_the_damaged_part_of_a_finished_file_is_lost(tmp_path: pathlib.Path, caplog: Any) -> None:
     made_up.record(tmp_path, [(BEGIN + n, n) for n in range(3)])
     file = next(tmp_path.glob("*.mcap"))
     intact = file.read_bytes()

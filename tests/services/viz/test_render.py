@@ -1,4 +1,4 @@
-"""Pictures show what is there, where it is, and in the right colours."""
+"""Pictures show all shapes, in their places and colours."""
 
 import dataclasses
 import os
@@ -82,7 +82,7 @@ def test_the_nearer_shape_hides_the_other() -> None:
     assert seen[50, 50] == 1 and seen[35, 50] == 0 and seen[0, 0] == -1
 
 
-def test_what_is_seen_through_takes_its_share_of_the_colour() -> None:
+def test_a_transparent_shape_takes_its_share_of_the_colour() -> None:
     pane = box((0.02, 0.4, 0.4), BLUE, (0.3, 0, 0), alpha=0.5)
     plain, through = render_scene([ball()], FRONT, (61, 61)), render_scene([ball(), pane], FRONT, (61, 61))
     center_plain, center = plain[30, 30].astype(int), through[30, 30].astype(int)
@@ -146,7 +146,7 @@ def test_a_mesh_is_cut_without_a_change_of_its_surface() -> None:
     assert mesh.area == pytest.approx(box.area) and mesh.volume == pytest.approx(box.volume)
 
 
-def test_between_and_arrow_lie_where_they_are_asked_to() -> None:
+def test_between_and_arrow_connect_their_points() -> None:
     start, end = np.array([0.1, -0.2, 0.3]), np.array([-0.2, 0.1, 0.1])
     capsule = between(start, end, 0.01, RED)
     axis = Rotation.from_quat(capsule.quaternion, scalar_first=True).apply([0, 0, capsule.size[1]])
@@ -168,7 +168,7 @@ def test_beads_are_one_shape_at_the_points() -> None:
     np.testing.assert_allclose(mesh.vertices.max(0), [0.01, 0.11, 0.11], atol=1e-3)
 
 
-def test_the_camera_just_holds_all_points() -> None:
+def test_the_camera_just_contains_all_points() -> None:
     points = np.random.default_rng(0).normal(size=(50, 3)) * [0.1, 0.2, 0.3] + [1, 2, 3]
     camera = fit(points, np.array([1.0, 0.5, 0.4]), 1.0)
     places = projected(camera, points)
@@ -184,7 +184,7 @@ def test_steps_of_a_sheet_include_the_ends_and_the_removal() -> None:
     assert key_steps(np.ones(3, bool), 8) == [0, 1, 2]
 
 
-def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
+def test_links_in_contact_and_the_avoid_region_are_coloured() -> None:
     skinned, body, *_ = episode_shapes(episode(), 11)
     hand = get_hand("human")
     assert skinned.colours is not None
@@ -200,7 +200,7 @@ def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
     assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint is None
 
 
-def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_through() -> None:
+def test_the_table_is_drawn_until_its_removal_and_the_reference_pose_is_transparent() -> None:
     def flat(step: int) -> bool:
         return any(shape.kind == "table" for shape in episode_shapes(episode(), step))
 
@@ -210,7 +210,7 @@ def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_thr
     np.testing.assert_allclose(ghost.vertices, episode_shapes(episode(), 11)[0].vertices, atol=1e-5)
 
 
-def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
+def test_frames_share_one_camera_that_contains_hand_and_object() -> None:
     camera = camera_of(episode(), [0, 6, 11], 1.0)
     for step in (0, 11):
         assert np.abs(projected(camera, episode().arrays["link_position"][step].astype(float))).max() < 1
@@ -226,13 +226,13 @@ def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
     assert np.abs(frames[0].astype(int) - frames[1]).max() > 50
 
 
-def test_a_view_shows_what_touches_and_the_second_one_is_from_its_side() -> None:
+def test_the_best_view_shows_the_contacts_and_the_second_is_from_its_side() -> None:
     best, aside = views(episode(), [11])
     assert abs((best.azimuth - aside.azimuth + 180) % 360 - 180) >= 75
     hand, arrays = get_hand("human"), episode().arrays
     capsules = capsule_shapes(hand, arrays["link_position"][11], arrays["link_quaternion"][11])
     shapes = [*capsules, *episode_shapes(episode(), 11, overlays=False)[1:2]]
-    tips = np.isin([*hand.capsule_links, -1], hand.tip_links)  # what touches
+    tips = np.isin([*hand.capsule_links, -1], hand.tip_links)  # in contact
 
     def shown(view: View) -> int:
         seen = visible(shapes, camera_of(episode(), [11], view=view), (192, 144))
@@ -266,7 +266,7 @@ def test_a_sheet_keeps_its_pictures_and_shrinks_long_titles() -> None:
         contact_sheet(images, ["a"], 2)
 
 
-def test_the_title_says_what_was_asked_and_how_it_went() -> None:
+def test_the_title_names_the_constraints_and_the_outcome() -> None:
     title = episode_title(episode(mask=(1, 0, 0, 1), success=False))
     for words in ("human hand", "cylinder-0", "heading + affordance + trajectory", "no success", "return 12.5", "3"):
         assert words in title
@@ -307,7 +307,7 @@ def test_a_video_runs_in_real_time_to_its_last_step_and_shows_no_overlays(tmp_pa
     assert len(bare) == 2 and len(marked) > 2
 
 
-def test_pictures_need_no_folder_that_can_be_written() -> None:
+def test_pictures_need_no_writable_folder() -> None:
     script = (
         "import numpy as np; from congrasp.services.viz import kernels; print(kernels.averaged(np.ones((2, 2, 3)), 2))"
     )
