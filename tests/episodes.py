@@ -1,4 +1,4 @@
-"""A made-up but whole episode: the hand nears a cylinder, closes, and holds it when the table goes."""
+"""A fake episode: the hand approaches a cylinder, closes, and holds it after the removal of the table."""
 
 import numpy as np
 import trimesh

@@ -81,7 +81,7 @@ def test_the_page_gets_one_message_with_everything_it_plays() -> None:
     assert message.arrays["lane/heading/met"].shape == (STEPS,)
     assert "at most" in message.meta["lanes"]["heading"]
     assert {"link_position", "object_quaternion", "reward/contact", "arrow/heading/tip"} <= message.arrays.keys()
-    # The made-up grasp ends in its reference pose: the ghost is where the hand is, in the object's frame.
+    # The fake grasp ends in its reference pose: the ghost is where the hand is, in the object's frame.
     last = message.arrays["link_position"][-1] - message.arrays["object_position"][-1]
     np.testing.assert_allclose(message.arrays["ghost/pose/position"], last, atol=1e-5)
 

@@ -29,7 +29,7 @@ from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import Recordings, TrainingWindow
-from tests import studio as made_up
+from tests import studio as fake
 
 
 class Page:
@@ -72,13 +72,13 @@ class Page:
 
 
 @pytest.fixture(scope="module")
-def grasping() -> made_up.MadeUpGrasping:
-    return made_up.MadeUpGrasping()
+def grasping() -> fake.FakePolicy:
+    return fake.FakePolicy()
 
 
 @pytest.fixture(scope="module")
-def page(grasping: made_up.MadeUpGrasping) -> Iterator[Page]:
-    session: Session = made_up.session(grasping, window=made_up.window(5))
+def page(grasping: fake.FakePolicy) -> Iterator[Page]:
+    session: Session = fake.session(grasping, window=fake.window(5))
     server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
     yield Page(server.port)
     server.close()
@@ -107,7 +107,7 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
     made: list[Session] = []
 
     def new() -> Session:
-        made.append(made_up.session(made_up.MadeUpGrasping()))
+        made.append(fake.session(fake.FakePolicy()))
         return made[-1]
 
     sessions = server_module.Sessions(new)
@@ -264,8 +264,8 @@ def test_paint_of_no_colour_leaves_the_studio_working(page: Page) -> None:
 
 
 def test_a_malformed_request_is_a_bad_request(tmp_path: pathlib.Path) -> None:
-    made_up.record(tmp_path, [(made_up.BEGIN, 1)])
-    session = made_up.session(window=TrainingWindow("made-up", Recordings(tmp_path)))
+    fake.record(tmp_path, [(fake.BEGIN, 1)])
+    session = fake.session(window=TrainingWindow("fake", Recordings(tmp_path)))
     server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
     page = Page(server.port)
     try:
@@ -274,14 +274,14 @@ def test_a_malformed_request_is_a_bad_request(tmp_path: pathlib.Path) -> None:
             assert (code, "is not a file name" in json.loads(found)["error"]) == (400, True), name
         for time_ in ("nan", "inf", "-inf", "1e300", "-1"):
             assert page.ask("GET", f"/api/episodes?time={time_}&seconds=1")[0] == 400, time_
-        assert page.ask("GET", f"/api/episodes?time={made_up.BEGIN}&seconds=nan")[0] == 400
-        assert len(json.loads(page.ask("GET", f"/api/episodes?time={made_up.BEGIN}&seconds=1")[1])["episodes"]) == 1
+        assert page.ask("GET", f"/api/episodes?time={fake.BEGIN}&seconds=nan")[0] == 400
+        assert len(json.loads(page.ask("GET", f"/api/episodes?time={fake.BEGIN}&seconds=1")[1])["episodes"]) == 1
     finally:
         server.close()
         session.close()
 
 
-def test_the_mass_of_an_object_is_set(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+def test_the_mass_of_an_object_is_set(page: Page, grasping: fake.FakePolicy) -> None:
     def mass() -> float:
         return page.state["studio"]["object"]["mass_g"]
 
@@ -295,7 +295,7 @@ def test_the_mass_of_an_object_is_set(page: Page, grasping: made_up.MadeUpGraspi
     assert mass() == own
 
 
-def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: fake.FakePolicy) -> None:
     page.do("time", approach=1.5, lift=0.2)
     page.do("time", hold=1)
     page.do("grasp")
@@ -305,16 +305,16 @@ def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: made_up.Mad
     assert page.state["phases"] == {"approach": 1.5, "lift": 0.2, "hold": 1.0}
 
 
-def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasping, tmp_path: pathlib.Path) -> None:
+def test_a_grasp_from_request_to_files(page: Page, grasping: fake.FakePolicy, tmp_path: pathlib.Path) -> None:
     page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, avoid=True)
     page.do("grasp")
     page.wait()
     assert tuple(grasping.asked[-1][1].constraints) == ("heading", "affordance")
     motions = page.state["motions"]
-    assert motions[0]["held"] and motions[0]["steps"] == made_up.STEPS
+    assert motions[0]["held"] and motions[0]["steps"] == fake.STEPS
     assert motions[0]["asked"].endswith("from the side")
     played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])
-    assert played.arrays["lane/affordance/met"].shape == (made_up.STEPS,)
+    assert played.arrays["lane/affordance/met"].shape == (fake.STEPS,)
     for kind in ("npz", "mcap"):
         (tmp_path / f"m.{kind}").write_bytes(page.ask("GET", f"/api/export?id={motions[0]['id']}&kind={kind}")[1])
     motion = load_motion(tmp_path / "m.npz")
@@ -324,7 +324,7 @@ def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasp
     assert b"Choose from: npz, mcap, glb" in page.ask("GET", "/api/export?id=1&kind=docx")[1]
 
 
-def test_a_fault_inside_is_shown_and_the_studio_continues(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+def test_a_fault_inside_is_shown_and_the_studio_continues(page: Page, grasping: fake.FakePolicy) -> None:
     grasping.fails = "the hand fell off"
     page.do("grasp")
     with pytest.raises(
@@ -372,7 +372,7 @@ def test_a_mesh_of_ambiguous_unit_waits_for_a_choice_that_may_change(page: Page)
 
 
 def test_a_second_mesh_of_the_same_name_does_not_touch_the_first(tmp_path: pathlib.Path) -> None:
-    uploads = Uploads(tmp_path, made_up.objects(), made_up.MadeUpImporter())
+    uploads = Uploads(tmp_path, fake.objects(), fake.FakeImporter())
     first, second = uploads.take("model.stl", b"first"), uploads.take("model.stl", b"second")
     assert (first.path.read_bytes(), second.path.read_bytes()) == (b"first", b"second")
     assert first.view()["file"] == second.view()["file"] == "model.stl"
