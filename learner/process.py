@@ -33,6 +33,8 @@ from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
 from congrasp.learner.distributed.ranks import Ranks, ended_by
 from congrasp.learner.hub.admission import Admission, task_ranges
 from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.limits import Events
+from congrasp.learner.hub.queue import RolloutQueue
 from congrasp.learner.hub.staleness import Counters, StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
@@ -158,7 +160,9 @@ class _Learner:
             with contextlib.suppress(OSError):  # standard output may be on a full disk
                 on_event(level, text)
 
-        self._on_event = notify
+        name, staleness = str(ranks.rank), config.max_staleness
+        events = Events(transport, config.name, name, notify)
+        self._event = events.add
         self._spec = bundles.policy_spec(config.task, config.network)
         self._algorithm = make_algorithm(self._spec, config)
         self._form = rollout_form(config, self._spec, self._algorithm.batch_schema)
@@ -170,24 +174,20 @@ class _Learner:
         if ranks.count > 1:
             # Before the hub exists, and so before an actor in this process captures its engine's graphs.
             self._warm_up()
-        name, staleness = str(ranks.rank), config.max_staleness
         log_error = functools.partial(self._event, "error")
         folder = run_dir / FOLDER / name
-        self._hub = LearnerHub(
-            transport,
-            run=config.name,
-            config_json=to_json(config),
-            run_id=self._run_id,
-            schema=self._spec.schema,
-            form=self._form,
-            staleness=StalenessManager(staleness, config.rollouts_per_update),
-            name=name,
+        self._rollouts = RolloutQueue(
+            self._run_id,
+            self._form,
+            self._spec.schema,
+            StalenessManager(staleness, config.rollouts_per_update),
+            events,
             durable=_durable(hubs, ranks.rank),
-            on_event=notify,
             audit=AuditLog(run_dir, name, log_error) if audit else None,
             log=WriteAheadLog(folder, staleness, write=config.write_ahead, log_error=log_error) if audit else None,
-            admission=Admission(functools.partial(task_ranges, config.task, config.curriculum)),
         )
+        admission = Admission(functools.partial(task_ranges, config.task, config.curriculum))
+        self._hub = LearnerHub(transport, self._rollouts, events, to_json(config), admission)
         self._is_new = not hubs
         if hubs and len(hubs) != ranks.count:
             self._event("warning", f"The checkpoint has {len(hubs)} rank(s), this run has {ranks.count}: {_COUNTERS}.")
@@ -221,7 +221,7 @@ class _Learner:
 
     def close(self) -> None:
         """Saves pending records; the transport stays open."""
-        self._hub.close()
+        self._rollouts.close()
 
     @property
     def version(self) -> int:
@@ -298,7 +298,9 @@ class _Learner:
         posted, silent_since = "", time.monotonic()
         while True:
             end = deaths[0] if deaths else "it was stopped" if stop.is_set() else ""
-            found = bool(posted) or self._hub.has_batch(self._config.rollouts_per_update, 0 if end else _POLL_SECONDS)
+            found = bool(posted) or self._rollouts.has_batch(
+                self._config.rollouts_per_update, 0 if end else _POLL_SECONDS
+            )
             state = end or ("ready" if found else "")
             if state != posted:
                 self._ranks.post({"end": end}, urgent=bool(end))
@@ -313,10 +315,10 @@ class _Learner:
 
     def _update(self) -> tuple[dict[str, float], int]:
         """Runs one update on all ranks; returns its metrics and its number of environment steps."""
-        messages = self._hub.next_batch(self._config.rollouts_per_update, 0.0)
+        messages = self._rollouts.next_batch(self._config.rollouts_per_update, 0.0)
         assert messages is not None, "an available batch cannot disappear"
         batch = collate([message.arrays for message in messages], self._form.arrays)
-        lags = [self._hub.lag(int(message.meta["version"])) for message in messages]
+        lags = [self._rollouts.staleness.lag(int(message.meta["version"])) for message in messages]
         mine = summary(messages, lags)
         batch["lag"] = np.repeat(np.array(lags, np.int32), self._form.worlds)
         try:
@@ -324,7 +326,7 @@ class _Learner:
                 self._state, metrics = self._algorithm.update(self._state, batch, self._ranks.mesh)
             self._dropped_in_a_row = 0
         except NonFiniteUpdate as error:
-            self._hub.discard(messages)
+            self._rollouts.discard(messages)
             self._state, metrics = self._drop(batch, error), {}
         self._publish()
         everyone = self._ranks.exchange(mine).meta["entries"]
@@ -385,7 +387,7 @@ class _Learner:
 
     def _save(self) -> None:
         """Writes a checkpoint on rank 0; all ranks call this, and their replicas are compared."""
-        durable = self._hub.durable()
+        durable = self._rollouts.durable()
         state = checksum(self._state) if self._ranks.count > 1 else 0
         everyone = self._ranks.exchange({"hub": durable, "state": state}).meta["entries"]
         if odd := [rank for rank, entry in enumerate(everyone) if entry["state"] != everyone[0]["state"]]:
@@ -404,7 +406,7 @@ class _Learner:
         if failure := self._ranks.exchange({"failure": failure}).meta["entries"][0]["failure"]:
             raise CongraspError(failure)
         self._saved = self._state.version
-        self._hub.note_saved()
+        self._rollouts.note_saved()
 
     def _save_if_possible(self) -> bool:
         """Writes a checkpoint during training; a failed one is retried after the next update."""
@@ -432,17 +434,13 @@ class _Learner:
         while time.monotonic() < deadline and any(who["role"] == "actor" for who in self._hub.status()["roles"]):
             time.sleep(_POLL_SECONDS / 4)
 
-    def _event(self, level: str, text: str) -> None:
-        self._on_event(level, text)
-        self._log("event", {"level": level, "text": text})
-
     def _log(self, kind: str, meta: dict[str, object]) -> None:
         message = Message(meta=finite({"time": time.time(), **meta}))
         self._transport.publish(self._keys.log(kind, "learner", str(self._ranks.rank)), message)
 
 
 def _durable(hubs: list[dict[str, Any]], rank: int) -> dict[str, Any] | None:
-    """Returns a checkpoint's data of this rank's hub; a new rank gets empty data at its version."""
+    """Returns a checkpoint's data of this rank's rollouts; a new rank gets empty data at its version."""
     if not hubs or rank < len(hubs):
         return hubs[rank] if hubs else None
     return {**hubs[0], "counters": dataclasses.asdict(Counters()), "forgotten_missing": 0, "sequences": []}

@@ -70,7 +70,7 @@ def run_learner(folder, endpoint, *, steps=FORM.steps, every=1, pause=0.0, disk=
     stopped = []
     signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
     with urls.listen(endpoint, "learner") as transport:
-        hub = learner_hub(
+        hub, rollouts = learner_hub(
             transport, "chaos", form=form_of(steps), staleness=StalenessManager(1, BATCH), durable=saved["durable"],
             audit=AuditLog(folder, "0"), log=SlowLog(folder / FOLDER / "0", 1, seconds=disk),
         )  # fmt: skip
@@ -79,7 +79,7 @@ def run_learner(folder, endpoint, *, steps=FORM.steps, every=1, pause=0.0, disk=
         print("ready", flush=True)
         updates = 0
         while not stopped:
-            batch = hub.next_batch(BATCH, 0.1)
+            batch = rollouts.next_batch(BATCH, 0.1)
             if batch is None:
                 continue
             for message in batch:
@@ -92,12 +92,12 @@ def run_learner(folder, endpoint, *, steps=FORM.steps, every=1, pause=0.0, disk=
             save(published, version)
             hub.publish_weights(bundle(version), version)
             if updates % every == 0:
-                durable = hub.durable()
+                durable = rollouts.durable()
                 save(path, {"durable": durable, "history": history, "version": version})
-                hub.note_saved()
+                rollouts.note_saved()
         hub.finish()
         time.sleep(0.5)  # actors hear of it; what is on its way still comes in
-        hub.close()
+        rollouts.close()
         save(folder / "final", {"history": history, "counters": hub.status()["counters"], "version": version})
 
 

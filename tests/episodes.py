@@ -1,4 +1,4 @@
-"""A made-up but whole episode: the hand nears a cylinder, closes, and holds it when the table goes."""
+"""A fake episode: the hand approaches a cylinder, closes, and holds it after the removal of the table."""
 
 import numpy as np
 import trimesh
@@ -96,10 +96,3 @@ def episode(
         "metrics": {"return": 12.5, "links_at_removal": 5.0},
     }
     return Message(arrays, meta)
-
-
-def older(message: Message) -> Message:
-    """The episode as recordings had it before they named blocks and kept errors."""
-    arrays = {name: x for name, x in message.arrays.items() if not name.startswith(("active/", "error/"))}
-    mask = np.array([message.arrays[f"active/{name}"] for name in BLOCKS], np.float32)
-    return Message({**arrays, "goal/mask": mask}, message.meta)

@@ -1,13 +1,17 @@
 """A learner's end, and small valid messages for it."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from congrasp.common.transport.base import Transport
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.messages import RolloutForm
+from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.limits import Events
+from congrasp.learner.hub.queue import RolloutQueue
 from congrasp.learner.hub.staleness import StalenessManager
 
 FORM = RolloutForm(steps=20, worlds=16, observation=32, action=4, half=True)
@@ -33,7 +37,28 @@ def bundle(version: int, run_id: str = RUN_ID, form: RolloutForm = FORM, paramet
     return Message(arrays, {**meta, "action_size": form.action})
 
 
-def learner_hub(transport: Transport, run: str, **options: Any) -> LearnerHub:
-    """The learner's end of a run; options are those of `LearnerHub`."""
-    defaults = {"config_json": "{}", "run_id": RUN_ID, "schema": SCHEMA, "form": FORM}
-    return LearnerHub(transport, run=run, **{**defaults, "staleness": StalenessManager(1, 2), **options})
+class Learner(NamedTuple):
+    """The learner's end of a run."""
+
+    hub: LearnerHub
+    rollouts: RolloutQueue
+
+
+def learner_hub(
+    transport: Transport,
+    run: str,
+    *,
+    schema: str = SCHEMA,
+    form: RolloutForm = FORM,
+    staleness: StalenessManager | None = None,
+    config_json: str = "{}",
+    run_id: str = RUN_ID,
+    name: str = "0",
+    on_event: Callable[[str, str], None] = lambda level, text: None,
+    admission: Admission | None = None,
+    **options: Any,
+) -> Learner:
+    """The learner's end of a run; options are those of `RolloutQueue`."""
+    events = Events(transport, run, name, on_event)
+    rollouts = RolloutQueue(run_id, form, schema, staleness or StalenessManager(1, 2), events, **options)
+    return Learner(LearnerHub(transport, rollouts, events, config_json, admission), rollouts)

@@ -1,4 +1,4 @@
-"""A studio without a policy, and a run that nobody trains, for tests of what is around them."""
+"""A studio with a fake policy, and a run without a learner."""
 
 import functools
 import pathlib
@@ -24,13 +24,13 @@ from tests.episodes import episode
 
 STEPS, REMOVAL = 60, 40
 DIP = 30
-"""The update at which the made-up curve dips."""
+"""The update at which the fake curve dips."""
 BEGIN = 1_700_000_000.0
-"""Time of the made-up run's first update, s."""
+"""Time of the fake run's first update, s."""
 
 
-class MadeUpGrasping:
-    """Answers every request with the made-up episode, after saying how far it is."""
+class FakePolicy:
+    """Answers every request with the fake episode, after a report of progress."""
 
     def __init__(self) -> None:
         self.hand, self.task = get_hand("human"), TaskConfig()
@@ -38,7 +38,7 @@ class MadeUpGrasping:
         self.fails = ""
 
     def newest(self) -> dict[str, Any]:
-        return {"source": "made up", "version": 7, "trouble": ""}
+        return {"source": "fake", "version": 7, "trouble": ""}
 
     def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
         self.asked.append((obj, request, phases))
@@ -64,13 +64,13 @@ def _short() -> Message:
 
 
 def actor_episode(number: int, success: bool = True) -> Message:
-    """A short one; which actor's it is says its object."""
+    """A short episode of an actor, whose number is in the name of the object."""
     meta = {**_short().meta, "actor": f"a{number:03d}", "object": f"thing-{number}", "success": success}
     return Message(_short().arrays, meta)
 
 
 def status(actors: int, version: int = 12) -> dict[str, Any]:
-    """What the learner of a run with many actors says."""
+    """Status of a run with many actors."""
     roles = [
         {"role": "actor", "id": f"a{n:03d}", "incarnation": "i", "version": version - n % 3, "lag": n % 3,
          "rollouts": 5 * n, "rollouts_per_second": 0.5, "steps_per_second": 1000.0 + n}
@@ -78,7 +78,7 @@ def status(actors: int, version: int = 12) -> dict[str, Any]:
     ]  # fmt: skip
     ledger = {"granted": 3, "running": 1, "redeemed": 2, "returned": 0, "expired": 0}
     return {
-        "run": "made-up", "version": version, "run_id": "e", "finished": False, "roles": roles, "warnings": [],
+        "run": "fake", "version": version, "run_id": "e", "finished": False, "roles": roles, "warnings": [],
         "rates": {"rollouts_per_second": 50.0, "steps_per_second": 123456.0},
         "queue": {"length": 1, "limit": 4}, "counters": ledger,
     }  # fmt: skip
@@ -93,8 +93,8 @@ def metrics(update: int) -> Message:
 
 
 def window(actors: int = 100, updates: int = 60) -> TrainingWindow:
-    """What is known of a run with many actors after some updates."""
-    made, keys, now = TrainingWindow("made-up"), Keys("made-up"), time.time()
+    """Training window of a run with many actors after some updates."""
+    made, keys, now = TrainingWindow("fake"), Keys("fake"), time.time()
     for update in range(updates):
         made.take(keys.log("metrics", "learner", "0"), metrics(update), now)
     made.take_status(status(actors), now)
@@ -105,14 +105,14 @@ def window(actors: int = 100, updates: int = 60) -> TrainingWindow:
 
 def record(folder: pathlib.Path, moments: list[tuple[float, int]]) -> None:
     """Recordings of episodes: times (s since 1970) and numbers of actors."""
-    writer, channels = LogWriter(folder, "log", run="made-up"), JsonChannels()
+    writer, channels = LogWriter(folder, "log", run="fake"), JsonChannels()
     for when, number in moments:
         writer.write(*episode_entries(f"a{number:03d}", actor_episode(number), int(1e9 * when), 0, channels))
     writer.close()
 
 
-class MadeUpImporter:
-    """Whatever the file holds, it is a bottle, 6 x 6 x 20 of the unit that its name ends with, or two of an unknown."""
+class FakeImporter:
+    """Makes a bottle of every file: 6 x 6 x 20 cm, by default in m; `cm` is in cm, and `unknown` of ambiguous unit."""
 
     def sides(self, path: pathlib.Path) -> tuple[float, float, float]:
         if path.suffix != ".stl":
@@ -124,6 +124,6 @@ class MadeUpImporter:
         return procedural.generate(5, "bottle").scaled(factor), ["It was a bit small"]
 
 
-def session(grasping: MadeUpGrasping | None = None, **more: Any) -> Session:
-    made = grasping or MadeUpGrasping()
-    return Session({"of the run": lambda: made}, objects(), MadeUpImporter(), **more)
+def session(grasping: FakePolicy | None = None, **more: Any) -> Session:
+    made = grasping or FakePolicy()
+    return Session({"of the run": lambda: made}, objects(), FakeImporter(), **more)

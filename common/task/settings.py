@@ -4,7 +4,7 @@ The string under a field is its help on the command line.
 """
 
 import dataclasses
-from typing import Literal
+from typing import Literal, Self
 
 from congrasp.common.hands.spec import CONTACT_TIME
 
@@ -188,6 +188,10 @@ class TaskSettings:
     """Distance below the object's height at the start, or at the table's removal, at which it counts as fallen, m."""
     control: ControlConfig = ControlConfig()
     """Mapping from actions to joint targets."""
+
+    def evaluated(self) -> Self:
+        """Returns the task with the physics of evaluations, grasps and exports: stiff friction, no end at a fall."""
+        return dataclasses.replace(self, impratio=type(self).impratio, end_when_fallen=False)
 
     @property
     def sensed(self) -> bool:

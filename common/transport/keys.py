@@ -158,11 +158,6 @@ class Keys:
         return self._key("log", "metrics", "learner", "*")
 
     @property
-    def actor_metrics(self) -> str:
-        """Expression of the metrics of all actors."""
-        return self._key("log", "metrics", "actor", "*")
-
-    @property
     def everyone(self) -> str:
         """Expression of all liveliness tokens."""
         return self._key("alive", "*", "*", "*")

@@ -1,4 +1,4 @@
-"""Limits for the owners of each certificate: rate of useless work, exponential backoff of offenders, listed tokens.
+"""Limits for the owners of each certificate: rate of useless work, backoff of offenders, listed tokens, events.
 
 A request that helps training is free: a granted ticket, an accepted rollout. All others (denied, refused, stale,
 duplicate) cost tokens by size. An actor without tokens gets the reply to retry later before its request is decoded, so
@@ -11,14 +11,15 @@ import threading
 import time
 from collections.abc import Callable
 
-from congrasp.common.transport.base import Handler
-from congrasp.common.transport.keys import Alive
+from congrasp.common.transport.base import Handler, Transport
+from congrasp.common.transport.keys import Alive, Keys
 from congrasp.common.wire.codec import Message
 
 DAMAGED = 1 << 20
 """Bytes charged for a message that cannot be decoded."""
 _NAMES = 1024
 _LONGEST = 600.0  # longest backoff, s
+_EVENT_SECONDS = 1.0  # between two events of one kind
 _EACH = 64
 """Most listed tokens of one role and certificate."""
 _LISTED = 1024
@@ -130,6 +131,37 @@ def certificate(actor: str) -> str:
 def sender(key: str) -> str:
     """Returns the actor of a key, which access control may reserve for it."""
     return key.rpartition("/")[2]
+
+
+class Events:
+    """Publishes the events of a learner; at most one a second of a kind that untrusted peers can trigger.
+
+    Attributes:
+      keys: keys of the run.
+      name: name of the learner.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        run: str,
+        name: str = "0",
+        on_event: Callable[[str, str], None] = lambda level, text: None,
+    ):
+        """Publishes as the learner `name` of a run; `on_event` is called with level and text, and must not block."""
+        self.keys, self.name = Keys(run), name
+        self._transport, self._on_event = transport, on_event
+        self._last: dict[str, float] = {}
+
+    def add(self, level: str, text: str, *, kind: str = "") -> None:
+        """Publishes an event, unless one of its kind was published within a second."""
+        now = time.monotonic()
+        if kind and now - self._last.get(kind, -_EVENT_SECONDS) < _EVENT_SECONDS:
+            return
+        self._last[kind] = now
+        self._on_event(level, text)
+        meta = {"time": time.time(), "level": level, "text": text}
+        self._transport.publish(self.keys.log("event", "learner", self.name), Message(meta=meta))
 
 
 class Members:

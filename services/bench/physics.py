@@ -40,7 +40,7 @@ _DEFINITION = (
 
 
 def engines() -> list[PhysicsName]:
-    """Engines to compare on this machine: all of them, on a CPU the fastest one alone."""
+    """Engines to compare on this machine: all of them on a GPU, only the fastest one on a CPU."""
     return [resolve_physics("auto")] if jax.default_backend() == "cpu" else list(ENGINES)
 
 
@@ -49,7 +49,7 @@ Rolled = Callable[[], np.ndarray]
 
 
 class Recorder(NativePhysics):
-    """A native engine that records its commands, so that another one can repeat its states."""
+    """A native engine that records its commands, so that another engine can reproduce its states."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         """Takes the arguments of `NativePhysics`."""
@@ -58,13 +58,13 @@ class Recorder(NativePhysics):
         """Targets (B, 6 + F) and tables (B,) of every control step."""
 
     def step(self, state: Any, target: Any, table: Any, force: Any | None = None) -> tuple[NativePhysics, PhysicsState]:
-        """Does one control step, and records it."""
+        """Advances one control step, and records its commands."""
         self.commands.append((np.array(target), np.array(table)))
         return super().step(state, target, table, force)
 
 
 def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> None:
-    """Repeats recorded control steps by `mj_step` alone; threads share the worlds and wait only where tables change."""
+    """Repeats recorded control steps by `mj_step` alone; threads share the worlds and only wait when tables move."""
 
     def run(environments: np.ndarray, targets: Sequence[np.ndarray]) -> None:
         for target in targets:
@@ -82,10 +82,10 @@ def replay(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarr
 
 
 def rolled(physics: NativePhysics, commands: Sequence[tuple[np.ndarray, np.ndarray]], substeps: int) -> Rolled:
-    """Prepares recorded control steps as calls of `mujoco.rollout`, which has its threads and the loop in C.
+    """Prepares recorded control steps as calls of `mujoco.rollout`, with threads and the loop over the steps in C.
 
-    One call for each object, because it takes models of one size; so no policy could act between its steps at once in
-    all environments.
+    Each object needs a call, since the models of a call must have one size. A policy that acts in all environments
+    between two steps could therefore not use it.
 
     Returns:
       A function without arguments that makes the calls, and returns the final positions (nq,) of every environment.

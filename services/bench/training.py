@@ -118,7 +118,7 @@ def bench_scaling(
     """Measures every number of ranks in turn, prints a table, and writes JSON after each of them.
 
     Args:
-      config: the run of every rank; it really learns, and is deleted afterwards.
+      config: the run of every rank; it is trained, and deleted afterwards.
       ranks: numbers of ranks; efficiency is relative to the first.
       seconds: duration of each measurement.
       actors: actor processes of each rank; by default none on GPUs (one runs inside each rank), otherwise one.
@@ -280,8 +280,8 @@ def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) 
         rows = {one.name: f"{one.ended - one.began:.2f} (at {one.began:.1f})" for one in stages()}
         rows |= {f"{name}, all threads": f"{total:.2f}" for name, total in seconds.items()}
         rows["compiled programs"] = str(programs.total())
-        rows["of these more than once"] = ", ".join(f"{name} {n}" for name, n in programs.items() if n > 1)
-        rows["in all, from the start of the process"] = f"{since_start():.2f}"
+        rows["compiled more than once"] = ", ".join(f"{name} {n}" for name, n in programs.items() if n > 1)
+        rows["total, from the start of the process"] = f"{since_start():.2f}"
         results.send_bytes(json.dumps(rows).encode())
 
     until_first_update(config, physics, threading.Event(), report)

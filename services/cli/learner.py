@@ -9,7 +9,7 @@ from congrasp.common.config import MetricWriter, RunConfig, run_config_from_json
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.ports import LEARNER_URL, rank_url, reachable_url
 from congrasp.services.cli.train import defaults as defaults
-from congrasp.services.ops.logs import Watch, log, logging_as
+from congrasp.services.ops.logs import Watch, log, log_error, logging_as
 from congrasp.services.train.presets import with_hand
 
 
@@ -82,13 +82,12 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
     from congrasp.services.ops.shutdown import on_signal
     from congrasp.services.train.learn import learn, longest_rollout
 
-    run_dir, rank = options.run_dir, options.rank
+    run_dir, rank, config = options.run_dir, options.rank, with_hand(config, options.hand)
     try:
-        config, url = with_hand(config, options.hand), rank_url(options.listen, rank)
         with (
             on_signal() as stop,
             urls.listen(
-                url,
+                url := rank_url(options.listen, rank),
                 "learner",
                 certs=options.certs,
                 insecure=options.insecure,
@@ -119,6 +118,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
             return stop.exit_code
     except CongraspError as error:
         if options.ranks > 1:
+            log_error(str(error))
             end_process(str(error), error.exit_code)
         raise
 

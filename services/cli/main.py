@@ -88,18 +88,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         code = run(arguments)
     except CongraspError as error:
-        code = _fail(error, str(error), error.exit_code, debug)
+        code = _fail(str(error), error.exit_code, debug)
     except BrokenPipeError:
         if _last_words(sys.stdout, "\n"):  # another pipe broke
             raise
         code = UNREAD
     except OSError as error:
-        code = _fail(error, _said_of(error), USAGE_ERROR, debug)
+        code = _fail(_said_of(error), USAGE_ERROR, debug)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package == "congrasp":
             raise
-        code = _fail(error, str(MissingPackageError("This", package)), USAGE_ERROR, debug)
+        code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
     # Native code of a daemon thread that is late, such as one that closes Zenoh, aborts in the interpreter's shutdown.
     late = [thread for thread in threading.enumerate() if thread.daemon and thread.name != SIGNALS]
@@ -247,10 +247,10 @@ def _prepare_environment() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
-def _fail(error: Exception, text: str, code: int, debug: bool) -> int:
+def _fail(text: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    if log_error(error, text):
+    if log_error(text):
         return code
     _last_words(sys.stderr, f"congrasp: error: {text}\n")
     return code

@@ -47,13 +47,11 @@ def protocol(task: TaskConfig, hold: int, friction: float = NOMINAL_FRICTION) ->
     different ranges.
     """
     return dataclasses.replace(
-        task,
+        task.evaluated(),
         hold_steps=min(task.hold_steps, hold),
         hold_steps_max=hold,
-        end_when_fallen=False,
         mass_range=(1.0, 1.0),
         friction_range=(friction, friction),
-        impratio=TaskConfig.impratio,
         gain_range=(1.0, 1.0),
         sensing=SensingConfig(),
     )

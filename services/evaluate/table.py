@@ -26,7 +26,7 @@ _LATEX = {
     "<": r"$<$",
     ">": r"$>$",
 }
-_UNBROKEN = ("constraint", "method", "success", "held 2 s", "object")
+_UNBROKEN = ("method", "success", "held 2 s", "object")
 """Columns without line breaks in a terminal."""
 
 
@@ -67,7 +67,7 @@ class Table:
 
         shown = Shown(title=self.title, title_justify="left")
         for column in self.columns:
-            shown.add_column(column, no_wrap=column in _UNBROKEN)
+            shown.add_column(column, no_wrap=column in _UNBROKEN, overflow="fold")
         for row in self.rows:
             shown.add_row(*row)
         return shown

@@ -294,9 +294,7 @@ def calibration(camera: Camera) -> dict[str, Any]:
 def _shapes(motion: GraspMotion, skin: Skin, frame: int) -> list[Shape]:
     """Shapes of the hand, the object, the arm, and the table while it is present."""
     hand = skin_shape(skin, motion.link_position[frame], motion.link_quaternion[frame])
-    own = motion.colours
     mesh = motion.object_vertices, motion.object_faces
-    paint = None if own is None else (own.points, own.values / 255)
-    thing = object_shape(mesh, motion.object_position[frame], motion.object_quaternion[frame], paint)
+    thing = object_shape(mesh, motion.object_position[frame], motion.object_quaternion[frame], motion.colours)
     arm = arm_shapes(motion.arm, frame) if motion.arm else []
     return [hand, thing, *arm, *([table_shape(motion.object_position[0])] if motion.table[frame] else [])]

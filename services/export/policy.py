@@ -27,7 +27,6 @@ from congrasp.common.policy.bundle import PolicyBundle, content_hash, mean_actio
 from congrasp.common.policy.network import CLOUD, POINT, TRUNK, gated, layer_count
 from congrasp.common.policy.normalizer import LIMIT
 from congrasp.common.task import observation
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.geometry import FORCE_SCALE
 from congrasp.common.wire.codec import encode
 from congrasp.services.client.limits import JointLimits
@@ -70,7 +69,7 @@ def describe(bundle: PolicyBundle) -> dict[str, Any]:
         "force_scale": FORCE_SCALE,
         "task": dataclasses.asdict(task),
         "scene": {
-            "mjcf": scene_spec(hand, dataclasses.replace(task, impratio=TaskConfig.impratio)).to_xml(),
+            "mjcf": scene_spec(hand, task.evaluated()).to_xml(),
             "hand_contype": HAND_CONTYPE,
             "object_contype": OBJECT_CONTYPE,
             "object_contact": dataclasses.asdict(object_contact(task)),

@@ -27,10 +27,10 @@ _ACROSS = 0.02  # m per unit of normal difference: the two sides of a thin wall 
 def to_attempt(
     hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int, rng: np.random.Generator
 ) -> tuple[RequestedEpisodes, np.ndarray, int]:
-    """Attempts under a request at an object with its regions.
+    """Samples episodes that attempt a request at an object with its regions.
 
     Returns:
-      The episodes, (B,) the resting pose of each, and how many of them are different: the first ones.
+      The episodes, the resting pose of each (B,), and the number of distinct ones, which come first.
 
     Raises:
       CongraspError: no approach fits the request, or its reference leads through the table.
@@ -48,7 +48,7 @@ def to_attempt(
 
 
 def repeated(hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int) -> RequestedEpisodes:
-    """Request for a labelled object, repeated `batch` times, in the requested resting pose."""
+    """Episodes of a request for a labelled object, `batch` equal ones in the requested resting pose."""
     rest = np.asarray(obj.rest_poses[request.rest or 0], np.float32)
     goal, surface, rest = jax.tree.map(
         lambda array: np.broadcast_to(array, (batch, *np.shape(array))),
@@ -140,7 +140,7 @@ def _balanced(obj: GraspObject) -> GraspObject:
 
 
 def _remedy(request: GraspRequest, otherwise: str) -> str:
-    """Remedy for a request that no approach fits: to leave out one of its options, or another way."""
+    """Remedy for a request that no approach fits: leave out an option that restricts it, or `otherwise`."""
     options = {
         "--rest": request.rest is not None,
         "--heading": request.above or request.given("heading", "direction") is not None,
@@ -164,13 +164,13 @@ def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
         )
     down = -matrix(obj.rest_poses[0][3:])[2]
     return (
-        "The hand would have to come through the table, however the object lies.",
+        "In every resting pose, the hand would have to come through the table.",
         f'In its likeliest pose straight down is --heading "{" ".join(f"{x:.2f}" for x in np.round(down, 2) + 0.0)}".',
     )
 
 
 def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
-    """Wrist positions (n, 3) and last orientation (4,) that the strongest constraint prescribes, if any does."""
+    """Wrist positions (n, 3) and last orientation (4,) prescribed by the strongest constraint; None if it is free."""
     for constraint in reversed(CONSTRAINTS):
         if constraint.name in request.constraints:
             path = constraint.wrist_path(request.constraints[constraint.name])
@@ -183,13 +183,13 @@ def valid_rests(hand: Hand, obj: GraspObject, path: np.ndarray, turn: np.ndarray
     """Resting poses in which a wrist path (n, 3) stays over the table and its last orientation (4,) is not from below.
 
     Raises:
-      CongraspError: there is none, or the requested one, `rest`, is not among them.
+      CongraspError: there is none, or the requested pose `rest` is not among them.
     """
     valid = np.flatnonzero(_clear_of_table(hand, turn[None], path[None], obj.rest_poses[None])[0])
     if not len(valid):
         raise CongraspError(
             f"With this reference the hand would be in the table in every resting pose of '{obj.name}'.",
-            "Its wrist must stay 2 cm over the table, and the hand come from above or level.",
+            "The wrist must stay 2 cm above the table, and the hand must come from above or horizontally.",
         )
     if rest is not None and rest not in valid:
         raise CongraspError(

@@ -91,7 +91,7 @@ def save_grasp(
         save_png(folder / THUMBNAIL, next(render_episode_frames(episode, [last], _SMALL, camera)))
     if film:
         until = min(found.first("hold") + round(_HELD / float(episode.meta["control_dt"])), last)
-        filmed = [*range(found.first("grasp") // 2, until, _FRAMED), until]  # the hand comes into the picture
+        filmed = [*range(found.first("grasp") // 2, until, _FRAMED), until]  # the hand enters the picture
         aspect = film.size[0] / film.size[1]
         if arm:
             save_robot_video(folder / VIDEO, arm, episode, film, [*steps[:-1], until], until)
@@ -141,7 +141,7 @@ def save_trajectories(folder: pathlib.Path, motion: GraspMotion, arm: MovedArm) 
     """Writes the joints of arm and hand at every control step: `arm.csv` and `arm_trajectory.json`.
 
     Angles are in rad, slides in m, times in s. Finger joints are the targets of their servos, which hold the object.
-    The JSON has the fields of trajectory_msgs/JointTrajectory, and is YAML that `ros2 topic pub` takes; its points are
+    The JSON has the fields of trajectory_msgs/JointTrajectory, and `ros2 topic pub` accepts it as YAML; its points are
     those of `joint_trajectory`.
 
     Raises:
@@ -173,14 +173,14 @@ def save_robot_picture(path: pathlib.Path, arm: MovedArm, episode: Message, step
 def save_robot_video(
     path: pathlib.Path, arm: MovedArm, episode: Message, film: Film, steps: Sequence[int], until: int | None = None
 ) -> None:
-    """Writes an MP4 of an episode with the whole robot, from a camera that shows it in all of some control steps.
+    """Writes an MP4 of an episode with the whole robot.
 
     Args:
       path: the file.
       arm: the arm of the episode.
       episode: the episode.
       film: size, frame rate and overlays.
-      steps: control steps that the camera must show.
+      steps: control steps in which the camera shows all of the robot.
       until: see `save_episode_video`.
 
     Raises:

@@ -23,7 +23,6 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime.parallel import cores
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.wire.codec import Message, encode
@@ -44,11 +43,11 @@ if TYPE_CHECKING:
 ATTEMPTS = 16
 """Number of grasps simulated in parallel."""
 ROUNDS = 4
-"""Maximum number of rounds; a round follows another while no attempt holds."""
+"""Maximum number of rounds; another one follows while no attempt holds."""
 _UNLIKELY = 0.5
-"""Cost of each resting pose that is preferred to a grasp's initial one, see `_places`."""
+"""Cost of an attempt for each resting pose that `_places` prefers to its initial one."""
 _LIGHTER, _SMALLER, _ENOUGH = 0.25, 0.7, 0.25
-"""Factors of mass and of size by which the cause of failures is looked for, and the share of holds that shows it."""
+"""Factors on mass and size in the search for the cause of failures, and the share of holds that confirms it."""
 _TOUCHED = 0.2
 """Share of contacts in the avoid region at and above which an attempt does not count as a hold."""
 
@@ -57,7 +56,7 @@ Progress = Callable[[str, int, int], None]
 
 
 class _Round(NamedTuple):
-    """Attempts at an object, all at once; the first n of B are different."""
+    """Parallel attempts at an object; the first n of B are distinct."""
 
     obj: GraspObject
     """The object with the regions of the request."""
@@ -71,14 +70,14 @@ class _Round(NamedTuple):
 
     @property
     def meets(self) -> np.ndarray:
-        """(n,) bool: holds that meet the request, which one by the avoid region does not."""
+        """(n,) bool: holds that meet the request; a hold by the avoid region does not."""
         if self.request.avoid is None:
             return self.holds
         return self.holds & (self.outcome.metrics["affordance_ratio"][: len(self.holds)] < _TOUCHED)
 
 
 class Grasper:
-    """A policy that grasps one object after another; what it compiles serves all of them."""
+    """Grasps one object after another with a policy; all of them share the compiled programs."""
 
     def __init__(
         self,
@@ -97,7 +96,7 @@ class Grasper:
         Args:
           policy: the policy, which names the hand.
           attempts: grasps simulated in parallel, in each round.
-          rounds: maximum number of rounds; a round follows another while no attempt holds.
+          rounds: maximum number of rounds; another one follows while no attempt holds.
           phases: approach, lift and hold.
           threads: threads of the physics; 0 for one per core.
           seed: seed of the attempts.
@@ -107,7 +106,7 @@ class Grasper:
         self._arm = arm
         self._hand, self._left = get_hand(policy.spec.hand), left
         self.hand = get_hand(self._hand.name + LEFT) if left else self._hand
-        self.task = dataclasses.replace(policy.task, end_when_fallen=False, impratio=TaskConfig.impratio)
+        self.task = policy.task.evaluated()
         self._policy, self._attempts_count, self._rounds, self._seed = policy, attempts, rounds, seed
         self._compiled = False
         self._attempts = Attempts(self._hand, self.task, policy, threads=threads or cores(), phases=phases)
@@ -122,7 +121,7 @@ class Grasper:
     def grasp(
         self, obj: GraspObject, request: GraspRequest | None = None, progress: Progress = lambda what, done, total: None
     ) -> Grasp:
-        """The best grasp of some attempts.
+        """Returns the best grasp of several attempts.
 
         Args:
           obj: the object.
@@ -133,7 +132,7 @@ class Grasper:
           UnknownConstraintError: the policy does not know one of the constraints.
           ContradictionError: two of them exclude each other.
           NoReachError: without an arm, no planned approach leads to the grasp.
-          CongraspError: the table is in the way of all attempts, or the arm can do none that holds the object.
+          CongraspError: the table obstructs all attempts, or the arm can execute none that holds the object.
         """
         request = request or GraspRequest()
         require_known(request.constraints, self.task)
@@ -144,7 +143,7 @@ class Grasper:
         refused: collections.Counter[str] = collections.Counter()
         held = attempts = 0
         for number in range(self._rounds):
-            what = f"Attempting others ({number + 1})" if number else "Attempting"
+            what = f"Attempting, round {number + 1}" if number else "Attempting"
             tried = self._attempt(obj, request, (self._seed, number), what, progress)
             if not tried.outcome.aligned.all():
                 raise ContradictionError(
@@ -160,7 +159,7 @@ class Grasper:
             elif best is None or cost.min() < best[1].min():
                 best = tried, cost
             if prescribed(request) is not None or (best is not None and tried.meets.any()):
-                break  # further rounds would repeat these attempts, or are not needed
+                break  # another round would repeat these attempts, or is not needed
         if self._arm:
             raise _no_motion(obj, self._arm.name, attempts, refused)
         assert best is not None
@@ -174,7 +173,7 @@ class Grasper:
     def _attempt(
         self, obj: GraspObject, request: GraspRequest, seed: int | tuple[int, int], what: str, progress: Progress
     ) -> _Round:
-        """A round of attempts, which is called `what` in its progress."""
+        """Runs a round of attempts; `what` is its name in the progress."""
         rng, count = np.random.default_rng(seed), self._attempts_count
         episodes, rests, different = to_attempt(self._hand, self.task, obj, request, count, rng)
         progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 1)
@@ -190,9 +189,9 @@ class Grasper:
         return (cost + _UNLIKELY * _places(tried.obj, tried.rests, tried.request))[: len(tried.holds)]
 
     def _cause(self, obj: GraspObject, request: GraspRequest, progress: Progress) -> str:
-        """A sentence on what makes every attempt fail, if attempts hold the object with one thing changed.
+        """Returns a sentence on the cause of all failures if attempts hold a lighter or a smaller object, else "".
 
-        Its mass is changed first, then its size, at the same mass and where the request names no place in its frame.
+        The smaller object has the same mass. It is tried only if the request names no place in the object frame.
         """
         lighter = dataclasses.replace(obj, mass=_LIGHTER * obj.mass, inertia=_LIGHTER * np.asarray(obj.inertia))
         trials = [(lighter, "weight", f"a quarter of its {1000 * obj.mass:.0f} g")]
@@ -200,7 +199,7 @@ class Grasper:
             smaller = obj.scaled(_SMALLER, constant_mass=True)
             trials.append((smaller, "width", f"{100 * _SMALLER:.0f} % of its size"))
         for changed, cause, how in trials:
-            what = f"Looking whether its {cause} is the cause"
+            what = f"Checking whether its {cause} is the cause"
             try:
                 holds = self._attempt(changed, request, self._seed, what, progress).holds
             except CongraspError:
@@ -219,7 +218,7 @@ class Grasper:
         refused: collections.Counter[str],
         progress: Progress,
     ) -> Grasp | None:
-        """The best attempt that the arm can do; counts the limits that forbid better ones."""
+        """Returns the best attempt that the arm can execute; `refused` counts the limits that exclude better ones."""
         order = [i for i in cost.argsort().tolist() if tried.meets[i]]
         for number, index in enumerate(order):
             progress(f"Moving {arm.name}", number + 1, len(order))
@@ -235,7 +234,7 @@ class Grasper:
         return None
 
     def _motion(self, tried: _Round, index: int, attempts: int, held: int) -> Grasp:
-        """One attempt, with its episode, motion and the constraints that were active."""
+        """Returns an attempt with its episode, motion and active constraints."""
         obj, given = tried.obj, tried.request.constraints
         about = {
             "actor": "grasp",
@@ -267,7 +266,7 @@ def open_grasper(
     phases: Phases = PLAIN,
     arm: ArmOptions = ArmOptions(),  # noqa: B008
 ) -> Grasper:
-    """A grasper with a policy file, or the pretrained policy of a hand.
+    """Returns a grasper with a policy file, or with the pretrained policy of a hand.
 
     Args:
       policy: the file, or None.
@@ -278,11 +277,11 @@ def open_grasper(
       arm: the arm that carries the hand, if it names one.
 
     Raises:
-      CongraspError: there is no such policy, hand or arm, or the arm should carry a left hand.
+      CongraspError: there is no such policy, hand or arm, or the hand on the arm is a left one.
     """
     right, left = right_name(hand)
     if left and arm.arm:
-        raise CongraspError("An arm carries right hands alone.", "Leave out --arm or :left.")
+        raise CongraspError("Arms carry right hands only.", "Leave out --arm or :left.")
     bundle, planner = bundles.load(policy_file(policy, right)), None
     if arm.arm:
         from congrasp.services.arm.planner import ArmPlanner
@@ -302,7 +301,7 @@ def grasp(
     progress: Progress = lambda what, done, total: None,
     **constraints: Any,
 ) -> Grasp:
-    """The best grasp motion of an object under constraints; compiled programs are kept for the next call.
+    """Returns the best grasp motion of an object under constraints; compiled programs are kept for the next call.
 
     Example:
       import congrasp
@@ -322,7 +321,7 @@ def grasp(
         is the text that the command line takes, or a sequence of its words or numbers.
 
     Raises:
-      CongraspError: the object cannot be imported, or a constraint cannot be read or kept.
+      CongraspError: the object cannot be imported, or a constraint cannot be read or met.
     """
     file = policy_file(None if policy is None else pathlib.Path(policy), right_name(hand)[0])
     grasper = _grasper(file, file.stat().st_mtime_ns, hand, attempts, seed)
@@ -350,7 +349,7 @@ def _no_motion(obj: GraspObject, arm: str, attempts: int, refused: collections.C
         return CongraspError(f"None of {attempts} attempts holds '{obj.name}'.", "Set more --attempts.")
     limits = ", ".join(f"{limit} {count}" for limit, count in refused.most_common())
     return CongraspError(
-        f"{arm} can do none of the {refused.total()} attempts that hold '{obj.name}'. Forbidden by {limits}.",
+        f"{arm} can execute none of the {refused.total()} attempts that hold '{obj.name}'. Reasons: {limits}.",
         "Set another --base or --mount, or more --attempts.",
     )
 

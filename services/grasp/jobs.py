@@ -1,4 +1,4 @@
-"""Grasps of many objects, one after another: finished ones are kept, and one bad object does not stop the others."""
+"""Grasps of many objects in turn: finished ones are skipped, and a failure does not stop the others."""
 
 import dataclasses
 import hashlib
@@ -61,7 +61,7 @@ class Result(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """True if the object is held, and its shape is that of its file."""
+        """True if the object is held, and its shape is close to that of its file."""
         return bool(self.facts.get("success")) and self.facts["shape_reliable"]
 
     def line(self) -> str:
@@ -76,7 +76,7 @@ class Result(NamedTuple):
         best = f"best of {facts['attempts']} attempts, {facts['attempts_held']} of which hold it"
         errors = [f"{what} {_shown(facts, stem)}" for stem, what in _ERRORS.items() if f"{stem}_m" in facts]
         if "affordance_ratio" in facts:
-            errors.append(f"{100 * facts['affordance_ratio']:.0f} % of the touches where there should be none")
+            errors.append(f"{100 * facts['affordance_ratio']:.0f} % of the contacts in the avoid region")
         lying = [facts["cause"].rstrip(".")] if facts.get("cause") else []
         lying += [f"in resting pose {facts['rest']}, not the likeliest"] if facts["rest"] > 1 else []
         return "; ".join(
@@ -95,8 +95,8 @@ def _shown(facts: dict[str, Any], stem: str) -> str:
 def find_objects(paths: Sequence[pathlib.Path], folder: str = "objects") -> tuple[list[ObjectAt], list[Result]]:
     """The objects of some paths (meshes, object files, folders of either), and errors of paths without objects.
 
-    A path that does not exist may be the name of an object in `folder`. Objects of the same name get numbers, because
-    each name is that of a folder.
+    A path that does not exist may be the name of an object in `folder`. Objects of the same name are numbered, since
+    each name becomes that of a folder.
     """
     found: list[ObjectAt] = []
     errors: list[Result] = []
@@ -159,10 +159,10 @@ def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: P
 
 
 def rest_pose(obj: GraspObject, text: str) -> int:
-    """The resting pose that a user means: its number from 1 on, or `upright`, with the file's z axis up.
+    """Returns the index of a resting pose from its number, counted from 1, or `upright`: the file's z axis points up.
 
     Raises:
-      CongraspError: the object has none of the kind.
+      CongraspError: the object has no such resting pose.
     """
     count = len(obj.rest_poses)
     if text == "upright":
@@ -188,7 +188,7 @@ def _notes(at: ObjectAt, obj: GraspObject, options: ImportOptions) -> list[str]:
 
 
 def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
-    """The object; for object files and generated objects the options set scale and mass alone."""
+    """Loads the object; only scale and mass of the options apply to object files and generated objects."""
     check_options(options)
     if at.source:
         return at.load(options)
@@ -219,7 +219,7 @@ def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> Non
 
 
 def _verdict(result: Result) -> str:
-    """The outcome on a picture."""
+    """Outcome in the label of a picture."""
     if not result.facts["shape_reliable"]:
         return "SHAPE UNRELIABLE"
     return "held" if result.held else "NOT HELD"

@@ -1,4 +1,4 @@
-"""The best of some attempts: its cost among them, its motion, and its facts."""
+"""The best of several attempts: the costs that choose it, its motion, and its facts."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ _FIRM = ("clean", *SURVIVAL)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Grasp:
-    """The best of some attempts."""
+    """The best of several attempts."""
 
     episode: Message
     """The whole episode, in the format of recordings."""
@@ -41,7 +41,7 @@ class Grasp:
     arm: "ArmMotion | None" = None
     """The motion of the arm, if there is one."""
     cause: str = ""
-    """Why no attempt holds the object, in a sentence, if it is its weight or its width."""
+    """Sentence on the reason why no attempt holds the object, if it is its weight or width; empty otherwise."""
 
     @property
     def success(self) -> bool:

@@ -75,8 +75,8 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
       obj: the object.
       hand: the hand.
       waypoints: K, of wrist trajectories.
-      **texts: by the names of the constraints' options (`Constraint.options`); empty is none. Text is split at blanks
-        and commas where an option takes several words; a sequence of words or numbers stands for such a text.
+      **texts: by the names of the constraints' options (`Constraint.options`); an empty text omits the option. Text is
+        split at blanks and commas if an option takes several words; a sequence of words or numbers equals such a text.
 
     Raises:
       CongraspError: an option is unknown, cannot be read or does not fit the object; the message names it.
@@ -108,10 +108,7 @@ def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
 
 
 def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]) -> str | tuple[str, ...]:
-    """Returns the text of an option: its words if it takes several, else one text, empty for a flag that is off.
-
-    A number stands for its text.
-    """
+    """Returns the text of an option, or its words if it takes several; a flag that is off is an empty text."""
     if option.switch:
         return "yes" if value else ""
     if isinstance(value, int | float):
@@ -145,7 +142,7 @@ def _numbers(text: str, name: str) -> np.ndarray:
 
 
 def _unit(vector: np.ndarray, name: str) -> np.ndarray:
-    """The vector at length 1."""
+    """The normalised vector."""
     largest = np.abs(vector).max()
     if largest < 1e-9:
         raise CongraspError(f"{name} has no direction: all its numbers are zero.", "Make one of them 1 or -1.")
@@ -231,7 +228,7 @@ def _path(text: str, target: Target) -> dict[str, np.ndarray]:
 
 
 def _recorded(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.ndarray]:
-    """The path of a BVH joint up to the frame in which it is nearest to the object, cut like captures."""
+    """The path of a BVH joint to the frame nearest to the object, cut like captured paths."""
     recorded = read_wrist_path(path, joint=joint)
     position, rotation = followed(target.hand, recorded.position, recorded.rotation)
     position = position + target.obj.origin  # both are upright
@@ -286,7 +283,7 @@ def _set_of(path: pathlib.Path, target: Target, index: int) -> Message:
     own, wanted = (np.ptp(x, axis=0) for x in (obj.visual_vertices, constraints.arrays["visual/vertices"]))
     if not np.allclose(own, wanted, rtol=0.02, atol=1e-3):
         scale = float(constraints.meta["object_scale"])
-        its = f"It is for objects {scale:g} times as large, as the {hand.name} hand is trained: add --scale {scale:g}."
+        its = f"The {hand.name} hand is trained on objects {scale:g} times as large: add --scale {scale:g}."
         raise CongraspError(
             f"{path} is for an object of {size_in_words(wanted)}; '{obj.name}' has {size_in_words(own)}.",
             "Name the set of this object." if scale == 1.0 else its,

@@ -1,4 +1,4 @@
-"""The planned approach of the hand from beside the table to the start of a grasp: smooth and free of contact.
+"""Planned approach of the hand from the side to the start of a grasp: smooth and free of contact.
 
 The wrist follows a cubic Bezier curve that ends along the heading. Its share s(x) of the arc length, x = t / T, has
 minimum jerk (Flash and Hogan 1985) from rest to the speed at which the policy takes over:
@@ -28,18 +28,18 @@ from congrasp.services.viz.shapes import link_frames, upright
 SPEED, ACCELERATION, TURNING = 1.0, 15.0, 5.0
 """Limits of the wrist: m/s, m/s^2 and rad/s."""
 CLEARANCE = 0.01
-"""Least clearance of the hand from object and table, m; near the end of the curve, that of the start of the grasp if it
-is smaller."""
+"""Least clearance of the hand from object and table, m; near the end of the curve, that of the start of the grasp if
+that is smaller."""
 _NEAR_END = 0.8  # share of the curve beyond which the clearance may be that of the start of the grasp
-_BESIDE, _ABOVE = 0.45, 0.04  # of the wrist from the object's centre, of the hand above the table, at first, m
+_BESIDE, _ABOVE = 0.45, 0.04  # initial distance of wrist and object's centre, and of hand and table, m
 _WAY = 0.22  # least horizontal distance by which the wrist starts further from the object than the grasp does, m
 _BESIDE_WITH_ARM, _ABOVE_WITH_ARM, _DOWN_WITH_ARM = 0.12, 0.2, math.radians(60.0)
 """The first two for a hand whose arm needs room above the table, m, and the angle by which its fingers point down."""
-_RELAXED = 0.15  # share from the open to the closed pose, of the fingers at first
+_RELAXED = 0.15  # initial share of the fingers' way from the open to the closed pose
 _CHECKED, _ALONG = 25, 5  # poses of the curve that are checked, and points on a capsule's axis
 _AZIMUTHS = np.radians([0, 30, -30, 60, -60, 100, -100, 140, -140, 180])
 _FINE = 401  # points of the curve
-_MOST_STRETCH = 50.0  # of the requested time
+_MOST_STRETCH = 50.0  # largest factor on the requested duration
 _BACK = (0.08, 0.15, 0.22)  # of the curve's middle point from its end, against the heading, m
 _UP = (0.0, 0.10, 0.20, 0.32)  # and upwards, m
 _TOLERANCE = 1e-3  # m
@@ -59,7 +59,7 @@ class Reach(NamedTuple):
     position: np.ndarray
     """(N, 3) m, wrist, world."""
     rotation: Rotation
-    """N of the wrist, to the world."""
+    """N orientations of the wrist, to the world frame."""
     q: np.ndarray
     """(N, F) rad."""
 
@@ -78,7 +78,7 @@ class _Curve(NamedTuple):
     def at(self, x: np.ndarray, seconds: float, speed: float) -> Reach:
         """Poses at shares x (N,) of the time T = `seconds`, with `speed` (m/s) at its end.
 
-        The wrist never moves back: s'(x) >= 0 needs m <= 5/2. If T is longer, it starts later.
+        The wrist never moves back: s'(x) >= 0 needs m <= 5/2. With a longer T it starts later.
         """
         way = self.way(x, seconds, speed) * self.length[-1]
         position = np.stack([np.interp(way, self.length, axis) for axis in self.points.T], -1)
@@ -142,7 +142,7 @@ def plan_reach(
         if (found >= needed).all():
             return curve.at(np.arange(steps) / steps, steps * dt, speed)
     raise NoReachError(
-        f"From beside the table no way leads to a grasp of '{obj.name}' without touching it or the table.",
+        f"Every approach to a grasp of '{obj.name}' touches the object or the table.",
         "Leave out the approach, or set another heading.",
     )
 
@@ -207,7 +207,7 @@ def clearances(hand: Hand, field: DistanceField, rest: np.ndarray, axes: np.ndar
       field: distance field whose first grid is that of the object.
       rest: (7,) pose of the object, world frame.
       axes: (N, P, 3) from `axes_in_wrist`, at the poses' finger angles.
-      poses: N of the wrist.
+      poses: N poses of the wrist.
     """
     radii = _radii(hand)
     world = np.einsum("nij,npj->npi", poses.rotation.as_matrix(), axes) + poses.position[:, None]

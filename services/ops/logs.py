@@ -15,8 +15,6 @@ from congrasp.common.errors import printable
 
 LogFormat = Literal["text", "json"]
 _logger = logging.getLogger("congrasp")
-_LOG = "__congrasp_log__"
-"""Attribute of an exception that ended a JSON log: the log's handler."""
 
 
 class JsonLines(logging.Formatter):
@@ -54,8 +52,8 @@ class Lines(logging.Formatter):
 def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[None]:
     """Context that writes the log of this process to standard output, including warnings of libraries.
 
-    A full disk loses lines, but does not end the process. An exception that ends the context carries the handler of a
-    JSON log, for `log_error`.
+    A full disk loses lines, but does not end the process. After an exception a JSON log continues until `log_error`,
+    for the lines of outer contexts.
     """
     root, handler = logging.getLogger(), logging.StreamHandler(sys.stdout)
     handler.setFormatter(
@@ -64,14 +62,14 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
     handler.handleError = lambda record: None  # type: ignore[method-assign]
     root.addHandler(handler)
     _logger.setLevel(logging.INFO)
-    try:
-        yield
-    except Exception as error:
-        if form == "json":
-            setattr(error, _LOG, handler)
-        raise
-    finally:
-        root.removeHandler(handler)
+    with contextlib.ExitStack() as ending:
+        ending.callback(root.removeHandler, handler)
+        try:
+            yield
+        except Exception:
+            if form == "json":
+                ending.pop_all()
+            raise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,9 +130,12 @@ def announced(what: str | Callable[[], str], first: float = 3.0, every: float = 
         done.set()
 
 
-def log_error(error: Exception, text: str) -> bool:
-    """Describes an error in the log that it ended if that is JSON; returns True if it is."""
-    handler: logging.Handler | None = getattr(error, _LOG, None)
-    if handler is not None:
-        handler.handle(_logger.makeRecord(_logger.name, logging.ERROR, "", 0, text, (), None))
-    return handler is not None
+def log_error(text: str) -> bool:
+    """Writes the error that ended a JSON log as its last line; returns False if there is no such log."""
+    root = logging.getLogger()
+    ended = [handler for handler in root.handlers if isinstance(handler.formatter, JsonLines)]
+    if ended:
+        log("error", text)
+    for handler in ended:
+        root.removeHandler(handler)
+    return bool(ended)

@@ -63,19 +63,30 @@ def finer(
     longest = max(edge, 2.2 * float(np.sqrt(area / most)))
     if len(faces) >= most:
         return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
-    while len(corners) < most:
-        sides = np.linalg.norm(corners[:, [1, 2, 0]] - corners, axis=-1)
-        order = np.argsort(-sides.max(1))[: most - len(corners)]
-        order = order[sides[order].max(1) > longest]
-        if not len(order):
-            break
-        first = (sides[order].argmax(1)[:, None] + np.arange(3)) % 3
-        start, end, across = np.take_along_axis(corners[order], first[..., None], 1).swapaxes(0, 1)
-        middle = (start + end) / 2
-        corners[order] = np.stack([start, middle, across], 1)
-        corners = np.concatenate([corners, np.stack([middle, end, across], 1)])
-    points, found = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    points, found = np.unique(bisected(corners, longest, most).reshape(-1, 3), axis=0, return_inverse=True)
     return points.astype(np.float32), found.reshape(-1, 3).astype(np.int32)
+
+
+def bisected(corners: np.ndarray, longest: float, most: float = np.inf) -> np.ndarray:
+    """Bisects triangles at their longest sides until no side is longer than `longest`, or there are `most` triangles.
+
+    Args:
+      corners: (F, 3, C) positions of the corners, m, and further values, which are interpolated.
+      longest: longest side, m.
+      most: limit of the number of triangles; the longest sides are bisected first.
+    """
+    small, count = [], len(corners)
+    while len(corners):
+        sides = np.linalg.norm(corners[:, [1, 2, 0], :3] - corners[..., :3], axis=-1)
+        order = np.argsort(-sides.max(1))
+        cut = order[: int(min((sides.max(1) > longest).sum(), most - count))]
+        small.append(corners[order[len(cut) :]])
+        first = (sides[cut].argmax(1)[:, None] + np.arange(3)) % 3
+        start, end, across = np.take_along_axis(corners[cut], first[..., None], 1).swapaxes(0, 1)
+        middle = (start + end) / 2
+        corners = np.concatenate([np.stack([start, middle, across], 1), np.stack([middle, end, across], 1)])
+        count += len(cut)
+    return np.concatenate(small)
 
 
 def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -97,6 +108,11 @@ def _painted(*content: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for array in found:
         array.flags.writeable = False
     return found
+
+
+def region_colours(points: np.ndarray, avoid: np.ndarray) -> Colours:
+    """Colours of surface points (P, 3), m, in the avoid region (P,) bool or the graspable region."""
+    return Colours(points, np.round(255 * np.where(avoid[:, None], AVOID, GRASPABLE)).astype(np.uint8))
 
 
 def colours_at(points: np.ndarray, colours: Colours) -> np.ndarray:

@@ -28,9 +28,9 @@ from congrasp.services.evaluate.pools import MANY, exam_pool, procedural_pools
 from congrasp.services.evaluate.report import count_causes, curves_of
 from congrasp.services.evaluate.scores import Row, write_json
 from congrasp.services.evaluate.tables import Captured, Found, captured, evaluate_tables
-from congrasp.services.ops import children
 from congrasp.services.reproduce.comparison import Account, compare, page, write
 from congrasp.services.reproduce.plan import BASELINES, Part, RequiredPolicy, Result, parts, policies
+from congrasp.services.train import processes
 from congrasp.services.viz.sheets import save_png
 
 RUNS = "policies"
@@ -145,7 +145,7 @@ def train_all(request: Request, wanted: Sequence[RequiredPolicy], track: Track) 
         run_dir = request.runs / policy.name
         track(f"Training {policy.name} (log: {run_dir}.log)", None)
         try:
-            children.train_in_background(run_dir, policy.training, request.options, patience=request.patience)
+            processes.train_in_background(run_dir, policy.training, request.options, patience=request.patience)
         except CongraspError as error:
             failures[policy] = str(error)
     return failures
@@ -255,7 +255,7 @@ def _file(request: Request, policy: RequiredPolicy) -> pathlib.Path | None:
         return request.given[policy].file
     if request.quick and policy.method == "ours":
         return pretrained_file(policy.hand)
-    return children.trained(request.runs / policy.name)
+    return processes.trained(request.runs / policy.name)
 
 
 def _policies(request: Request, failed: Mapping[RequiredPolicy, str]) -> _Policies:
@@ -279,7 +279,7 @@ def _policies(request: Request, failed: Mapping[RequiredPolicy, str]) -> _Polici
 
 def _account(request: Request, found: _Policies, results: Sequence[Result], failures: Sequence[str]) -> Account:
     """Collects the content of the page."""
-    trainings = {policy: children.training_seconds(request.runs / policy.name) or 0.0 for policy in found.entrants}
+    trainings = {policy: processes.training_seconds(request.runs / policy.name) or 0.0 for policy in found.entrants}
     seconds = {
         "training": sum(trainings.values()),
         "evaluation": sum(result.about["seconds"] for result in results),

@@ -1,4 +1,4 @@
-"""Opens a studio with the policies, objects and runs that the command names, and closes it again."""
+"""Opens and closes a studio with the policies, objects and run of a command line."""
 
 import contextlib
 import functools
@@ -61,7 +61,7 @@ def open_view(
         if connect or recordings:
             recorded = Recordings(recordings) if recordings else None
             window = TrainingWindow(run if connect else _run_of(recordings), recorded)
-            # In the background: the curves of a long run take a while.
+            # In the background, since reading the curves of a long run takes seconds.
             threading.Thread(target=window.load, daemon=True, name="curves").start()
         if window is not None and connect:
             watching = stack.enter_context(urls.connect(connect, "observer", certs=certs))
@@ -83,7 +83,7 @@ def open_view(
 def _of_run(
     connect: str, run: str, certs: pathlib.Path | None, watching: Transport, stack: contextlib.ExitStack
 ) -> dict[str, Callable[[], PolicyGrasping]]:
-    """The policy of a run; with an observer's certificate alone the pretrained ones."""
+    """The policy of a run; the pretrained ones if there is only an observer's certificate."""
     pulling = watching
     if certs is not None:
         try:

@@ -1,4 +1,4 @@
-"""Objects that a studio offers, uploaded meshes among them, and pictures of their resting poses."""
+"""Objects that a studio offers, including uploaded meshes, and pictures of their resting poses."""
 
 import dataclasses
 import pathlib
@@ -108,7 +108,7 @@ class Uploads:
         """
         name = pathlib.PurePosixPath(name.replace("\\", "/")).name or "mesh"
         if name == ".." or not name.isprintable() or len(name.encode()) > _LONGEST_NAME:
-            raise BadRequest(f"{ascii(name)[:60]} is no name of a file.")
+            raise BadRequest(f"{ascii(name)[:60]} is not a file name.")
         if not body:
             raise CongraspError(f"{name} is empty (0 bytes).", "Export or download it again.")
         path = pathlib.Path(tempfile.mkdtemp(dir=self._folder)) / name
@@ -117,7 +117,7 @@ class Uploads:
             sides = self._importer.sides(path)
             return Upload(path, sides, guessed_unit(name, sides))
         except CongraspError as error:
-            raise self._told(error, path) from None
+            raise self._without_path(error, path) from None
 
     def load(self, upload: Upload, unit: str, replaces: str = "") -> str:
         """Imports a mesh in a unit; returns the name of its object.
@@ -133,7 +133,7 @@ class Uploads:
         try:
             obj, notes = self._importer.load(upload.path, unit)
         except CongraspError as error:
-            raise self._told(error, upload.path) from None
+            raise self._without_path(error, upload.path) from None
         if replaces in self._known:
             self._catalogue.drop(replaces)
             del self._known[replaces]
@@ -142,7 +142,7 @@ class Uploads:
         self.pending = None
         return name
 
-    def _told(self, error: CongraspError, path: pathlib.Path) -> CongraspError:
+    def _without_path(self, error: CongraspError, path: pathlib.Path) -> CongraspError:
         """The error with the file's name in place of its path on the server."""
         return CongraspError(str(error).replace(str(path), path.name))
 

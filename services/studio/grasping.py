@@ -1,4 +1,4 @@
-"""Grasps of a policy for the studio: exactly as drawn, or close to that where it fails; and the reason if none held."""
+"""Grasps of a policy for the studio: as drawn, or a variation if that fails; and the reason if none holds."""
 
 import dataclasses
 import threading
@@ -29,9 +29,9 @@ from congrasp.services.studio.session import SECONDS, Progress
 from congrasp.services.studio.state import tool_of
 
 ATTEMPTS = 8
-"""Number of parallel grasps: the drawn one, and others near it."""
+"""Number of parallel grasps: the drawn one, and variations of it."""
 _ASIDE, _TILT, _ROLL = 0.006, np.radians(6.0), np.radians(10.0)
-"""Standard deviations of the others from the drawn grasp: m per axis, rad, rad."""
+"""Standard deviations of the variations: m per axis, rad, rad."""
 _COMPILING = 60
 """Seconds of the first grasp on two cores of a laptop, with an empty compilation cache."""
 _OTHER = 2.0
@@ -62,7 +62,7 @@ class PolicyGrasping:
         self._source, self._name, self._policy = source, name, first
         self._trouble = ""
         self.hand = get_hand(first.spec.hand)
-        self.task = dataclasses.replace(first.task, end_when_fallen=False)
+        self.task = first.task.evaluated()
         self._attempts = Attempts(self.hand, self.task, first, threads=threads or cores())
         self._compiled, self._free = False, threading.Lock()
 
@@ -84,15 +84,15 @@ class PolicyGrasping:
             self._trouble = str(error)
 
     def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
-        """The episode of the drawn grasp, unless one near it holds or keeps to the constraints clearly better.
+        """Returns the episode of the drawn grasp, or of a variation that clearly holds or meets the constraints better.
 
-        `note` in its metadata says which one it is, or explains why none held.
+        `note` in its metadata names a variation, or explains why none held.
 
         Raises:
           CongraspError: the policy lacks a constraint, or no reach leads to the grasp.
         """
         if not self._free.acquire(blocking=False):
-            progress(f"another browser's grasp is before this one, {SECONDS} s", 0.0)
+            progress(f"waiting for the grasp of another browser, {SECONDS} s", 0.0)
             self._free.acquire()
         try:
             return self._grasp(obj, request, phases, progress)
@@ -137,7 +137,7 @@ class PolicyGrasping:
     def _attempt(
         self, obj: GraspObject, request: GraspRequest, progress: Callable[[float], None]
     ) -> tuple[Outcome, np.ndarray]:
-        """Outcome of a request and of others near it, and the distance (B,) of each from it, m."""
+        """Outcome of a request and its variations, and the distance (B,) of each from the request, m."""
         episodes, aside = _episodes(self.hand, self.task, obj, request)
         steps = self._attempts.steps
         return self._attempts.run(obj, episodes, lambda step: progress(step / steps)), aside
@@ -168,16 +168,16 @@ def _episodes(
 
 
 def _best(outcome: Outcome, constraints: tuple[str, ...], removal: int, lift: float) -> int:
-    """Index of the drawn grasp, or of another one that is clearly better: it holds, or keeps to the constraints."""
+    """Index of the drawn grasp, or of a variation that clearly holds or meets the constraints better."""
     return int(np.argmin(costs(outcome, constraints, removal, lift) + _OTHER * (np.arange(ATTEMPTS) > 0)))
 
 
 def _note(outcome: Outcome, index: int, aside: np.ndarray) -> str:
-    """Reason why another grasp than the drawn one is shown; empty if it is the drawn one, or none held."""
+    """Reason why a variation is shown; empty if the drawn grasp is shown, or none held."""
     held = outcome.metrics["held"] > 0
     if held.any() and index:
-        why = "did better" if held[0] else "held, which what was drawn did not"
-        return f"Of {ATTEMPTS - 1} others near what was drawn, this one {why}: {1000 * aside[index]:.0f} mm beside it."
+        why = "is better than the drawn grasp" if held[0] else "holds; the drawn grasp does not"
+        return f"This variation, the best of {ATTEMPTS - 1}, {why}: it is {1000 * aside[index]:.0f} mm away."
     return ""
 
 
@@ -202,7 +202,7 @@ def why_nothing_held(
         return f"{text} The {title} decided: without it {found[best]} of {attempts} hold."
     guides = [name for name in request.constraints if "heading" in get_constraint(name).overrides]
     advice = f"{explanation[0]} Try another {get_constraint(guides[-1] if guides else 'heading').title}."
-    return f"{text} None holds without any one of the constraints either. {advice}" if found else f"{text} {advice}"
+    return f"{text} Leaving out any one constraint does not help. {advice}" if found else f"{text} {advice}"
 
 
 def _weaker(request: GraspRequest) -> Iterator[tuple[str, GraspRequest]]:

@@ -64,14 +64,14 @@ _ABOVE = np.cos(np.radians(45.0))
 MOST = 30
 """Number of motions kept; the oldest is dropped first."""
 DATA = ("npz", "mcap", *FORMATS)
-"""Formats in which a motion can be saved at once."""
+"""Formats in which a motion is saved without a job."""
 DRAWN = ("mp4", "png")
-"""Formats that are rendered first, in a job."""
+"""Formats that a job renders."""
 _PICTURE, _VIDEO = (1280, 720), (854, 480)  # pixels
 
 
 def describe(studio: Studio) -> dict[str, Any]:
-    """Everything that a page shows of a request; in the object frame, except resting pose and start (world frame)."""
+    """The page's content for a request, in the object frame; resting pose and start are in the world frame."""
     resolution = studio.resolution
     goal = resolution.goal
     obj, hand, rest = studio.obj, studio.hand, studio.obj.rest_poses[studio.rest]

@@ -42,7 +42,7 @@ _DRAINED, _DRAIN_SECONDS = 64 << 10, 1.0  # bytes read of a refused body, so tha
 
 
 class BadRequest(CongraspError):
-    """A request that no page sends."""
+    """A malformed request; the page sends none."""
 
 
 class Download(NamedTuple):
@@ -111,7 +111,7 @@ class Sessions:
                 if now - used < IDLE:
                     raise CongraspError(
                         f"{MOST} browsers use this studio.",
-                        f"Come back when one has been idle for {IDLE / 60:.0f} minutes, or start another studio.",
+                        f"Try again when one has been idle for {IDLE / 60:.0f} minutes, or start another studio.",
                     )
                 self._open.popitem(last=False)
                 oldest.close()
@@ -147,7 +147,7 @@ class PageServer:
             reason = getattr(error, "strerror", None) or error
             raise CongraspError(
                 f"The page cannot be offered at {host}:{port} ({reason}).",
-                "Choose another --port, or end what uses it.",
+                "Choose another --port, or end the process that uses it.",
             ) from None
         self.routes, self._server.page = routes, self
         self.host, self.port = host, int(self._server.server_address[1])
@@ -172,7 +172,7 @@ class PageServer:
         """Reason why a request is refused, with the remedy; empty if it comes from the page itself.
 
         Other sites in the browser must not reach the page. A site's name may resolve to this machine (DNS rebinding),
-        so the Host header must name this machine, or a proxy that the user named. Ports differ behind a tunnel.
+        so the Host header must name this machine, or a proxy set by the user. Ports differ behind a tunnel.
         """
         host = request.headers.get("Host", "").strip()
         origin, site = request.headers.get("Origin"), request.headers.get("Sec-Fetch-Site")
@@ -220,7 +220,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         elif (routes := self._routes()) and (route := routes.gets.get(path)):
             self._answer(lambda: route(query))
         elif routes:
-            self._send(404, "text/plain", b"There is nothing of this name.")
+            self._send(404, "text/plain", b"There is no such page.")
 
     def do_POST(self) -> None:
         """Answers by a route; a request is refused by its headers, before its body is read."""
@@ -239,7 +239,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         elif (routes := self._routes()) is None:
             self._drain(length)
         elif (route := routes.posts.get(path)) is None:
-            self._error(404, "There is nothing of this name.")
+            self._error(404, "There is no such page.")
             self._drain(length)
         else:
             body = self.rfile.read(length)
@@ -296,7 +296,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         files = (file for file in STATIC.rglob("*") if file.suffix in _TYPES)
         file = next((file for file in files if file.relative_to(STATIC).as_posix() == name), None)
         if file is None:
-            self._send(404, "text/plain", b"There is nothing of this name.")
+            self._send(404, "text/plain", b"There is no such page.")
             return
         new = {}
         if file.suffix == ".html" and not self._browser():

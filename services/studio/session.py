@@ -169,7 +169,7 @@ class Session:
         return self._drawn
 
     def training(self, names: str) -> dict[str, Any]:
-        """Content of the training window; `names` are those of curves, separated by commas."""
+        """Content of the training window; `names` are the curves, separated by commas."""
         if self._window is None:
             raise CongraspError("The studio follows no run.", "Start it with --connect, or with --recordings.")
         return self._window.view([name for name in names.split(",") if name])
@@ -188,7 +188,7 @@ class Session:
         return {"seconds": reach, "episodes": episodes}
 
     def _do(self, query: Mapping[str, str], body: bytes) -> dict[str, Any]:
-        """Does one action of the user; returns the new state."""
+        """Runs one action of the user; returns the new state."""
         try:
             request = json_object(body)
             action = request.pop("action")
@@ -209,7 +209,7 @@ class Session:
                 **{name: functools.partial(self._history.do, name) for name in ACTIONS},
             }
             if not isinstance(action, str) or action not in actions:
-                raise CongraspError(f"The studio cannot do '{str(action)[:40]}'.", f"It can: {', '.join(actions)}.")
+                raise CongraspError(f"There is no action '{str(action)[:40]}'.", f"Choose from: {', '.join(actions)}.")
             try:
                 actions[action](**request)
             except (TypeError, ValueError, OverflowError) as error:

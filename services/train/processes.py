@@ -1,11 +1,13 @@
-"""A learner and its actors as processes of this machine: starts, restarts and ends them.
+"""Trainings as processes of this machine: a learner and its actors, and a whole training in the background.
 
-`Launch` says how many there are, on which engine, and who may connect to them.
+`Launch` has their number, their engine, and the peers that may connect.
 """
 
 import dataclasses
+import json
 import os
 import pathlib
+import shutil
 import subprocess
 import sys
 import threading
@@ -19,6 +21,8 @@ from congrasp.actors.harvest import references_file
 from congrasp.actors.physics import resolve_physics
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.io.files import write_atomically
+from congrasp.common.io.inputs import read_json
 from congrasp.common.io.journal import AUDIT
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import cores
@@ -27,8 +31,8 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import LEARNER_URL, local_url, rank_url, reachable_url
 from congrasp.common.transport.security import CERTIFICATE_FILE, check_exposure
-from congrasp.learner.run_directory import LOGS
-from congrasp.services.ops.children import CHILD_GRACE, Child, command, end_all, wait_for
+from congrasp.learner.run_directory import CONFIG_FILE, LOGS, POLICY_FILE, has_checkpoints
+from congrasp.services.ops.children import CHILD_GRACE, Child, command, end_all, run_child, wait_for
 
 MAX_RESTARTS = 5
 _BAD_INPUT = 2
@@ -302,3 +306,61 @@ def _check_can_restart(child: Child, code: int) -> None:
     """Raises a `CongraspError` if a restart would end in the same way."""
     if code == _BAD_INPUT or child.restarts >= MAX_RESTARTS:
         raise CongraspError(f"The {child.name} failed: {child.last_line()}", f"Its log is {child.log}.")
+
+
+_TRAINED = "trained.json"
+_LARGEST = 1 << 16
+
+
+def train_in_background(
+    run_dir: pathlib.Path,
+    chosen: Sequence[str],
+    options: Sequence[str] = (),
+    *,
+    patience: float,
+    progress: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Trains until the run's end; the output goes to a log next to the run's folder.
+
+    Args:
+      run_dir: the run, which is resumed; one without a checkpoint is restarted.
+      chosen: options of `congrasp train` for a new run, such as `--preset`.
+      options: further options, also for a resumed run.
+      patience: seconds after which the training is stopped, to be resumed later.
+      progress: called with its last line of output.
+
+    Raises:
+      CongraspError: it failed, or took too long.
+    """
+    name = run_dir.name
+    resume = has_checkpoints(run_dir)
+    if not resume and (run_dir / CONFIG_FILE).exists():
+        shutil.rmtree(run_dir)  # it ended before its first checkpoint
+    begin = command(resume=True) if resume else list(chosen)
+    arguments = ["train", *begin, *command(run_dir=run_dir, evaluation=0), *options]
+    run_dir.parent.mkdir(parents=True, exist_ok=True)
+    child = Child(name, arguments, run_dir.with_name(f"{name}.log"))
+    began = time.monotonic()
+    code = run_child(child, patience, progress)
+    if code is None:
+        raise CongraspError(
+            f"The training of {name} was stopped after {patience / 60:.0f} min.",
+            "Repeat the command to resume it; --patience gives it more time.",
+        )
+    if code or not (run_dir / POLICY_FILE).exists():
+        raise CongraspError(f"The training of {name} failed: {child.last_line()}", f"Its log is {child.log}.")
+    write_atomically(run_dir / _TRAINED, json.dumps({"seconds": round(time.monotonic() - began, 1)}).encode())
+
+
+def trained(run_dir: pathlib.Path) -> pathlib.Path | None:
+    """Policy file of a finished run; None if it is not finished."""
+    policy = run_dir / POLICY_FILE
+    return policy if (run_dir / _TRAINED).exists() and policy.exists() else None
+
+
+def training_seconds(run_dir: pathlib.Path) -> float | None:
+    """Duration of its training in seconds; for a resumed one, that of the last session."""
+    try:
+        return float(read_json(run_dir / _TRAINED, _LARGEST)["seconds"])
+    except (LookupError, TypeError, ValueError, CongraspError):
+        return None

@@ -11,11 +11,11 @@ from congrasp.common.io.files import cache_folder, can_cache
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 GAMMA = 2.2
-"""sRGB is about linear light to the power of one over this."""
+"""Exponent of sRGB, approximately: it is linear light to the power of 1 / GAMMA."""
 NOTHING = -1
 """Index of samples without a triangle."""
 _KEY_STRENGTH, _SKY_STRENGTH, _BOUNCE = 0.70, 0.50, 0.05
-_HIGHLIGHT = 60  # exponent: how sharp the highlight is
+_HIGHLIGHT = 60  # exponent of the highlight; a larger one is sharper
 _ROUNDING = 1e-9  # of weights: a sample on an edge belongs to both sides
 _SMALL = 1e-6  # samples: a triangle of a smaller area covers nothing
 

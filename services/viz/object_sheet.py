@@ -22,7 +22,7 @@ from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.meshes import Source
 from congrasp.services.assets.objects.options import length, size_in_words
 from congrasp.services.assets.objects.repair import with_few_faces
-from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, OBJECT, PIECES, WAYPOINT
+from congrasp.services.record.palette import HEADING, OBJECT, PIECES, WAYPOINT, region_colours
 from congrasp.services.viz.raster import render_fitted
 from congrasp.services.viz.shapes import (
     Shape,
@@ -57,7 +57,7 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
     tips, ways = turn.apply(cleared.position[chosen]) + place, turn.apply(cleared.direction[chosen])
 
     painted = _painted(obj)
-    whole = dataclasses.replace(painted, paint_points=None, paint_colours=None)
+    whole = dataclasses.replace(painted, paint=None)
     pieces = [
         dataclasses.replace(whole, colour=PIECES[i % len(PIECES)], vertices=vertices, faces=faces)
         for i, (vertices, faces) in enumerate(map(tessellate, obj.pieces))
@@ -81,8 +81,7 @@ def object_sheet(obj: GraspObject, headings: Headings) -> np.ndarray:
 def rest_picture(obj: GraspObject, rest: int, size: tuple[int, int] = _SMALL) -> np.ndarray:
     """(height, width, 3) uint8: the object on the table in one of its resting poses; size (width, height), pixels."""
     pose = np.asarray(obj.rest_poses[rest], float)
-    shape = dataclasses.replace(_painted(obj), position=pose[:3], quaternion=pose[3:])
-    shape = dataclasses.replace(shape, paint_points=None, paint_colours=None)
+    shape = object_shape((obj.visual_vertices, obj.visual_faces), pose[:3], pose[3:])
     return render_fitted([shape], _VIEW, size, [table_shape(pose[:3])])
 
 
@@ -111,8 +110,8 @@ def overview(objects: Sequence[GraspObject]) -> np.ndarray:
 def _painted(obj: GraspObject) -> Shape:
     """The object in its most likely resting pose, in the colours of its regions."""
     pose = np.asarray(obj.rest_poses[0], float)
-    paint = np.where(obj.non_graspable_points[:, None], AVOID, GRASPABLE)
-    return object_shape((obj.visual_vertices, obj.visual_faces), pose[:3], pose[3:], (obj.points, paint))
+    paint = region_colours(obj.points, obj.non_graspable_points)
+    return object_shape((obj.visual_vertices, obj.visual_faces), pose[:3], pose[3:], paint)
 
 
 _HEADINGS, _PATHS = 14, 4
@@ -169,15 +168,15 @@ class _Placed:
     def body(self) -> Shape:
         """The object with its painted regions."""
         mesh = self.arrays["visual/vertices"], self.arrays["visual/faces"]
-        paint = self.arrays["surface/points"], np.where(self.arrays["surface/avoid"][:, None], AVOID, GRASPABLE)
+        paint = region_colours(self.arrays["surface/points"], self.arrays["surface/avoid"])
         return object_shape(mesh, self.position, self.arrays["rest"][self.rest][3:], paint)
 
 
 def constraint_sheet(constraints: Message, rest: int = 0, seed: int = 0) -> np.ndarray:
-    """Six pictures of the object in one of its resting poses, with some of its constraints drawn by the seed.
+    """Six pictures of the object in one of its resting poses, with a random sample of its constraints.
 
-    Approach arrows end before the surface, two centimetres short of the heading positions;
-    the graspable region is green, and the avoid region red.
+    Heading arrows end before the surface, two centimetres short of the heading positions. The graspable region is
+    green, the avoid region red.
 
     Returns:
       (H, W, 3) uint8.
@@ -261,17 +260,19 @@ def import_sheet(
         )
     ]
     if avoid is not None:
-        colours = np.round(255 * np.where(avoid[:, None], AVOID, GRASPABLE)).astype(np.uint8)
-        regions = Colours(rest.apply(obj.points), colours)
         label = "the affordance: green may be grasped, red must not be touched"
-        parts[label] = [Body(rest.apply(obj.visual_vertices), obj.visual_faces, OBJECT, regions)]
+        parts[label] = [
+            Body(
+                rest.apply(obj.visual_vertices), obj.visual_faces, OBJECT, region_colours(rest.apply(obj.points), avoid)
+            )
+        ]
     pieces = enumerate(map(tessellate, obj.pieces))
     count = len(obj.pieces)
     parts[f"its {f'{count} convex pieces' if count > 1 else 'convex piece'}, which physics uses"] = [
         Body(rest.apply(vertices), faces, PIECES[i % len(PIECES)]) for i, (vertices, faces) in pieces
     ]
     images = [render_fitted(_beside(hand, bodies), _CORNER, _PANEL) for bodies in parts.values()]
-    title = f"{obj.name} beside the {hand.name} hand at true scale"
+    title = f"{obj.name} and the {hand.name} hand at true scale"
     return contact_sheet(images, list(parts), columns=len(parts), title="  |  ".join([title, *obj.notes]))
 
 
@@ -294,7 +295,7 @@ def _beside(hand: Hand, bodies: list[Body]) -> list[Shape]:
             (body.vertices - middle, body.faces),
             np.zeros(3),
             np.array([1.0, 0.0, 0.0, 0.0]),
-            body.own and (body.own.points - middle, body.own.values / 255),
+            body.own and body.own._replace(points=body.own.points - middle),
             body.colour,
         )
         for body in bodies

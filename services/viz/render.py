@@ -37,7 +37,7 @@ def film_of(size: str, fps: float, overlays: bool) -> Film:
     """Style of a video, from its size as WIDTHxHEIGHT, both even and from 64 to 4096 pixels.
 
     Raises:
-      CongraspError: the size is no such text, or a package for videos is missing.
+      CongraspError: the size is malformed, or a package for videos is missing.
     """
     need_package("--video", "imageio_ffmpeg")
     numbers = size.lower().split("x")

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.skin import MATERIALS, Skin, skin_of
 from congrasp.common.hands.spec import Hand, capsule_ends
+from congrasp.common.objects.spec import Colours
 from congrasp.services.record.episode import MovedArm
 from congrasp.services.record.palette import MATERIALS as MATERIAL_COLOURS
 from congrasp.services.record.palette import OBJECT, SKIN, TABLE, Colour
@@ -35,9 +36,9 @@ class Shape:
 
     `size` is a radius and a half length along z, zeros for a mesh; `position` (3,) and `quaternion` (4,) are in the
     world frame. `colour` is sRGB in [0, 1]. With `alpha` below one the shape is transparent, and casts no `shadow`.
-    `vertices` (V, 3) and `faces` (F, 3) belong to a mesh. With `paint_points` (N, 3), in the shape's frame, and
-    `paint_colours` (N, 3), each point of a mesh takes the colours of the nearest paint points. With `normals` (V, 3)
-    and `colours` (V, 3), the mesh is drawn unchanged: it must be closed, wound outwards, and fine enough.
+    `vertices` (V, 3) and `faces` (F, 3) belong to a mesh. With `paint`, in the shape's frame, each point of a mesh has
+    the mean colour of the nearest paint points. With `normals` (V, 3) and `colours` (V, 3), the mesh is drawn
+    unchanged: it must be closed, wound outwards, and fine enough.
     """
 
     kind: Kind
@@ -50,8 +51,7 @@ class Shape:
     shadow: bool = True
     vertices: np.ndarray | None = None
     faces: np.ndarray | None = None
-    paint_points: np.ndarray | None = None
-    paint_colours: np.ndarray | None = None
+    paint: Colours | None = None
     normals: np.ndarray | None = None
     colours: np.ndarray | None = None
 
@@ -176,7 +176,7 @@ def object_shape(
     mesh: tuple[np.ndarray, np.ndarray],
     position: np.ndarray,
     quaternion: np.ndarray,
-    paint: tuple[np.ndarray, np.ndarray] | None = None,
+    paint: Colours | None = None,
     colour: Colour = OBJECT,
 ) -> Shape:
     """An object.
@@ -185,10 +185,9 @@ def object_shape(
       mesh: (V, 3) and (F, 3) in its frame.
       position: (3,) m, world.
       quaternion: (4,) from its frame to the world.
-      paint: points (P, 3) in its frame, and the colours (P, 3) of the surface there, in [0, 1]; optional.
+      paint: colours of its surface, in its frame; optional.
       colour: colour without paint.
     """
-    points, colours = paint or (None, None)
     return Shape(
         "mesh",
         (0, 0),
@@ -197,8 +196,7 @@ def object_shape(
         np.asarray(quaternion, float),
         vertices=mesh[0],
         faces=mesh[1],
-        paint_points=points,
-        paint_colours=colours,
+        paint=paint,
     )
 
 

@@ -49,7 +49,7 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
 
 
 def stacked(sheets: Sequence[np.ndarray]) -> np.ndarray:
-    """Sheets (H, W, 3) under one another, as wide as the widest."""
+    """Sheets (H, W, 3) stacked vertically, as wide as the widest one."""
     width = max(sheet.shape[1] for sheet in sheets)
     wide = [np.full((len(sheet), width, 3), _PAPER, np.uint8) for sheet in sheets]
     for whole, sheet in zip(wide, sheets, strict=True):
@@ -74,7 +74,7 @@ def png_of(image: np.ndarray) -> bytes:
 
 
 def save_png(path: pathlib.Path, image: np.ndarray) -> None:
-    """Writes (H, W, 3) uint8 as PNG, atomically; a CongraspError names a path that cannot be written."""
+    """Writes (H, W, 3) uint8 as PNG, atomically; raises a CongraspError if the path cannot be written."""
     write_atomically(path, png_of(image))
 
 

@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.objects.spec import Colours
+from congrasp.services.record.palette import bisected, colours_at
 from congrasp.services.viz.kernels import GAMMA
 from congrasp.services.viz.shapes import Shape
 
@@ -81,8 +82,8 @@ def _triangles(shape: Shape, fine: bool) -> Triangles:
         surface = _mesh(
             _content(shape.vertices, float),
             _content(shape.faces, int),
-            _content(shape.paint_points, float),
-            _content(shape.paint_colours, float),
+            _content(shape.paint and shape.paint.points, float),
+            _content(shape.paint and shape.paint.values, np.uint8),
             fine,
         )
     else:
@@ -107,7 +108,7 @@ def _content(array: np.ndarray | None, kind: type) -> bytes:
 
 
 @functools.lru_cache(maxsize=64)
-def _mesh(vertices: bytes, faces: bytes, paint_points: bytes, paint_colours: bytes, fine: bool) -> _Surface:
+def _mesh(vertices: bytes, faces: bytes, paint_points: bytes, paint_values: bytes, fine: bool) -> _Surface:
     """A mesh; cached by the content of its arrays, so that a mesh that moves between pictures is refined once."""
     corners, triples = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, int).reshape(-1, 3)
     closed = bool(trimesh.Trimesh(corners, triples).is_volume)
@@ -115,8 +116,8 @@ def _mesh(vertices: bytes, faces: bytes, paint_points: bytes, paint_colours: byt
     surface = _surface(*smooth_corners(corners, triples), closed, size)
     if not paint_points:
         return surface
-    points, colours = (np.frombuffer(paint).reshape(-1, 3) for paint in (paint_points, paint_colours))
-    return surface._replace(paint=_linear(_painted(cKDTree(points), colours, surface.points)))
+    paint = Colours(np.frombuffer(paint_points).reshape(-1, 3), np.frombuffer(paint_values, np.uint8).reshape(-1, 3))
+    return surface._replace(paint=_linear(colours_at(surface.points, paint) / 255))
 
 
 @functools.lru_cache(maxsize=256)
@@ -199,25 +200,8 @@ def cut(corners: np.ndarray, normals: np.ndarray, side: float, most: int) -> tup
     """
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum() / 2
     longest = max(side, 3 * float(np.sqrt(area / most)))
-    rest, small = np.concatenate([corners, normals], -1), []
-    while len(rest):
-        sides = np.linalg.norm(rest[:, [1, 2, 0], :3] - rest[..., :3], axis=-1)
-        long = sides.max(1) > longest
-        small.append(rest[~long])
-        first = (sides[long].argmax(1)[:, None] + np.arange(3)) % 3
-        a, b, c = np.take_along_axis(rest[long], first[..., None], 1).swapaxes(0, 1)
-        middle = (a + b) / 2
-        rest = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
-    corners, normals = np.split(np.concatenate(small), 2, -1)
+    corners, normals = np.split(bisected(np.concatenate([corners, normals], -1), longest), 2, -1)
     return corners, normals
-
-
-def _painted(tree: cKDTree, colours: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n, 3) colours of the nearest paint points, with a soft border."""
-    distance, near = tree.query(points, k=min(4, len(colours)))
-    distance, near = distance.reshape(len(points), -1), near.reshape(len(points), -1)
-    weight = 1 / (distance**2 + 1e-8) ** 2
-    return (weight[..., None] * colours[near]).sum(1) / weight.sum(1, keepdims=True)
 
 
 def _linear(colour: np.ndarray) -> np.ndarray:

@@ -11,10 +11,11 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import MATERIALS, skin_of
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints.base import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.episode import markers
-from congrasp.services.record.palette import AVOID, GRASPABLE, HEADING, WAYPOINT
+from congrasp.services.record.palette import HEADING, WAYPOINT, region_colours
 from congrasp.services.viz.raster import visible
 from congrasp.services.viz.shapes import (
     Camera,
@@ -61,9 +62,9 @@ def _object(episode: Message, step: int, *, painted: bool = True) -> Shape:
     avoid = np.asarray(arrays["surface_avoid"], bool)
     paint = None
     if painted and avoid.any() and any(isinstance(marker, Paint) for _, marker in markers(arrays)):
-        paint = arrays["surface_points"], np.where(avoid[:, None], AVOID, GRASPABLE)
+        paint = region_colours(arrays["surface_points"], avoid)
     elif "colour_values" in arrays:
-        paint = arrays["colour_points"], arrays["colour_values"] / 255
+        paint = Colours(arrays["colour_points"], arrays["colour_values"])
     mesh = arrays["visual_vertices"], arrays["visual_faces"]
     return object_shape(mesh, arrays["object_position"][step], arrays["object_quaternion"][step], paint)
 

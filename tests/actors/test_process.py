@@ -32,8 +32,8 @@ from congrasp.common.wire.codec import encode
 from congrasp.common.wire.messages import EPISODE, PRIVILEGED, RECORDED, validate
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.algorithms.protocol import rollout_form
-from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
+from tests.rollouts import learner_hub
 
 T, B = 5, 3
 CONFIG = RunConfig(
@@ -123,8 +123,8 @@ def heard(monkeypatch):
         broker, stop = MemoryHub(), threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
             logs = server.subscribe(Keys("t").logs, depth=100)
-            hub = LearnerHub(
-                server, run="t", config_json=to_json(config), run_id="e", schema=SPEC.schema, form=FORM,
+            hub, rollouts = learner_hub(
+                server, "t", config_json=to_json(config), schema=SPEC.schema, form=FORM,
                 staleness=StalenessManager(0, 1),
             )  # fmt: skip
             algorithm = make_algorithm(SPEC, CONFIG)
@@ -137,7 +137,7 @@ def heard(monkeypatch):
                 kwargs={"run": "t", "actor": "a", "stop": stop, "physics": "native", "patience": 5.0},
             )
             actor.start()
-            batch = hub.next_batch(1, 30.0)
+            batch = rollouts.next_batch(1, 30.0)
             stop.set()
             actor.join(30.0)
             received = list(iter(lambda: logs.receive(0.0), None))

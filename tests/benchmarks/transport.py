@@ -31,11 +31,10 @@ from congrasp.common.transport.ports import free_port, local_url
 from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.hub.admission import Admission, Ranges
-from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
-from tests.rollouts import SCHEMA, bundle, learner_hub
+from tests.rollouts import SCHEMA, Learner, bundle, learner_hub
 
 _FORM = RolloutForm(steps=20, worlds=340, observation=534, action=26, half=True)
 """Of the human hand's rollouts; these have 8.0 MB."""
@@ -94,7 +93,7 @@ def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]
     Versions that an actor never held, since a newer one was there, count from their own publication as well.
     """
     parameters = int(megabytes * 250_000)
-    with tempfile.TemporaryDirectory() as name, _learner(folder := pathlib.Path(name)) as (hub, endpoint):
+    with tempfile.TemporaryDirectory() as name, _learner(folder := pathlib.Path(name)) as ((hub, _), endpoint):
         published: list[float] = []
 
         def publish() -> None:
@@ -122,12 +121,12 @@ def measure_weights(actors: int, versions: int, megabytes: float) -> list[float]
 
 
 @contextlib.contextmanager
-def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tuple[LearnerHub, str]]:
+def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tuple[Learner, str]]:
     """A learner's hub without a learner, and where it listens."""
     endpoint = local_url()
     ranges = Ranges(np.full(_FORM.observation, 100.0), 100.0, 100.0, {})
     with urls.listen(endpoint, "learner") as transport:
-        hub = learner_hub(
+        made = learner_hub(
             transport,
             _RUN,
             form=_FORM,
@@ -136,8 +135,8 @@ def _learner(folder: pathlib.Path, *, write_ahead: bool = False) -> Iterator[tup
             log=WriteAheadLog(folder / FOLDER, 1, write=write_ahead),
             admission=Admission(lambda: ranges),
         )
-        yield hub, endpoint
-        hub.close()
+        yield made, endpoint
+        made.rollouts.close()
 
 
 def _rollout() -> Message:
@@ -152,21 +151,21 @@ def _through_the_hub(senders: int, seconds: float, *, write_ahead: bool = False)
     size = len(encode(_rollout()))
     with (
         tempfile.TemporaryDirectory() as name,
-        _learner(folder := pathlib.Path(name), write_ahead=write_ahead) as (hub, endpoint),
+        _learner(folder := pathlib.Path(name), write_ahead=write_ahead) as ((hub, rollouts), endpoint),
     ):
         hub.publish_weights(bundle(0, form=_FORM), 0)
         version = 0
 
         def receive() -> int:
             nonlocal version
-            batch = hub.next_batch(_BATCH, 0.5)
+            batch = rollouts.next_batch(_BATCH, 0.5)
             if batch is None:
                 return 0
             version += 1
             hub.publish_weights(bundle(version, form=_FORM), version)
             if write_ahead:
-                hub.durable()
-                hub.note_saved()
+                rollouts.durable()
+                rollouts.note_saved()
             return size * len(batch)
 
         with _processes(senders, _upload, endpoint, folder):

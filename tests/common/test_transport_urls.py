@@ -145,15 +145,15 @@ def in_process(url):
 def test_a_rollout_reaches_the_learner_over_any_transport(scheme, start, tmp_path):
     url = {"memory": f"memory/{tmp_path}", "socket": f"socket/{tmp_path}/s", "tcp": local_url()}[scheme]
     with urls.listen(url, "learner") as transport:
-        hub = learner_hub(transport, "test")
+        hub, rollouts = learner_hub(transport, "test")
         hub.publish_weights(bundle(0), 0)
         actor = start(url)
-        (message,) = eventually(lambda: hub.next_batch(1, 0.5))
+        (message,) = eventually(lambda: rollouts.next_batch(1, 0.5))
         assert (message.arrays["reward"] == 3.0).all() and message.meta["actor"] == "a"
         assert hub.status()["counters"]["accepted"] == 1
         actor.join(10)
         assert not actor.is_alive() and getattr(actor, "exitcode", 0) == 0
-        hub.close()
+        rollouts.close()
 
 
 TAKER = """

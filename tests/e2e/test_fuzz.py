@@ -200,18 +200,24 @@ def served(endpoint, folder):
     ranges = Ranges(np.full(32, 1.0), 10.0, 100.0, {"episode/success": (0.0, 1.0)})
     with ZenohTransport(listen=[endpoint]) as transport:
         staleness = StalenessManager(1, 2, ticket_seconds=1.0)
-        hub = learner_hub(transport, "chaos", form=FORM, staleness=staleness, admission=Admission(lambda: ranges))
+        hub, rollouts = learner_hub(
+            transport, "chaos", form=FORM, staleness=staleness, admission=Admission(lambda: ranges)
+        )
         hub.publish_weights(bundle(0), 0)
         transport.serve(KEYS.act, act, workers=2, depth=64)
         transport.serve(KEYS.health, lambda key, request: Message(meta={"ready": True}))
         with Recorder(transport, "chaos", folder, warn=lambda text: None) as recorder:
-            yield hub, recorder
+            yield hub, rollouts, recorder
 
 
 def test_mutated_messages_at_every_key(tmp_path):
     rng, endpoint = random.Random(SEED), f"tcp/127.0.0.1:{free_port()}"
     asked, told = requests()
-    with no_tracebacks(), served(endpoint, tmp_path) as (hub, recorder), ZenohTransport(connect=[endpoint]) as raw:
+    with (
+        no_tracebacks(),
+        served(endpoint, tmp_path) as (hub, rollouts, recorder),
+        ZenohTransport(connect=[endpoint]) as raw,
+    ):
         began, first, sent = time.monotonic(), 0, 0
         while (now := time.monotonic()) < began + SECONDS:
             key, message = rng.choice(asked if rng.random() < 0.7 else told)
@@ -239,7 +245,7 @@ def test_mutated_messages_at_every_key(tmp_path):
                 next(tmp_path.glob("*.mcap")).unlink()
         assert memory() - first < GROWTH, f"grew by {(memory() - first) >> 20} MiB in {sent} messages"
         # An honest one is served as ever.
-        hub.next_batch(2, 0.0)
+        rollouts.next_batch(2, 0.0)
         hub.publish_weights(bundle(1), 1)
         fine = Message(meta={"actor": "77777.a", "incarnation": "1", "ticket": "t"})
         assert raw.query(KEYS.ticket("77777.a"), fine, timeout=10.0).meta["version"] == 1

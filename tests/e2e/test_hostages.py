@@ -37,22 +37,21 @@ def learner(parameters):
     """A hub with weights of so many float32."""
     endpoint = local_url()
     with urls.listen(endpoint, "learner") as transport:
-        hub = learner_hub(transport, "r")
-        hub.publish = lambda version: hub.publish_weights(bundle(version, parameters=parameters), version)
-        hub.publish(0)
-        yield endpoint, hub
+        run = learner_hub(transport, "r")
+        run.hub.publish_weights(bundle(0, parameters=parameters), 0)
+        yield endpoint, run
 
 
-def _updates(link, hub, count):
+def _updates(link, run, parameters, count):
     """So many updates of two rollouts each, with the weights of each pulled in full."""
-    version = hub._staleness.version
+    version = run.rollouts.staleness.version
     for _ in range(count):
         for _ in range(2):
             ticket = link.acquire_ticket(20)
             assert link.upload(rollout(version=version), ticket).result(20) == "accepted"
-        assert hub.next_batch(2, 5)
+        assert run.rollouts.next_batch(2, 5)
         version += 1
-        hub.publish(version)
+        run.hub.publish_weights(bundle(version, parameters=parameters), version)
         deadline = time.monotonic() + 20
         while (pulled := link.weights(version - 1)) is None or pulled.meta["version"] != version:
             assert time.monotonic() < deadline, "the weights did not come"
@@ -77,14 +76,14 @@ def test_two_who_leave_their_answers_unread_hold_nobody_up(tmp_path):
 
 def test_peers_that_ask_for_weights_without_end_are_put_off():
     with (
-        learner(900_000) as (endpoint, hub),
+        learner(900_000) as (endpoint, run),
         urls.connect(endpoint, "actor") as transport,
         ActorLink(transport, "r", "a", request_timeout=20.0) as link,
         attacked("greedy", endpoint, "r", count=3),
     ):
         link.config(10)
-        _updates(link, hub, 20)
-        assert hub._pull_limit.rejected > 0
+        _updates(link, run, 900_000, 20)
+        assert run.hub._pull_limit.rejected > 0
 
 
 def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
@@ -97,7 +96,7 @@ def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
             pulled.append(link.weights(-1))
 
     with (
-        learner(225_000) as (endpoint, hub),
+        learner(225_000) as (endpoint, run),
         throttled(endpoint, 300e3) as slow,
         urls.connect(endpoint, "actor") as transport,
         ActorLink(transport, "r", "a", request_timeout=20.0) as link,
@@ -106,7 +105,7 @@ def test_an_actor_on_a_slow_link_gets_its_weights_and_holds_no_other_up():
         thread = threading.Thread(target=pull, args=(slow,))
         thread.start()
         for _ in range(15):
-            _updates(link, hub, 1)
+            _updates(link, run, 225_000, 1)
             time.sleep(0.05)
         thread.join(60)
     (weights,) = pulled

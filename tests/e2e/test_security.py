@@ -21,6 +21,7 @@ from congrasp.common.transport.security import RIGHTS, Credentials
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, encode
 from congrasp.learner.hub.hub import LearnerHub
+from congrasp.learner.hub.queue import RolloutQueue
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.certificates import create_authority, issue, revoke
 from tests.rollouts import bundle, learner_hub, rollout
@@ -59,6 +60,7 @@ class Run:
     endpoint: str
     policy: str
     hub: LearnerHub
+    rollouts: RolloutQueue
     transport: ZenohTransport
     stack: contextlib.ExitStack
 
@@ -77,12 +79,12 @@ def listening(certs):
     with contextlib.ExitStack() as stack:
         learner, server = (Credentials(certs / f"{role}.0", role) for role in ("learner", "server"))
         transport = stack.enter_context(ZenohTransport(listen=[endpoint], credentials=learner, revocation_seconds=0.1))
-        hub = learner_hub(transport, "safe")
+        hub, rollouts = learner_hub(transport, "safe")
         hub.publish_weights(bundle(0), 0)
         serving = stack.enter_context(ZenohTransport(listen=[policy], credentials=server, flows=("policy",)))
         for key in (below(KEYS.act), KEYS.health):
             serving.serve(key, lambda key, request: Message(meta={"ready": True, "served": key}))
-        yield Run(certs, endpoint, policy, hub, transport, stack)
+        yield Run(certs, endpoint, policy, hub, rollouts, transport, stack)
 
 
 @pytest.fixture
@@ -135,7 +137,7 @@ def test_with_the_right_certificates_a_run_works_from_end_to_end(fresh):
         for _ in range(2):
             ticket = link.acquire_ticket(5)
             assert link.upload(rollout(), ticket).result(10) == "accepted"
-        assert len(fresh.hub.next_batch(2, 5)) == 2
+        assert len(fresh.rollouts.next_batch(2, 5)) == 2
         fresh.hub.publish_weights(bundle(1), 1)
         # The announcement arrives by itself: without one, a link that holds the newest version asks for nothing.
         eventually(lambda: (new := link.weights(0)) and new.meta["version"] == 1)
@@ -255,7 +257,7 @@ def test_actors_do_not_speak_for_or_listen_to_one_another(fresh):
         actor.declare_alive(KEYS.alive(role, name, "66"))
     roles = eventually(lambda: (roles := fresh.hub.status()["roles"]) and len(roles) >= 3 and roles)
     assert {(role["role"], role["id"], role["incarnation"]) for role in roles} == {
-        ("learner", "0", fresh.hub.session_id),
+        ("learner", "0", fresh.rollouts.session_id),
         ("actor", OTHER, "01"),
         ("actor", ME, "66"),
     }

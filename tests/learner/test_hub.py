@@ -18,8 +18,8 @@ from congrasp.common.wire.codec import Message, encode
 from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.hub import hub
 from congrasp.learner.hub.admission import Admission, Ranges
-from congrasp.learner.hub.deduplication import Sequences
 from congrasp.learner.hub.limits import RateLimit
+from congrasp.learner.hub.queue import Sequences
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.write_ahead import PART, WriteAheadLog
 from tests import rollouts
@@ -46,7 +46,9 @@ class Bench:
         shared = MemoryHub()
         self.server, self.peer = MemoryTransport(shared), MemoryTransport(shared)
         self.staleness = StalenessManager(max_staleness, batch)
-        self.hub = rollouts.learner_hub(self.server, "test", form=FORM, staleness=self.staleness, **options)
+        self.hub, self.rollouts = rollouts.learner_hub(
+            self.server, "test", form=FORM, staleness=self.staleness, **options
+        )
         if version is not None:
             self.hub.publish_weights(bundle(version), version)
 
@@ -101,7 +103,7 @@ def test_nothing_is_granted_or_taken_before_the_first_weights(bench):
 def test_tickets_run_out_and_return(bench):
     b = bench(version=0, max_staleness=0, batch=1)
     assert b.ticket("t")["granted"] and b.ticket("t")["granted"]
-    assert b.hub._sequences.of(("a", "01")).granted == 1
+    assert b.rollouts._sequences.of(("a", "01")).granted == 1
     assert not b.ticket("u")["granted"]
     b.ticket("t", give_back=True)
     assert b.ticket("u")["granted"]
@@ -135,14 +137,14 @@ def _roles(b):
 
 def test_batches_come_in_order_and_wait(bench):
     b = bench(version=0)
-    assert b.hub.next_batch(2, 0.05) is None
+    assert b.rollouts.next_batch(2, 0.05) is None
     assert b.send(0)["outcome"] == b.send(1)["outcome"] == b.send(2)["outcome"] == "accepted"
-    batch = b.hub.next_batch(2, 1)
+    batch = b.rollouts.next_batch(2, 1)
     assert sequences(batch) == [0, 1]
     np.testing.assert_array_equal(batch[1].arrays["reward"], np.ones((T, B), np.float32))
-    assert b.hub.next_batch(2, 0.05) is None
+    assert b.rollouts.next_batch(2, 0.05) is None
     threading.Timer(0.1, b.send, [3]).start()
-    assert sequences(b.hub.next_batch(2, 10)) == [2, 3]
+    assert sequences(b.rollouts.next_batch(2, 10)) == [2, 3]
     assert b.ledger() | {"capacity": 0} == {
         "granted": 0, "redeemed": 0, "returned": 0, "expired": 0, "accepted": 4, "consumed": 4, "dropped": 0,
         "stale": 0, "duplicate": 0, "damaged": 0, "undone": 0, "running": 0, "queued": 0, "capacity": 0, "missing": 0,
@@ -155,10 +157,10 @@ def test_full_learner_says_when_to_come_again(bench):
     assert [b.send(i)["outcome"] for i in range(2)] == ["accepted"] * 2
     reply = b.send(2)
     assert reply["outcome"] == "retry" and reply["retry_after"] > 0
-    assert b.hub.next_batch(1, 1)
+    assert b.rollouts.next_batch(1, 1)
     b.hub.publish_weights(bundle(1), 1)
     assert b.send(2)["outcome"] == "accepted"
-    limited = bench(version=0, batch=10, queue_limit=1)
+    limited = bench(version=0, batch=10, limit=1)
     assert [limited.send(i)["outcome"] for i in range(2)] == ["accepted", "retry"]
 
 
@@ -175,7 +177,7 @@ def test_too_old_is_refused_on_arrival_and_dropped_in_the_queue(bench):
     assert b.send(3, version=3)["outcome"] == "stale"
     assert b.send(4, run_id="other")["outcome"] == "stale"
     b.send(5, version=2)
-    assert sequences(b.hub.next_batch(2, 1)) == [1, 5]
+    assert sequences(b.rollouts.next_batch(2, 1)) == [1, 5]
     texts = [events.receive(60)[1].meta["text"] for _ in range(2)]
     assert "refused" in texts[0] and texts[1] == "Dropped as too old at version 2: 1 of a."
     ledger = b.ledger()
@@ -298,7 +300,7 @@ def test_weights_are_pulled_by_version(bench):
     notices = b.peer.subscribe(KEYS.announcement, depth=4)
     b.hub.publish_weights(bundle(0), 0)
     assert notices.receive(60)[1].meta == {
-        "version": 0, "run_id": "e", "session_id": b.hub.session_id, "finished": False,
+        "version": 0, "run_id": "e", "session_id": b.rollouts.session_id, "finished": False,
     }  # fmt: skip
     pulled = b.peer.query(KEYS.weights, Message(meta={"newer_than": -1}), timeout=60)
     assert pulled.meta == bundle(0).meta and pulled.arrays["actor/w"][0] == 0
@@ -358,15 +360,15 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
     b = bench(version=3, batch=3)
     for i in range(5):
         assert b.send(i, version=3)["outcome"] == "accepted"
-    assert sequences(b.hub.next_batch(3, 1)) == [0, 1, 2]  # 3 and 4 wait
+    assert sequences(b.rollouts.next_batch(3, 1)) == [0, 1, 2]  # 3 and 4 wait
     b.hub.publish_weights(bundle(4), 4)
-    durable = b.hub.durable()
+    durable = b.rollouts.durable()
     assert b.send(5, version=4)["outcome"] == "accepted"  # and then the learner is killed
 
     resumed = bench(batch=3, durable=durable)
     assert resumed.send(2, version=4)["outcome"] == "retry"  # its weights are not there yet
     resumed.hub.publish_weights(bundle(4), 4)
-    assert resumed.hub.session_id != b.hub.session_id
+    assert resumed.rollouts.session_id != b.rollouts.session_id
     assert resumed.ledger()["accepted"] == resumed.ledger()["consumed"] == 3
     assert resumed.send(2, version=3)["outcome"] == "duplicate"
     # The actor goes on where it was: 3, 4 and 5 were acknowledged, and are gone with the killed learner.
@@ -375,7 +377,7 @@ def test_resumed_hub_knows_what_was_learnt_and_counts_what_was_undone(bench):
     assert resumed.send(6, version=4)["outcome"] == "duplicate"
     ledger = resumed.ledger()
     assert (ledger["accepted"], ledger["consumed"], ledger["queued"], ledger["missing"]) == (5, 3, 2, 3)
-    again = bench(version=5, batch=3, durable=resumed.hub.durable())
+    again = bench(version=5, batch=3, durable=resumed.rollouts.durable())
     assert again.send(8, version=5)["outcome"] == "accepted"
     assert again.ledger()["missing"] == 5 and again.ledger()["accepted"] == 4  # 6 and 7 were waiting as well
     with pytest.raises(CongraspError, match="run id e, not f"):
@@ -413,7 +415,7 @@ def test_made_up_sequence_numbers_do_not_blow_up_what_is_missing(bench):
         assert b.send(sequence, version=7)["outcome"] == "stale"  # of a version that there will be
     assert b.ledger()["missing"] <= 64 + 71  # what may overtake, and tickets
     assert b.send(made_up[-1], version=0)["outcome"] == "stale"  # still
-    resumed = bench(batch=100, durable=b.hub.durable())  # whose size is bounded though sequence 0 waits
+    resumed = bench(batch=100, durable=b.rollouts.durable())  # whose size is bounded though sequence 0 waits
     assert resumed.ledger()["missing"] <= 2 * 64 + 71
 
 
@@ -421,10 +423,10 @@ def test_what_a_killed_learner_decided_after_its_checkpoint_is_missing(bench):
     b = bench(version=5, batch=2)
     assert b.send(0, version=0)["outcome"] == "stale"
     assert b.send(2, version=5)["outcome"] == b.send(3, version=5)["outcome"] == "accepted"
-    assert sequences(b.hub.next_batch(2, 1)) == [2, 3]
+    assert sequences(b.rollouts.next_batch(2, 1)) == [2, 3]
     b.hub.publish_weights(bundle(6), 6)
     assert b.ledger()["missing"] == 1
-    durable = b.hub.durable()
+    durable = b.rollouts.durable()
     assert b.send(1, version=6)["outcome"] == "accepted"  # overtaken by 2 and 3, and lost with this learner
     assert b.ledger()["missing"] == 0
     resumed = bench(version=6, batch=2, durable=durable)
@@ -451,24 +453,24 @@ def on_disk(log):
 
 
 def test_a_resumed_learner_takes_up_what_was_accepted_and_uses_the_oldest_first(bench, log):
-    b = bench(version=3, batch=2, log=log(), durable={**bench().hub.durable(), "version": 3})
+    b = bench(version=3, batch=2, log=log(), durable={**bench().rollouts.durable(), "version": 3})
     for i, version in enumerate((3, 2, 3, 2)):
         assert b.send(i, version=version)["outcome"] == "accepted"
-        assert on_disk(b.hub._log) == list(range(i + 1))  # before it is acknowledged
-    assert sequences(b.hub.next_batch(2, 1)) == [1, 3]
+        assert on_disk(b.rollouts._log) == list(range(i + 1))  # before it is acknowledged
+    assert sequences(b.rollouts.next_batch(2, 1)) == [1, 3]
     b.hub.publish_weights(bundle(4), 4)
     assert b.send(4, version=4)["outcome"] == "accepted"
     b.hub.publish_weights(bundle(5), 5)
     assert b.send(5, version=5)["outcome"] == "accepted"  # two versions from the checkpoint: of no use to a resume
-    assert on_disk(b.hub._log) == [0, 1, 2, 3, 4]
+    assert on_disk(b.rollouts._log) == [0, 1, 2, 3, 4]
 
-    resumed = bench(batch=2, log=log(), durable={**bench().hub.durable(), "version": 3})
+    resumed = bench(batch=2, log=log(), durable={**bench().rollouts.durable(), "version": 3})
     resumed.hub.publish_weights(bundle(7), 7)  # which is 3 under another number
     assert resumed.ledger()["queued"] == 5 and not resumed.ticket()["granted"]
     assert resumed.send(1, version=2)["outcome"] == "duplicate"
     batches = []
     for version in (8, 9, 10):
-        batches.append(sequences(resumed.hub.next_batch(2, 5 if version < 10 else 0.05) or []))
+        batches.append(sequences(resumed.rollouts.next_batch(2, 5 if version < 10 else 0.05) or []))
         resumed.hub.publish_weights(bundle(version), version)
     assert batches == [[1, 3], [0, 2], []]  # of 2 and 4, one update away from 3, only one batch could be used
     assert resumed.ledger()["dropped"] == 1 and resumed.ticket()["granted"]
@@ -478,22 +480,22 @@ def test_the_log_keeps_what_waits_at_a_checkpoint_and_nothing_else(bench, log):
     b = bench(version=5, batch=2, log=log())
     for i in range(3):
         assert b.send(i, version=5)["outcome"] == "accepted"
-    assert on_disk(b.hub._log) == []  # there is no checkpoint from which these would be fresh
-    assert sequences(b.hub.next_batch(2, 1)) == [0, 1]
+    assert on_disk(b.rollouts._log) == []  # there is no checkpoint from which these would be fresh
+    assert sequences(b.rollouts.next_batch(2, 1)) == [0, 1]
     b.hub.publish_weights(bundle(6), 6)
-    durable = b.hub.durable()
-    assert on_disk(b.hub._log) == [2]
+    durable = b.rollouts.durable()
+    assert on_disk(b.rollouts._log) == [2]
     assert b.send(3, version=6)["outcome"] == "accepted"  # while the checkpoint is written
-    b.hub.note_saved()
-    assert on_disk(b.hub._log) == [2, 3]
+    b.rollouts.note_saved()
+    assert on_disk(b.rollouts._log) == [2, 3]
 
     resumed = bench(version=6, batch=2, log=log(), durable=durable)
-    assert sequences(resumed.hub.next_batch(2, 1)) == [2, 3]
+    assert sequences(resumed.rollouts.next_batch(2, 1)) == [2, 3]
     resumed.hub.publish_weights(bundle(7), 7)
-    resumed.hub.durable()
-    assert on_disk(resumed.hub._log) == [2, 3]  # the checkpoint might yet fail
-    resumed.hub.note_saved()
-    assert on_disk(resumed.hub._log) == []
+    resumed.rollouts.durable()
+    assert on_disk(resumed.rollouts._log) == [2, 3]  # the checkpoint might yet fail
+    resumed.rollouts.note_saved()
+    assert on_disk(resumed.rollouts._log) == []
 
 
 def test_nothing_is_acknowledged_before_it_is_written(bench, log):
@@ -511,7 +513,7 @@ def test_nothing_is_acknowledged_before_it_is_written(bench, log):
     written.set()
     first.join(60)
     assert answers == ["accepted"] and b.send(0)["outcome"] == "duplicate" and on_disk(slow) == [0]
-    slow.add = lambda header, message: b.hub.close()  # the disk refuses it, and the learner stops
+    slow.add = lambda header, message: b.rollouts.close()  # the disk refuses it, and the learner stops
     assert b.send(1)["outcome"] == "retry"
 
 
@@ -519,8 +521,8 @@ def test_a_batch_that_nothing_can_be_learnt_from_is_not_taken_up_again(bench, lo
     b = bench(version=0, log=log())
     for i in range(3):
         b.send(i)
-    b.hub.discard(b.hub.next_batch(2, 1))
-    assert on_disk(b.hub._log) == [2]
+    b.rollouts.discard(b.rollouts.next_batch(2, 1))
+    assert on_disk(b.rollouts._log) == [2]
 
 
 def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
@@ -528,7 +530,7 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     b = bench(version=0, log=log())
     for i in range(4):
         assert b.send(i)["outcome"] == "accepted"
-    folder = b.hub._log._folder
+    folder = b.rollouts._log._folder
     damaged, renamed = sorted(folder.iterdir())[1:3]
     damaged.write_bytes(damaged.read_bytes()[:-3] + b"xyz")
     renamed.rename(folder / renamed.name.replace("~2.", "~9."))
@@ -536,13 +538,13 @@ def test_a_resume_tells_damaged_torn_and_strange_files_apart(bench, log):
     os.mkfifo(folder / "000000000008~a~01~7.safetensors")  # which would keep a reader waiting for ever
     (folder / "notes.txt").write_text("not ours")
     resumed = bench(version=1, log=log(), on_event=lambda *event: said.append(event))
-    assert sequences(resumed.hub.next_batch(2, 1)) == [0, 3]
+    assert sequences(resumed.rollouts.next_batch(2, 1)) == [0, 3]
     assert ("error", "3 accepted rollouts are damaged on disk and were ignored.") in said
     kinds = sorted(path.suffix for path in folder.iterdir())
     assert kinds == [".aside", ".aside", ".aside", ".safetensors", ".safetensors", ".txt"]
     other = bench(log=log(), run_id="f")
     other.hub.publish_weights(bundle(0, run_id="f"), 0)
-    assert not on_disk(other.hub._log) and other.ledger()["queued"] == 0
+    assert not on_disk(other.rollouts._log) and other.ledger()["queued"] == 0
 
 
 def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, log):
@@ -550,7 +552,7 @@ def test_without_a_log_nothing_is_written_but_what_is_there_is_taken_up(bench, l
     b.send(0)
     resumed = bench(version=1, log=log(write=False))
     assert resumed.send(1, version=1)["outcome"] == "accepted"
-    assert on_disk(resumed.hub._log) == [0] and sequences(resumed.hub.next_batch(2, 1)) == [0, 1]
+    assert on_disk(resumed.rollouts._log) == [0] and sequences(resumed.rollouts.next_batch(2, 1)) == [0, 1]
 
 
 def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
@@ -561,4 +563,4 @@ def test_a_disk_that_refuses_is_said_once_and_training_goes_on(bench, tmp_path):
     assert len(said) == 1 and "they do not survive the learner" in said[0]
     (tmp_path / "file").unlink()
     assert b.send(3)["outcome"] == "accepted"
-    assert on_disk(b.hub._log) == [3]
+    assert on_disk(b.rollouts._log) == [3]

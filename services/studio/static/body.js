@@ -4,7 +4,7 @@ import { BufferAttribute, BufferGeometry, Color, DoubleSide, Mesh, MeshLambertMa
 
 const OBJECT = new Color(0.95, 0.64, 0.28);
 export const AVOID = new Color(0.8, 0.22, 0.22);
-const HINT = 0.55; // share of its colour that a brush shows before it paints
+const HINT = 0.55; // share of a brush's colour in its preview
 const CREASE = Math.cos((35 * Math.PI) / 180);
 const ALIKE = 0.9999; // cosine between normals that count as one
 
@@ -70,7 +70,7 @@ export class Body extends Mesh {
     this.#show(point ? this.#brushed(point, radius, avoid, hinted) : this.colours);
   }
 
-  // Colours what a brush at a point of the object frame touches, until the server's answer is there.
+  // Colours the surface under a brush at a point of the object frame, until the server responds.
   brush(point, radius, avoid) {
     this.colours = this.#brushed(point, radius, avoid, (_, target) => target);
     this.#show(this.colours);

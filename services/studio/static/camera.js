@@ -1,4 +1,4 @@
-// A camera that looks at a point and goes around it; z is up.
+// A camera that orbits a point; z is up.
 
 import { PerspectiveCamera, Raycaster, Vector2, Vector3 } from "./vendor/three.module.min.js";
 
@@ -16,7 +16,7 @@ export class OrbitCamera extends PerspectiveCamera {
     this.raycaster = new Raycaster();
   }
 
-  // What a picture of another size needs to look the same way: m in the world, and degrees from bottom to top.
+  // The same view for pictures of other sizes: world frame, m; vertical field of view, degrees.
   get viewpoint() {
     return { position: this.position.toArray(), target: this.target.toArray(), field_of_view: this.fov };
   }
@@ -45,7 +45,7 @@ export class OrbitCamera extends PerspectiveCamera {
     this.elevation = Math.min(1.5, Math.max(-0.35, this.elevation + 0.008 * dy));
   }
 
-  // Moves by pixels of a frame of a height.
+  // Pans by pixels of a frame with the given height in pixels.
   pan(dx, dy, height) {
     const step = this.height / height;
     this.target.add(new Vector3(-dx * step, dy * step, 0).applyQuaternion(this.quaternion));

@@ -38,7 +38,7 @@ class App {
     setInterval(() => this.#count(), 500);
   }
 
-  // What the tools may change: nothing while a motion is shown.
+  // The request that the tools edit; null while a motion is shown.
   get state() {
     return this.player.motion ? null : this.edited;
   }
@@ -59,7 +59,7 @@ class App {
     this.redraw();
   }
 
-  // Looks at the object and at the hand above it.
+  // Fits the camera to the object and the hand above it.
   #frameAll() {
     const { object, hand } = this.editing;
     const reach = new Vector3(0.4, 0.4, 0).multiplyScalar(this.body.radius);
@@ -81,7 +81,7 @@ class App {
     this.shownPaint = studio.painted;
   }
 
-  // The studio's state after something was done.
+  // Shows a new state of the studio.
   async takeState(state) {
     const { studio } = state;
     const other = state.shown !== this.shownObject;
@@ -101,7 +101,7 @@ class App {
     this.redraw();
   }
 
-  // Shows the paint as the server has it.
+  // Shows the server's paint.
   async repaint() {
     this.body.paint((await fetchMessage("api/paint")).arrays.avoid.data);
     this.redraw();
@@ -125,7 +125,7 @@ class App {
     this.panel.mark();
   }
 
-  // The player has closed: the constraints are seen as before.
+  // The player has closed: the constraints are shown again.
   closed() {
     this.camera.target.copy(this.looked.target);
     this.camera.distance = this.looked.distance;

@@ -1,4 +1,4 @@
-// A recorded motion: its frame at a time, between two steps too.
+// A recorded motion; frames between two steps are interpolated.
 
 import { Quaternion, Vector3 } from "./vendor/three.module.min.js";
 
@@ -8,7 +8,7 @@ function points(rows) {
   return Array.from({ length: numbers.length / 3 }, (_, i) => new Vector3().fromArray(numbers, 3 * i));
 }
 
-// Poses of positions x y z and quaternions w x y z; the same.
+// Poses of positions x y z and quaternions w x y z, in either form.
 export function poses({ position, quaternion }) {
   const q = Array.from(quaternion).flat();
   return points(position).map((place, i) => ({
@@ -28,7 +28,7 @@ function between(before, after, share) {
   return { position: before.position.clone().lerp(after.position, share), quaternion: before.quaternion.clone().slerp(after.quaternion, share) };
 }
 
-// Rows of a list, as many in each as a step has.
+// The numbers of each step, from a list of all steps.
 function steps(list, count) {
   const width = list.length / count;
   return Array.from({ length: count }, (_, t) => list.slice(t * width, (t + 1) * width));

@@ -12,10 +12,10 @@ export class Player {
   // `app` has: stage, camera, skin(name), redraw(), shown(), closed().
   constructor(app) {
     this.app = app;
-    this.slots = []; // {motion, playing, name}: the motion that is played, and one that it is compared with
+    this.slots = []; // {motion, playing, name}: the motion that is played, and one to compare with it
     this.time = 0;
     this.playing = false;
-    this.wanted = 0; // number of the last request to play: what comes for an earlier one is too late
+    this.wanted = 0; // number of the last request to play; responses to earlier ones are ignored
     this.timeline = new Timeline($("timeline"), $("cursor"), $("lanes"), (time) => this.seek(time));
     $("play").addEventListener("click", () => this.toggle());
     $("scrub").addEventListener("input", () => this.seek($("scrub").value * this.step));
@@ -44,7 +44,7 @@ export class Player {
     return this.motion.dt;
   }
 
-  // Side by side, not one over the other.
+  // True for two motions side by side, false if one is over the other.
   get beside() {
     return this.slots.length > 1 && $("layout").value === "beside";
   }
@@ -53,7 +53,7 @@ export class Player {
     return this.slots.some(({ motion }) => motion.id === id);
   }
 
-  // Plays a motion alone, from its begin.
+  // Plays a motion alone, from its beginning.
   async play(id, name = "") {
     const slot = await this.#load(id, name, 0);
     if (!slot) return;
@@ -63,7 +63,7 @@ export class Player {
     this.#show();
   }
 
-  // Plays a motion beside the one that is shown; without that, alone.
+  // Plays a motion next to the current one, or alone if there is none.
   async compare(id, name) {
     if (!this.motion) return this.play(id, name);
     const slot = await this.#load(id, name, 1);
@@ -95,7 +95,7 @@ export class Player {
     this.app.redraw();
   }
 
-  // Goes on to the time of a frame that is drawn; whether something moves.
+  // Advances to the time of the next frame; returns true while the motion plays.
   tick(now) {
     if (!this.playing) return false;
     const time = this.time + ((now - this.last) / 1000) * Number($("speed").value);
@@ -116,7 +116,7 @@ export class Player {
     return this.beside ? groups.map((group) => [group]) : [groups];
   }
 
-  // The motion with what it needs to be drawn; null if something else was asked for meanwhile, or it cannot be had.
+  // Loads a motion with its skin; returns null if another was requested meanwhile, or if that fails.
   async #load(id, name, slot) {
     const number = ++this.wanted;
     try {
@@ -177,7 +177,7 @@ export class Player {
     this.#values();
   }
 
-  // Force and rewards of every motion that is shown, with what each is.
+  // Force and rewards of every shown motion, with their meanings.
   #values() {
     const steps = this.slots.map(({ motion }) => motion.step(this.time));
     const terms = Object.keys(this.motion.rewards).filter((name) => this.motion.rewards[name].some((value) => value !== 0));
@@ -204,8 +204,7 @@ export class Player {
   }
 }
 
-// How a motion ended. It succeeds by holding the object for the paper's quarter of a second, and holds it if it does to
-// its end.
+// Outcome of a motion: success is a hold of the paper's quarter of a second, held is a hold to the end.
 export function outcomeOf(success, held) {
   return { outcome: held ? "held" : success ? "held briefly" : "not held", held };
 }

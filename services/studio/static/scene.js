@@ -1,4 +1,4 @@
-// Everything that is seen: hand, object, constraints and contacts.
+// Content of the picture: hand, object, constraints and contacts.
 
 import {
   Color, CylinderGeometry, DirectionalLight, DoubleSide, EqualStencilFunc, Group, HemisphereLight, IncrementStencilOp,
@@ -28,7 +28,7 @@ const KEY = new Vector3(0.35, -0.5, 0.8); // towards the light that casts shadow
 const SHADE = 0.2; // of a shadow
 const OVERRULED = 0.45; // opacities
 const GHOST = 0.4;
-const BEHIND = 0.4; // of a motion that another is laid over
+const BEHIND = 0.4; // opacity of a motion behind another
 
 const FORWARD = new Vector3(0, 0, 1); // of the shapes below, which have the length 1
 const SHAFT = arrow(0.0028, 0.168);
@@ -190,7 +190,7 @@ export class Editing extends Pair {
     this.table.at(this.object.position);
     this.hand.follow(poses(start));
     this.mark(markers.map(marker), 1);
-    // An arrow that the rules overrule is faint, and beside it is the one that counts.
+    // An overridden arrow is faint; the active one is drawn as well.
     this.counts.visible = active.overruled;
     fade(this.arrow.material, active.overruled ? OVERRULED : 1);
     approach(this.counts, new Vector3(...active.position), new Vector3(...active.direction));
@@ -262,7 +262,7 @@ export class Playing extends Pair {
   }
 }
 
-// All that can be drawn, and its light.
+// The whole scene and its light.
 export class Stage extends Scene {
   constructor() {
     super();
@@ -276,7 +276,7 @@ export class Stage extends Scene {
     this.add(key, second, sky);
   }
 
-  // Shows some of the groups alone.
+  // Shows only the given groups.
   show(groups, shadows) {
     this.background.set(colour("--stage"));
     for (const child of this.children) if (child instanceof Pair) child.visible = groups.includes(child);

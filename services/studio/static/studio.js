@@ -35,7 +35,7 @@ export class StudioPanel {
     this.extras = Object.fromEntries(Array.from(document.querySelectorAll("[data-extra]"), (part) => [part.dataset.extra, part]));
     $("clear-paint").addEventListener("click", () => this.act("fill", { avoid: false }));
     $("close-hand").addEventListener("click", () => this.act("close_hand", {}));
-    this.gesture = Date.now(); // of the roll's slider: what one drag does is one edit, also beside other pages' drags
+    this.gesture = Date.now(); // id of a drag of the roll's slider, which is one edit; it differs between pages
     $("roll").addEventListener("input", () => this.#roll($("roll").value, this.gesture));
     $("roll").addEventListener("change", () => (this.gesture = Date.now()));
     $("roll-number").addEventListener("change", () => this.#roll($("roll-number").value));
@@ -47,8 +47,8 @@ export class StudioPanel {
     this.#drops();
   }
 
-  // Asks the server to do something, one thing after another; false if it would not. What changes the request is seen
-  // without a motion over it.
+  // Sends an action to the server, in turn; resolves to false if it is refused. A change of the request closes the
+  // player.
   act(action, values) {
     if (!KEEPS_MOTION.has(action) && this.app.player.motion) this.app.player.close();
     this.queue = this.queue.then(async () => {
@@ -69,7 +69,7 @@ export class StudioPanel {
     return this.queue;
   }
 
-  // Turns the hand to an angle in degrees; of those that come while the server is busy only the last one counts.
+  // Turns the hand to an angle in degrees; while the server is busy, only the last one is kept.
   async #roll(degrees, gesture = null) {
     this.rolling = { angle: (Number(degrees) * Math.PI) / 180, gesture };
     if (this.turning || !Number.isFinite(this.rolling.angle)) return;
@@ -98,7 +98,7 @@ export class StudioPanel {
     this.act(key === "y" || event.shiftKey ? "redo" : "undo", {});
   }
 
-  // Shows what the server knows now, such as a run's newer weights; whether it answered.
+  // Shows the server's current state, such as newer weights; resolves to true if the server responded.
   async refresh() {
     const state = await ask("api/state").catch(() => null);
     if (state) await this.show(state);
@@ -195,7 +195,7 @@ export class StudioPanel {
     this.questioned = upload.unit ? null : upload.file;
   }
 
-  // A row for each constraint: a box to ask for it, what its tool has on the panel, and a box for each of its flags.
+  // A row for each constraint: a box to request it, the controls of its tool, and a box for each of its flags.
   #constraints(rows) {
     const shown = JSON.stringify(rows);
     if (shown === this.rows) return;
@@ -228,12 +228,12 @@ export class StudioPanel {
     }));
   }
 
-  // Shows a job's progress while it runs, and once what came of it.
+  // Shows a job's progress while it runs, then its result once.
   #job(job) {
     $("job").hidden = !job.running;
     $("share-done").value = job.share;
     $("doing").textContent = job.text;
-    this.settled ??= job.number; // what was done before this page was opened is of no interest
+    this.settled ??= job.number; // results from before the page was opened are ignored
     if (job.running && !this.watching) this.#watch();
     else if (!job.running && job.number !== this.settled) {
       this.settled = job.number;
@@ -252,7 +252,7 @@ export class StudioPanel {
       job = await ask("api/job").catch(() => null);
       if (job?.running) this.#job(job);
     } while (!job || job.running);
-    // Without the new state nobody would hear what came of the job.
+    // The result of the job is part of the new state.
     while (!(await this.refresh())) await new Promise((resolve) => setTimeout(resolve, POLL));
     this.watching = false;
   }
@@ -275,7 +275,7 @@ export class StudioPanel {
       };
       const name = this.#name(motion.id);
       button(name, motion.note, () => this.app.play(motion.id, name), `name ${motion.held ? "good" : "warn"}`);
-      button("Compare", "Show it beside the motion that is played", () => this.app.player.compare(motion.id, name), "compare");
+      button("Compare", "Show it next to the current motion", () => this.app.player.compare(motion.id, name), "compare");
       button("×", `Delete motion ${motion.id}`, () => this.#delete(motion.id), "delete");
       return item;
     }));
@@ -283,7 +283,7 @@ export class StudioPanel {
     this.mark();
   }
 
-  // Marks the motions that are played.
+  // Marks the shown motions.
   mark() {
     for (const item of $("motions").children) item.toggleAttribute("data-shown", this.app.player.shows(item.dataset.motion));
   }
@@ -293,7 +293,7 @@ export class StudioPanel {
     this.act("delete", { id });
   }
 
-  // Saves the motion that is played: data at once, pictures and videos as they are seen when they are drawn.
+  // Saves the current motion: data at once, pictures and videos from the current view once a job has drawn them.
   #save(kind) {
     const { player, camera } = this.app;
     const { id } = player.motion;

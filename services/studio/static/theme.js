@@ -1,4 +1,4 @@
-// Colours of the page's style sheet, for what is drawn on canvases; they change with the browser's colour scheme.
+// Colours of the page's style sheet for canvases; they change with the browser's colour scheme.
 
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const known = new Map();

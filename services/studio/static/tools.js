@@ -1,4 +1,4 @@
-// What the mouse does in the scene: look around, place the arrow, paint, draw a path.
+// Tools of the mouse in the scene: look around, place the arrow, paint, draw a path.
 
 import { ARROW } from "./scene.js";
 import { Plane, Ray, Vector3 } from "./vendor/three.module.min.js";
@@ -9,10 +9,10 @@ const STEP = 0.004; // m between two points of a drawn path
 
 const HINTS = {
   look: "Drag to turn, right button to move, wheel to zoom. The arrow's ends can be dragged.",
-  arrow: "Click where the hand should come to. Drag the arrow's tip over the object, or its tail to turn it.",
+  arrow: "Click the place to grasp. Drag the arrow's tip over the object, or its tail to turn it.",
   avoid: "Brush over what the hand must not touch.",
   graspable: "Brush over what the hand may grasp.",
-  path: "Draw the wrist's way with one stroke, from far away to the object.",
+  path: "Draw the wrist's path with one stroke, from far away to the object.",
 };
 
 export class Tools {
@@ -25,7 +25,7 @@ export class Tools {
     this.arrow = null; // ray to its target in the object frame, while it is dragged
     this.stroke = null;
     this.over = null; // {point, normal} of the object's surface under a brush
-    this.fingers = new Map(); // places of what touches the canvas, by pointer
+    this.fingers = new Map(); // positions on the canvas by pointer
     const { canvas } = app;
     canvas.addEventListener("pointerdown", (event) => this.#down(event));
     canvas.addEventListener("pointermove", (event) => this.#move(event));
@@ -146,7 +146,7 @@ export class Tools {
     } else if (this.tool === "arrow" && hit) {
       this.doing = "";
       const inward = hit.normal.negate().transformDirection(app.body.matrixWorld);
-      inward.z = Math.min(inward.z, 0); // from below the table no hand comes: such a direction is levelled
+      inward.z = Math.min(inward.z, 0); // a direction from below the table becomes horizontal
       const direction = inward.transformDirection(app.body.matrixWorld.clone().invert());
       app.act("set_heading", { surface: hit.point.toArray(), direction: direction.toArray() });
     } else if (this.tool === "path" && app.state) {
@@ -183,7 +183,7 @@ export class Tools {
     app.redraw();
   }
 
-  // Two fingers move the picture, and zoom it by how far they are apart.
+  // Two fingers pan the picture, and zoom it by their distance.
   #pinch(event) {
     const { app } = this;
     const before = [...this.fingers.values()];
@@ -197,7 +197,7 @@ export class Tools {
     app.redraw();
   }
 
-  // What was begun with one finger is not meant once there is a second.
+  // A second finger cancels what the first one began.
   #drop() {
     this.stroke = this.arrow = null;
     if (this.doing === "paint") this.app.repaint();

@@ -1,4 +1,4 @@
-// The window on a training: how it goes, its curves, its actors, and the episodes around a time.
+// The training window: state, curves and actors of a run, and its episodes around a time.
 
 import { colour as styled, onTheme } from "./theme.js";
 import { ask } from "./wire.js";
@@ -8,7 +8,7 @@ const EVERY = 1000; // ms
 const ALL = "*";
 const COLOURS = ["#2f6fdb", "#e08a2c", "#1f9d88", "#0e8fb3", "#7a4cc2", "#5b8c2a"];
 
-const ENDED = ["finished", "recorded"]; // phases in which nothing more comes
+const ENDED = ["finished", "recorded"]; // phases without further data
 const PHASES = { training: "training", finished: "finished", recorded: "recorded", disconnected: "disconnected" };
 const COUNTERS = {
   granted: "tickets granted", running: "tickets in use", redeemed: "tickets redeemed", returned: "tickets returned", expired: "tickets expired",
@@ -59,7 +59,7 @@ export class TrainingPanel {
     $("run-trouble").textContent = text;
   }
 
-  // Whether a run that is over has been seen to its end, so that nothing more comes.
+  // True once a finished run has been shown to its end.
   #ended() {
     const last = this.view && JSON.stringify([this.view.phase, this.view.last, this.view.loading]);
     const same = last === this.before;
@@ -92,7 +92,7 @@ export class TrainingPanel {
 
   #show() {
     const { view } = this;
-    // Until somebody chooses, the server does: a run that is over has more to show than one that trains.
+    // The tiles of a finished run replace those of a live one.
     const tiles = {
       run: view.run,
       state: view.loading ? "reading …" : PHASES[view.phase],

@@ -48,7 +48,7 @@ export async function upload(path, file) {
   return (await request(path, { name: file.name }, options)).json();
 }
 
-// Lets the browser save what the server answers with, under the name that it gives.
+// Saves the server's response as a file, under the name in its header.
 export async function download(path, query) {
   const response = await request(path, query);
   const link = document.createElement("a");

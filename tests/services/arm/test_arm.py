@@ -266,4 +266,4 @@ def test_a_grasp_on_the_arm_from_the_command_line(folder, tmp_path, capsys):
 
     assert load("grasp")([*shared, "--base", "3 0 0 180", "--no-pictures"])() == 2
     said = capsys.readouterr().err
-    assert "seven can do none of the" in said and "the reach" in said and "Set another --base" in said
+    assert "seven can execute none of the" in said and "the reach" in said and "Set another --base" in said

@@ -1,4 +1,4 @@
-"""The benchmark's reference goes through what the actor went through."""
+"""The references of the benchmark repeat the states of the actor."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ TASK = TaskConfig()
 WORLDS = 3
 
 
-def test_replays_end_in_the_very_states_of_the_recording():
+def test_replays_end_in_the_states_of_the_recording():
     objects = box, _ = [procedural.generate(0, family) for family in ("box", "cylinder")]
     height = float(np.abs(box.points[:, 2]).max())
     one = np.ones((WORLDS, 1))

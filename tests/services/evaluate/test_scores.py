@@ -1,15 +1,17 @@
 """Rows of an evaluation, against numbers worked out by hand."""
 
 import dataclasses
+import io
 import json
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks
 from congrasp.services.evaluate.episodes import PROBED_EPISODES, Sample, joined
-from congrasp.services.evaluate.paper import paper_row
+from congrasp.services.evaluate.paper import CENTER_GROUP, paper_row
 from congrasp.services.evaluate.scores import (
     TABLES,
     clustered,
@@ -186,6 +188,20 @@ def test_rows_of_several_policies_stand_together_and_missing_ones_are_named():
     assert [row[2] for row in rates.rows] == ["ours", "pd", "ours", "pd", "graspxl"]
     alone, *_ = tables_of(rows[:2], "title")
     assert alone.columns[:2] == ["constraint", "episodes"]
+
+
+def test_a_terminal_shows_every_figure_of_several_policies():
+    """A long title is broken, and not the figures."""
+    held = {"held_2s": 1.0, "held_2s_low": 0.342, "held_2s_high": 1.0}
+    rows = [
+        dataclasses.replace(made_row("heading", 1.0, 0.342, 1.0, hand=hand, method=method, group=CENTER_GROUP), **held)
+        for hand, method in (("human", "no-dynamic-center"), ("allegro", "ours"))
+    ]
+    console = Console(width=160, file=io.StringIO())
+    console.print(tables_of(rows, "title")[0].terminal())
+    shown = console.file.getvalue()
+    assert "\N{HORIZONTAL ELLIPSIS}" not in shown and "episodes" in shown and "objects" in shown
+    assert shown.count("100.0 % (34.2-100.0)") == 4 and shown.count("0.000 rad") >= 2
 
 
 def test_the_margin_of_a_mean_error_is_1_96_standard_errors():

@@ -21,6 +21,7 @@ from congrasp.services.evaluate.plan import protocol
 from congrasp.services.evaluate.plots import draw_noise
 from congrasp.services.evaluate.tables import MASSES, NOISE, PEERS, SENSING, Load, Noise, payload
 from congrasp.services.grasp.grasper import Grasper
+from congrasp.services.studio.grasping import PolicyGrasping
 from congrasp.services.train.presets import TRACKERS
 from tests import draws, task
 from tests.task import HAND, OBJECTS
@@ -119,8 +120,10 @@ def test_friction_is_stiff_whatever_the_training_s_was():
     """One option of the scene, in training alone."""
     soft = dataclasses.replace(TASK, impratio=1.0)
     assert [scene_spec(HAND, one).option.impratio for one in (TASK, soft, protocol(soft, 25))] == [100.0, 1.0, 100.0]
-    with contextlib.closing(Grasper(dataclasses.replace(task.policy(), task=soft), attempts=1)) as grasper:
+    policy = dataclasses.replace(task.policy(), task=soft)
+    with contextlib.closing(Grasper(policy, attempts=1)) as grasper:
         assert grasper.task.impratio == 100.0
+    assert PolicyGrasping(lambda version: policy, "soft").task.impratio == 100.0
 
 
 def test_a_load_sets_the_mass_of_objects_and_the_friction_of_the_same_episodes():

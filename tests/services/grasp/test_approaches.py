@@ -1,4 +1,4 @@
-"""Approaches that the table leaves room for."""
+"""Approaches that the table allows."""
 
 import pathlib
 
@@ -29,7 +29,7 @@ def test_an_object_that_lies_too_flat(tmp_path: pathlib.Path, quick_import: None
     assert rest > 0 and (rests == rest).all()
 
 
-def test_fingers_close_across_a_handle_that_few_surface_points_lie_on() -> None:
+def test_fingers_close_across_a_handle_with_few_surface_points() -> None:
     """A bar of 9 mm, 25 mm before a block: fingertips have no room behind it at the usual depth of 2 cm."""
     rods = [box((0.017, 0.0045, 0.0045), (0.052, 0.0, z)) for z in (0.03, -0.03)]
     draft = Draft((box((0.04, 0.04, 0.045)), *rods, box((0.0045, 0.0045, 0.0345), (0.0695, 0.0, 0.0))))

@@ -1,4 +1,4 @@
-"""Constraint sets: what the files hold, and the two commands."""
+"""Constraint sets: content of the files, and the two commands."""
 
 import dataclasses
 
@@ -23,11 +23,11 @@ BOX, _, MUG, _ = OBJECTS
 
 @pytest.fixture(scope="module")
 def file(constraint_sets, tmp_path_factory):
-    """That of the mug."""
+    """Constraint set of the mug."""
     return sets.save(constraint_sets[2], tmp_path_factory.mktemp("sets"))
 
 
-def test_every_array_is_explained_and_has_the_shape_that_is_written_down(constraint_sets):
+def test_every_array_is_described_and_has_the_described_shape(constraint_sets):
     for constraints in constraint_sets:
         arrays, meta = constraints.arrays, constraints.meta
         assert set(arrays) == set(meta["arrays"])
@@ -41,7 +41,7 @@ def test_every_array_is_explained_and_has_the_shape_that_is_written_down(constra
         assert meta["finger_joints"][0] == HAND.joints[0].name and meta["quaternions"] == "(w, x, y, z)"
 
 
-def test_a_set_is_what_training_draws_from(constraint_sets):
+def test_a_set_equals_the_bank_of_training(constraint_sets):
     made = bank()
     for n, constraints in enumerate(constraint_sets):
         arrays = constraints.arrays
@@ -59,7 +59,7 @@ def test_a_set_is_what_training_draws_from(constraint_sets):
         np.testing.assert_allclose(arrays["trajectory/position"][:, :, -1], arrays["pose/position"], atol=1e-4)
 
 
-def test_files_come_back_whole_and_others_are_refused(constraint_sets, file, tmp_path):
+def test_files_round_trip_and_others_are_refused(constraint_sets, file, tmp_path):
     read = stored_sets.load(file)
     assert file.name == "mug_2.constraints.safetensors" and dict(read.meta) == dict(constraint_sets[2].meta)
     for name, array in constraint_sets[2].arrays.items():
@@ -74,7 +74,7 @@ def test_files_come_back_whole_and_others_are_refused(constraint_sets, file, tmp
         stored_sets.load(tmp_path / "absent")
 
 
-def test_show_says_and_draws_what_a_file_holds(file, tmp_path, capsys, monkeypatch):
+def test_show_prints_and_draws_a_file(file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("congrasp.services.viz.object_sheet._SIZE", (48, 36))
     picture = tmp_path / "sheet.png"
     assert load("constraints")(["show", str(file), "--png", str(picture)])() == 0
@@ -113,5 +113,5 @@ def test_a_reference_is_refused_for_another_object_or_size(constraint_sets, file
         read_request(BOX, HAND, 15, trajectory=str(file))
     larger = Message(constraint_sets[2].arrays, {**constraint_sets[2].meta, "object_scale": 1.4})
     file = sets.save(larger, tmp_path)
-    with pytest.raises(CongraspError, match=r"1\.4 times as large, as the human hand is trained: add --scale 1\.4"):
+    with pytest.raises(CongraspError, match=r"human hand is trained on objects 1\.4 times as large: add --scale 1\.4"):
         read_request(MUG.scaled(1 / 1.4), HAND, 15, pose=str(file))

@@ -1,4 +1,4 @@
-"""Grasps of one's own objects: a real one by the pretrained policy, and the command around made-up ones."""
+"""Grasps of custom objects: a real one by the pretrained policy, and the command with fake ones."""
 
 import dataclasses
 import json
@@ -56,7 +56,7 @@ def grasper():
     grasper.close()
 
 
-def test_a_shape_that_is_another_one_is_not_held():
+def test_an_unreliable_shape_does_not_count_as_held():
     held = {"success": True, "shape_reliable": True}
     assert Result("mug", held).held
     assert not Result("mug", held | {"shape_reliable": False}).held
@@ -78,11 +78,11 @@ def test_the_pretrained_policy_grasps_a_block(block, grasper):
     assert len(motion.time) == steps and motion.table.sum() == steps - 26  # gone with its last step
     np.testing.assert_allclose(motion.goal["heading_direction"], [0, 0, -1], atol=1e-6)
     np.testing.assert_array_equal(motion.surface_avoid, minus[:256])
-    # The hand came along the block's own z axis: from its start to its end the wrist moved mostly that way.
+    # The hand approached along the block's z axis: the wrist moved mostly in that direction.
     way = motion.wrist_position[48] - motion.wrist_position[0]
     axis = np.asarray(rotate(motion.object_quaternion[0], np.array([0.0, 0.0, -1.0])))
     assert way @ axis > 0.8 * np.linalg.norm(way) > 0.05
-    # What it holds stays where it is although nothing is below it.
+    # The held block keeps its height although there is no table.
     assert abs(motion.object_position[-1, 2] - motion.object_position[49, 2]) < 0.05
     facts = found.facts()
     assert facts["heading_rad"] < 0.5 and {"heading_m", "affordance_ratio", "force_link_max"} <= facts.keys()
@@ -113,7 +113,7 @@ def test_a_left_hand_moves_as_the_mirrored_right_one(block, grasper, monkeypatch
 
 
 def test_costs_of_attempts():
-    """Costs that are added up by hand, of five attempts."""
+    """Costs of five attempts, computed by hand."""
     zeros = np.zeros(5)
     metrics = {name: zeros.copy() for name in ("moved_at_removal", *ASSESSED)}
     metrics |= {
@@ -122,7 +122,7 @@ def test_costs_of_attempts():
         "heading_rad": np.array([0.0, 0.0, 0.0, 0.1, 0.9]),  # one for 0.2 rad
         "heading_m": zeros,
         "force_link_max": np.array([0.0, 0.0, 10.0, 0.0, 0.0]),  # one for 10 N
-        "pose_rad": np.full(5, 9.0),  # not asked for
+        "pose_rad": np.full(5, 9.0),  # not requested
         "clean": np.array([0.0, 0, 0, 1, 1]),
         **dict.fromkeys(SURVIVAL, np.array([0.0, 0, 1, 1, 1])),
     }
@@ -131,8 +131,8 @@ def test_costs_of_attempts():
     np.testing.assert_allclose(found, [11004.0, 4.0, 2.0, 0.5, 4.5], rtol=1e-6)
 
 
-def test_what_no_attempt_holds_has_a_cause(block, monkeypatch):
-    """Attempts that hold what is light or narrow enough: the cause is what they are told apart by."""
+def test_the_cause_of_failures_is_weight_or_width(block, monkeypatch):
+    """Attempts hold objects that are light or narrow enough; the cause is the limit that was exceeded."""
     four = Grasper(bundles.load(policy_file(None)), attempts=4)
 
     def cause(request, may_be_held):
@@ -154,8 +154,8 @@ def test_what_no_attempt_holds_has_a_cause(block, monkeypatch):
     assert cause(placed, lambda obj: np.ptp(obj.points[:, 0]) < narrow) == ""
 
 
-def test_a_grasp_lifts_the_block_off_a_table_that_stays(block):
-    """By physics: the hand goes up and the block with it, because the hand holds it."""
+def test_a_grasp_lifts_the_block_off_the_table(block):
+    """In the simulation the hand rises, and the block with it; the table stays."""
     lifting = Grasper(bundles.load(policy_file(None)), attempts=4, phases=Phases(0.3, 0.1, 0.25), threads=2)
     upright = int(np.argmax(block.rest_poses[:, 2]))
     found = lifting.grasp(block, GraspRequest(rest=upright))
@@ -185,8 +185,8 @@ def test_impossible_requests(block, grasper):
 
 
 @pytest.fixture
-def made_up(monkeypatch, quick_import):
-    """The command with grasps that are made up; the list of objects that were grasped."""
+def fake_grasps(monkeypatch, quick_import):
+    """Replaces the grasps of the command by fake ones; returns the names of the grasped objects."""
     calls = []
 
     def grasp(self, obj, request=None, progress=lambda what, done, total: None):
@@ -216,13 +216,13 @@ def meshes(folder: pathlib.Path, *names: str) -> pathlib.Path:
     return folder
 
 
-def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch, made_up):
+def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch, fake_grasps):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder, out = meshes(tmp_path / "things", "a", "b"), tmp_path / "out"
     (folder / "bad.obj").write_text("no mesh")
     assert command(folder, "--out", out) == 2
     captured = capsys.readouterr()
-    assert made_up == ["a", "b"]
+    assert fake_grasps == ["a", "b"]
     assert "bad.obj" in captured.err and captured.err.count("congrasp: error:") == 1
     line = next(line for line in captured.out.splitlines() if line.startswith("a:"))
     size = "5.0 x 6.0 x 14.0 cm, about as long as a phone"
@@ -240,18 +240,18 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
     assert json.loads((out / "a" / RESULT).read_text())["object_mass"] > 0.001
     (out / "b" / RESULT).unlink()  # as if it had been interrupted while b was written
     assert command(folder, "--out", out) == 0
-    assert made_up == ["a", "b", "b", "c"] and "a (done before)" in capsys.readouterr().out
-    assert command(folder, "--out", out, "--heading", "above") == 0  # something else is asked for
+    assert fake_grasps == ["a", "b", "b", "c"] and "a (done before)" in capsys.readouterr().out
+    assert command(folder, "--out", out, "--heading", "above") == 0  # another request
     assert command(folder, "--out", out, "--heading", "above") == 0
-    assert made_up[4:] == ["a", "b", "c"]
+    assert fake_grasps[4:] == ["a", "b", "c"]
     trimesh.creation.box((0.05, 0.05, 0.05)).export(folder / "c.stl")  # another mesh under its name
     assert command(folder, "--out", out, "--heading", "above") == 0
-    assert made_up[7:] == ["c"]
+    assert fake_grasps[7:] == ["c"]
     assert command(folder, "--out", out, "--heading", "above", "--again") == 0
-    assert made_up[8:] == ["a", "b", "c"]
+    assert fake_grasps[8:] == ["a", "b", "c"]
 
 
-def test_exit_codes(tmp_path, capsys, monkeypatch, made_up):
+def test_exit_codes(tmp_path, capsys, monkeypatch, fake_grasps):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder = meshes(tmp_path / "things", "loose")
     assert command(folder / "loose.stl", "--out", tmp_path / "out") == 1
@@ -262,13 +262,13 @@ def test_exit_codes(tmp_path, capsys, monkeypatch, made_up):
     assert "--heading is 'up there', not 3 numbers" in capsys.readouterr().err
 
 
-def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, made_up):
+def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, fake_grasps):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     path = meshes(tmp_path / "things", "a") / "a.stl"
     assert command(path, "--out", tmp_path / "out") == 0
     for _ in range(2):
         assert load("grasp")([str(path), "--out", str(tmp_path / "out")])() == 0
-    assert made_up == ["a", "a"]  # without its pictures it was not done
+    assert fake_grasps == ["a", "a"]  # without its pictures it was not finished
     assert Image.open(tmp_path / "out" / "a" / PORTRAIT).size == (1280, 720)
     for name, columns in ((OBJECT, 3), (PICTURE, 4)):
         image = np.asarray(Image.open(tmp_path / "out" / "a" / name).convert("RGB")).astype(int)
@@ -279,7 +279,7 @@ def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, made_up):
     assert (tmp_path / "out" / "summary.png").exists()
 
 
-def test_files_of_a_grasp_are_constraints_of_the_next(tmp_path, block, grasper, monkeypatch, made_up):
+def test_a_grasp_is_a_constraint_of_the_next(tmp_path, block, grasper, monkeypatch, fake_grasps):
     found = Grasper.grasp(grasper, block)
     save_grasp(tmp_path, found, film=None, pictures=False, about={"key": "k"})
     text = str(tmp_path / MOTION)
@@ -288,8 +288,8 @@ def test_files_of_a_grasp_are_constraints_of_the_next(tmp_path, block, grasper, 
     np.testing.assert_array_equal(request.given("pose", "q"), found.motion.joint_position[7])
 
 
-def test_an_object_that_can_stand_is_grasped_as_it_stands():
-    """The mug rests likeliest on its side; upright comes before that, and nothing where a pose was asked for."""
+def test_an_upright_resting_pose_is_preferred():
+    """The mug's likeliest resting pose is on its side; upright precedes it, unless the request names a pose."""
     mug = procedural.generate(0, "mug")
     upright = upright_rest(mug)
     assert upright is not None and upright > 0

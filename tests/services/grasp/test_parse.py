@@ -1,4 +1,4 @@
-"""Constraints as people write them down."""
+"""Constraints from texts and files."""
 
 import dataclasses
 import json
@@ -38,7 +38,7 @@ def asked(obj, **constraints):
     return read_request(obj, HAND, 15, **constraints)
 
 
-def test_an_object_remembers_where_its_file_has_its_origin(block):
+def test_an_object_has_the_origin_and_scale_of_its_file(block):
     np.testing.assert_allclose(block.origin, -CENTER, atol=1e-6)
     assert block.file_scale == 0.001
 
@@ -83,7 +83,7 @@ def test_a_part_is_a_mesh_in_the_files_coordinates_or_a_name(block, tmp_path):
         asked(block, affordance=str(tmp_path / "metres.ply"))
 
 
-def test_what_refers_to_a_file_with_y_up_turns_with_it(block, tmp_path):
+def test_coordinates_of_a_file_with_y_up_are_rotated(block, tmp_path):
     """The quarter turn takes (x, y, z) to (x, -z, y)."""
     turned = dataclasses.replace(block, file_up="y")
     x, y, z = CENTER
@@ -154,14 +154,14 @@ def test_references_come_from_motions_json_and_csv(block, tmp_path):
         ),
     ],
 )
-def test_what_is_wrong_with_a_pose_is_said(block, tmp_path, text, complaint):
+def test_errors_name_the_fault_of_a_pose(block, tmp_path, text, complaint):
     path = tmp_path / "pose.json"
     path.write_text(text)
     with pytest.raises(CongraspError, match=complaint):
         asked(block, pose=str(path))
 
 
-def test_what_is_wrong_with_a_trajectory_is_said(block, tmp_path):
+def test_errors_name_the_fault_of_a_trajectory(block, tmp_path):
     path = tmp_path / "path.csv"
     path.write_text("0,0,0,1,0,0,0\n0,0,0,1,0,0,0\n")
     with pytest.raises(CongraspError, match="wrist does not move"):
@@ -196,20 +196,20 @@ def test_what_is_wrong_with_a_trajectory_is_said(block, tmp_path):
 
 
 @pytest.mark.filterwarnings("error")
-def test_huge_numbers_are_directions_but_no_places(block):
+def test_huge_numbers_are_valid_directions_but_not_places(block):
     direction = asked(block, heading="1e308 -1e308 0").given("heading", "direction")
     np.testing.assert_allclose(direction, np.array([1, -1, 0]) / np.sqrt(2))
     with pytest.raises(CongraspError, match="--at lies inf m from 'block'"):
         asked(block, at="1e300 0 0")
 
 
-def test_a_motion_has_no_numbers(block):
+def test_a_motion_takes_no_number(block):
     for name in ("pose", "trajectory"):
         with pytest.raises(CongraspError, match=r"grasp\.npz is one motion and has no number 3. Leave the number out"):
             asked(block, **{name: "grasp.npz:3"})
 
 
-def test_a_joint_of_a_skeleton_leads_to_where_it_is_nearest_to_the_object():
+def test_the_path_of_a_skeleton_s_joint_ends_nearest_to_the_object():
     mug = dataclasses.replace(generate(7, "mug"), origin=(0.03, 0.0, -0.05))
     path = asked(mug, trajectory="examples/reach.bvh").constraints["trajectory"]
     distance = np.linalg.norm(path["position"], axis=-1)

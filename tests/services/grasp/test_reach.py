@@ -1,4 +1,4 @@
-"""The hand comes from beside the table without touching anything, and as an arm can."""
+"""The planned approach is free of contact, and within the limits of an arm."""
 
 import dataclasses
 
@@ -34,7 +34,7 @@ def ball():
 
 
 def beginning(hand, heading: np.ndarray, ball, away: float) -> Reach:
-    """The open hand that comes along a direction, with its centre so far from the ball's."""
+    """The open hand with a heading, its centre `away` (m) from the ball's."""
     frame = grasp_frame(hand)
     across = np.cross(heading, [0.3, 0.9, 0.1])
     turn = Rotation.align_vectors([heading, across], [frame.heading, frame.cross])[0]
@@ -62,7 +62,7 @@ def clearance(hand, reach: Reach, center: np.ndarray) -> tuple[np.ndarray, np.nd
 @pytest.mark.parametrize(
     ("name", "heading", "speed"), [("human", (-1.0, 0.2, -0.4), 0.36), ("allegro", (0.0, 0.0, -1.0), 0.0)]
 )
-def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, heading, speed, ball) -> None:
+def test_the_reach_is_free_of_contact_and_within_the_limits_of_an_arm(name, heading, speed, ball) -> None:
     hand, way = get_hand(name), np.array(heading) / np.linalg.norm(heading)
     first = beginning(hand, way, ball, 0.16)
     rest = np.asarray(ball.rest_poses[0], float)
@@ -90,21 +90,21 @@ def test_the_reach_touches_nothing_and_keeps_to_the_limits_of_an_arm(name, headi
     assert (steps[1:] * steps[:-1]).sum(-1).min() > -1e-9  # it never goes back
 
 
-def test_the_reach_ends_nine_tenths_as_fast_as_the_guidance_moves_the_wrist() -> None:
+def test_the_reach_ends_at_nine_tenths_of_the_speed_of_the_guidance() -> None:
     hand, task = get_hand("human"), TaskConfig()
     further = dataclasses.replace(task, control=dataclasses.replace(task.control, approach_position_limit=0.04))
     found = [handover_speed(hand, one) for one in (task, further)]  # its servos: 20/s
     assert found == pytest.approx([0.9 * 0.02 * 20, 0.9 * 0.04 * 20])
 
 
-def test_where_no_way_leads_is_said(ball) -> None:
+def test_an_unreachable_grasp_is_an_error(ball) -> None:
     hand = get_hand("human")
     first = beginning(hand, np.array([0.0, 0.0, 1.0]), ball, 0.16)  # from below, through the table
-    with pytest.raises(CongraspError, match=r"no way leads to a grasp of .* Leave out the approach"):
+    with pytest.raises(CongraspError, match=r"Every approach to a grasp of .* touches .* Leave out the approach"):
         plan_reach(hand, ball, np.asarray(ball.rest_poses[0], float), np.array([0.0, 0.0, 1.0]), first, 1.0, DT)
 
 
-def test_an_episode_with_a_reach_says_when_its_phases_begin() -> None:
+def test_an_episode_with_a_reach_has_the_start_times_of_its_phases() -> None:
     made = episode()
     made.meta["phases"] = {"grasp": 0.0, "hold": 8 * CONTROL_DT}
     hand = get_hand("human")
@@ -118,17 +118,17 @@ def test_an_episode_with_a_reach_says_when_its_phases_begin() -> None:
     np.testing.assert_allclose(motion.wrist_position[:3], place, atol=1e-6)
     np.testing.assert_allclose(motion.link_position[3:], made.arrays["link_position"])
     assert (motion.object_position == motion.object_position[0]).all() and not motion.link_force[:3].any()
-    # The virtual wrist's joints put it there: R = Rx Ry Rz of the base, which is where the joints are zero.
+    # The virtual wrist's joints lead to the same pose: R = Rx Ry Rz relative to the base.
     u = longer.arrays["u"]
     for t in range(3):
         own = first * Rotation.from_euler("XYZ", u[t, 3:])
         assert (own.inv() * turns[t]).magnitude() < 1e-5
         np.testing.assert_allclose(first.apply(u[t, :3]) + made.arrays["link_position"][0, 0], place[t], atol=1e-6)
-    # What others take of such a motion is its grasp.
+    # Used as a reference, such a motion is cut to its grasp.
     assert grasp_part(motion) == (3, 10) and grasp_steps(longer) == (3, 11)
     lifted = dataclasses.replace(motion, about={"phases": {"grasp": 0.03, "lift": 0.08, "hold": 0.1}})
     assert grasp_part(lifted) == (3, 7)
-    # Files of others may say anything.
+    # Files of other programs may hold any phases.
     for odd in ("soon", {"lift": "soon", "grasp": -1.0}, {"lift": 1e300, "grasp": float("nan")}, {"grasp": 9e3}):
         first, end = grasp_part(dataclasses.replace(motion, about={"phases": odd}))
         assert 0 <= first <= end < len(motion.time)
@@ -153,7 +153,7 @@ def test_resting_poses_by_name_and_number() -> None:
         rest_pose(lying, "upright")
 
 
-def test_names_of_a_folder_stand_for_files(tmp_path, monkeypatch) -> None:
+def test_an_object_is_found_by_its_name_in_a_folder(tmp_path, monkeypatch) -> None:
     from congrasp.common.objects.store import Catalogue
 
     mug = procedural.generate(7, "mug")

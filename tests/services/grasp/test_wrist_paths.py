@@ -1,4 +1,4 @@
-"""Wrist paths from CSV, NPZ and BVH: one path, written three ways, comes back."""
+"""Wrist paths from CSV, NPZ and BVH, each written with the same path."""
 
 import itertools
 
@@ -16,7 +16,7 @@ ROTATION = Rotation.from_rotvec(np.outer(T, [0.4, -0.3, 0.8]))
 
 
 def bvh(path, order="ZXY", unit=0.01):
-    """A skeleton of three joints, y up, whose hand follows the path; the arm's angles are whatever they are."""
+    """Writes a skeleton of three joints, y up, whose hand follows the path; the angles of the arm are arbitrary."""
     up = Rotation.from_euler("X", -90, degrees=True)
     place, turn = up.apply(POSITION) / unit, up * ROTATION
     shoulder = Rotation.from_rotvec(np.outer(T, [0.2, 0.5, -0.1]))
@@ -66,13 +66,13 @@ def check(found):
 
 
 @pytest.mark.parametrize("order", ["".join(axes) for axes in itertools.permutations("XYZ")])
-def test_a_joint_of_a_skeleton_is_followed_in_any_order_of_its_channels(tmp_path, order):
+def test_the_channels_of_a_skeleton_may_have_any_order(tmp_path, order):
     found = read_wrist_path(bvh(tmp_path / "motion.bvh", order), joint="Hand")
     check(found)
     assert found.seconds == 0.02
 
 
-def test_tables_and_archives_say_the_same(tmp_path):
+def test_csv_and_npz_give_the_same_path(tmp_path):
     quaternion = ROTATION.as_quat(scalar_first=True)
     np.savez(tmp_path / "a.npz", position=POSITION, quaternion=quaternion)
     np.savez(tmp_path / "b.npz", wrist_position=POSITION, wrist_quaternion=quaternion)
@@ -82,7 +82,7 @@ def test_tables_and_archives_say_the_same(tmp_path):
         check(read_wrist_path(tmp_path / name))
 
 
-def test_another_wrist_frame_is_turned_into_ours(tmp_path):
+def test_another_wrist_frame_is_converted(tmp_path):
     # Fingers towards +x and the back of the hand +y: the thumb of a right hand then points to -z.
     own = Rotation.from_matrix(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]))
     quaternion = (ROTATION * own.inv()).as_quat(scalar_first=True)
@@ -90,7 +90,7 @@ def test_another_wrist_frame_is_turned_into_ours(tmp_path):
     check(read_wrist_path(tmp_path / "a.npz", fingers="+x", back="+y"))
 
 
-def test_what_cannot_be_read_is_said(tmp_path):
+def test_unreadable_files_are_errors(tmp_path):
     file = bvh(tmp_path / "motion.bvh")
     with pytest.raises(CongraspError, match="no joint 'RightHand'"):
         read_wrist_path(file)

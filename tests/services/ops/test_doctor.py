@@ -134,7 +134,7 @@ def test_certificates_are_looked_at(tmp_path):
 def test_a_learner_is_reached_and_its_clock_compared(monkeypatch):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as server:
-        hub = learner_hub(server, "r")
+        hub = learner_hub(server, "r").hub
         assert [finding.fine for finding in doctor._learner(endpoint, "r")] == [True, True]
         real = hub.status
         monkeypatch.setattr(hub, "status", lambda: real() | {"time": real()["time"] + 7.0})

@@ -4,6 +4,7 @@ import contextlib
 import datetime
 import errno
 import json
+import logging
 import os
 import socket
 import subprocess
@@ -18,7 +19,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import main
-from congrasp.services.ops.logs import log, logging_as
+from congrasp.services.ops.logs import log, log_error, logging_as
 from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
 from tests.waits import eventually
 
@@ -155,6 +156,22 @@ def test_an_error_is_the_last_line_of_a_log_in_json(capfd):
     with pytest.raises(SystemExit):
         main(["grasp", "nowhere.obj"])
     assert capfd.readouterr().err.startswith("congrasp: error: There is no file nowhere.obj.")  # no log of before
+
+
+def test_a_log_in_json_goes_on_after_an_error_until_it_is_reported(capfd):
+    @contextlib.contextmanager
+    def outer():
+        try:
+            yield
+        finally:
+            logging.getLogger("library").warning("closing")
+
+    with pytest.raises(CongraspError), outer(), logging_as("json", role="learner", id="0", run="r"):
+        raise CongraspError("It is refused.")
+    assert log_error("It is refused.") and not log_error("It is refused.")
+    logging.getLogger("library").warning("after the log")
+    lines = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    assert [(line["level"], line["text"]) for line in lines] == [("warning", "closing"), ("error", "It is refused.")]
 
 
 def test_a_full_disk_under_a_log_costs_lines_and_not_the_process(monkeypatch):

@@ -30,7 +30,7 @@ def endpoint():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with ZenohTransport(listen=[endpoint]) as server:
         form = RolloutForm(4, 2, 7, 3, half=True)
-        learner_hub(server, "r", form=form).publish_weights(bundle(0, form=form), 0)
+        learner_hub(server, "r", form=form).hub.publish_weights(bundle(0, form=form), 0)
         with ZenohTransport(connect=[endpoint]) as actor:
             actor.declare_alive(Keys("r").alive("actor", "worker-7", "1f"))
             sent = rollout(0.5, form, actor="worker-7", incarnation="1f", sequence=0, run_id="e")

@@ -25,13 +25,12 @@ from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.record import scene
-from congrasp.services.record.episode import active_blocks, active_constraints
 from congrasp.services.record.palette import JOINT, SKIN
 from congrasp.services.record.palette import MATERIALS as COLOURS
 from congrasp.services.record.recorder import Converter
 from congrasp.services.record.scene import SPACING, check_episode, surface_parts, surface_points
 from congrasp.services.record.writer import Entry, LogWriter
-from tests.episodes import CONTROL_DT, FORCE, episode, older
+from tests.episodes import CONTROL_DT, FORCE, episode
 
 HAND = get_hand("human")
 START = 1_000_000_000_000
@@ -109,14 +108,6 @@ def test_only_active_constraints_are_drawn(mask: tuple[int, ...], shown: set[str
     (entry,) = of(Converter()(KEY, episode(mask=mask), START), "scene")
     ids = {e.id for e in SceneUpdate.FromString(entry.data).entities}
     assert {name.removeprefix("constraint/") for name in ids if name.startswith("constraint/")} == shown
-
-
-def test_an_older_recording_is_drawn_as_it_is_now() -> None:
-    made = episode(mask=(1, 1, 0, 1))
-    (now,), (before,) = (of(Converter()(KEY, message, START), "scene") for message in (made, older(made)))
-    assert before.data == now.data
-    assert active_blocks(older(made).arrays) == active_blocks(made.arrays)
-    assert active_constraints(older(made).arrays) == ("heading", "affordance", "pose", "trajectory")
 
 
 def test_a_new_episode_removes_what_the_last_one_left(entries: list[Entry]) -> None:

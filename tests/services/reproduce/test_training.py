@@ -10,6 +10,7 @@ from congrasp.services.cli import main
 from congrasp.services.ops import children
 from congrasp.services.reproduce.plan import RequiredPolicy
 from congrasp.services.reproduce.run import Request, train_all
+from congrasp.services.train import processes
 from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import Child
 
@@ -32,7 +33,7 @@ def scripts(monkeypatch):
                 command = [sys.executable, "-c", chosen[self.name], run_dir]
                 self.process = subprocess.Popen(command, stdout=log, stderr=log)
 
-    monkeypatch.setattr(children, "Child", Script)
+    monkeypatch.setattr(processes, "Child", Script)
     monkeypatch.setattr(children, "_POLL", 0.05)
     yield chosen, started
     assert all(child.process.poll() is not None for child in started)
@@ -56,9 +57,9 @@ def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tm
     assert "human-ours failed: The disk is full." in failures[OURS] and "human-ours.log" in failures[OURS]
     assert "human-graspxl was stopped" in failures[GRAPSXL]
     runs = wanted.runs
-    assert children.trained(runs / OURS.name) is None and children.training_seconds(runs / OURS.name) is None
-    assert children.trained(runs / PHASES.name) == runs / PHASES.name / "policy.safetensors"
-    assert children.training_seconds(runs / PHASES.name) > 0.0
+    assert processes.trained(runs / OURS.name) is None and processes.training_seconds(runs / OURS.name) is None
+    assert processes.trained(runs / PHASES.name) == runs / PHASES.name / "policy.safetensors"
+    assert processes.training_seconds(runs / PHASES.name) > 0.0
     assert not any("--resume" in child.arguments for child in started)
 
 

@@ -1,4 +1,4 @@
-"""A headless browser for the tests of the page; what it saw is kept in test-results/ where a test fails."""
+"""A headless browser for the tests of the page; the trace of a failed test is kept in test-results/."""
 
 import os
 import pathlib
@@ -58,7 +58,7 @@ def page(browser: Any, request: pytest.FixtureRequest, tmp_path: pathlib.Path) -
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Any:
-    """Tells the fixture whether its test failed."""
+    """Stores for the fixture whether its test failed."""
     report = yield
     if report.when == "call":
         item.failed = report.failed  # type: ignore[attr-defined]

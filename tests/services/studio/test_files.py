@@ -29,7 +29,7 @@ def painted(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.nonzero(((red > 2 * green) & (red > 2 * blue)) | ((green > 1.5 * red) & (green > 1.5 * blue)))
 
 
-def test_a_picture_is_seen_from_where_the_page_looks() -> None:
+def test_a_picture_has_the_camera_of_the_page() -> None:
     seen = image(VIEW)
     rows, columns = painted(seen)
     assert seen.shape == (720, 1280, 3) and abs(np.median(columns) - 640) < 40
@@ -58,7 +58,7 @@ def test_a_video_has_a_frame_for_every_40_ms() -> None:
         ("png", [1, 2], 0, "must have a position"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_in_one_line(kind, view, frame, says) -> None:
+def test_invalid_drawings_are_refused(kind, view, frame, says) -> None:
     with pytest.raises(CongraspError, match=says):
         drawing(episode(6, removal=4), "3", kind, view, frame, lambda share: None)
 
@@ -76,12 +76,12 @@ FLAGS = np.ones(4, bool)
             "The wrist trajectory decided: without it 5 of 8",
         ),
         (("affordance", "pose"), {"affordance": 2, "pose": 1}, "The affordance decided: without it 2 of 8"),
-        (("pose",), {"pose": 0}, "either. It guides. Try another reference pose."),
+        (("pose",), {"pose": 0}, "does not help. It guides. Try another reference pose."),
         (("affordance", "trajectory"), {"affordance": 0, "trajectory": 0}, "It guides. Try another wrist trajectory."),
         (("affordance",), {"affordance": 0}, "It guides. Try another heading."),
     ],
 )
-def test_where_nothing_held_the_constraint_whose_absence_helps_most_decided(asked, without, says) -> None:
+def test_a_failure_names_the_constraint_whose_absence_helps_most(asked, without, says) -> None:
     made = episode(12, removal=8, success=False)
     metrics = {**made.meta["metrics"], "held": 0.0, "diverged": 0.0, "moved_at_removal": 0.2}
     failed = type(made)(made.arrays, {**made.meta, "metrics": metrics})

@@ -1,4 +1,4 @@
-"""The policy behind the studio: newest weights, and which of the grasps near what was drawn is shown."""
+"""The policy of the studio: its newest weights, and the choice between the drawn grasp and its variations."""
 
 import dataclasses
 import threading
@@ -22,7 +22,7 @@ POLICY = task.policy()
 
 
 class Source:
-    """Gives what it is told to."""
+    """Returns what `next` returns."""
 
     def __init__(self) -> None:
         self.next: Callable[[], PolicyBundle | None] = lambda: POLICY
@@ -70,7 +70,7 @@ def test_newer_weights_are_taken_and_those_that_do_not_fit_are_refused() -> None
         PolicyGrasping(source, "the run 'r'")
 
 
-def test_what_was_drawn_is_tried_first_and_the_others_are_near_it() -> None:
+def test_the_drawn_grasp_is_the_first_attempt_and_its_variations_are_near() -> None:
     policy = PolicyGrasping(Source(), "file")
     studio = Studio(policy.hand, policy.task, objects().get("mug"))
     episodes, aside = grasping._episodes(policy.hand, policy.task, studio.labelled, studio.request)
@@ -87,12 +87,12 @@ def test_what_was_drawn_is_tried_first_and_the_others_are_near_it() -> None:
     ("held", "error", "index", "says"),
     [
         ([0, 1, 2], [0.1, 0.0, 0.0], 0, ""),
-        ([0, 1, 2], [1.5, 1.5, 0.0], 2, "this one did better"),
-        ([3], [0.0], 3, "this one held, which what was drawn did not"),
+        ([0, 1, 2], [1.5, 1.5, 0.0], 2, "is better than the drawn grasp: it is 4 mm"),
+        ([3], [0.0], 3, "holds; the drawn grasp does not"),
         ([], [0.0], 0, ""),
     ],
 )
-def test_what_was_drawn_is_shown_unless_another_is_clearly_better(held, error, index, says):
+def test_the_drawn_grasp_is_shown_unless_a_variation_is_clearly_better(held, error, index, says):
     found = outcome(held, error)
     removal = int(found.trace.table[:, 0].sum()) - 1
     assert grasping._best(found, (), removal, 0.0) == index
@@ -100,7 +100,7 @@ def test_what_was_drawn_is_shown_unless_another_is_clearly_better(held, error, i
     assert bool(says) == bool(grasping._note(found, index, np.full(ATTEMPTS, 0.004)))
 
 
-def test_a_job_says_for_how_long_it_runs() -> None:
+def test_a_job_shows_its_elapsed_seconds() -> None:
     jobs, done = Jobs(), threading.Event()
     jobs.start(f"compiling, {SECONDS} s of about 60", lambda progress: done.wait(60) and None)
     assert jobs.state()["text"] == "compiling, 0 s of about 60"

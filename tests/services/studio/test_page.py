@@ -1,4 +1,4 @@
-"""The page in a real browser, operated as a person does: by clicking, dragging, and looking at the picture."""
+"""The page in a real browser, operated with the mouse, and checked by its picture."""
 
 import io
 import json
@@ -18,7 +18,7 @@ from congrasp.services.record.reader import read_episodes
 from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import Recordings, TrainingWindow
-from tests import studio as made_up
+from tests import studio as fake
 from tests.studio import BEGIN, DIP
 from tests.waits import eventually
 
@@ -27,15 +27,15 @@ REFERENCE = pathlib.Path(__file__).with_name("first_picture.png")
 
 
 class Site:
-    """A studio that a page can be opened on, with what is behind it."""
+    """A studio with its server, session and fake policy."""
 
     def __init__(self, folder: pathlib.Path):
         when = BEGIN + 10 * DIP
-        made_up.record(folder, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
-        self.grasping = made_up.MadeUpGrasping()
-        self.window: TrainingWindow = made_up.window(100)
+        fake.record(folder, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
+        self.grasping = fake.FakePolicy()
+        self.window: TrainingWindow = fake.window(100)
         self.window.recordings = Recordings(folder)
-        self.session: Session = made_up.session(self.grasping, window=self.window)
+        self.session: Session = fake.session(self.grasping, window=self.window)
         self.server = PageServer(lambda browser: self.session.routes, "127.0.0.1", 0)
 
     @property
@@ -70,7 +70,7 @@ def opened(page: Any, site: Site) -> Any:
 
 
 def picture(page: Any) -> np.ndarray:
-    """(H, W, 3) the three-dimensional picture, 0 to 255, after everything that was asked for is done."""
+    """(H, W, 3) the three-dimensional picture, 0 to 255, once all requests are done."""
     page.wait_for_selector("body:not([data-busy])")
     page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     image = Image.open(io.BytesIO(page.locator("#scene").screenshot())).convert("RGB")
@@ -86,7 +86,7 @@ def red(image: np.ndarray) -> np.ndarray:
 
 
 def on_object(page: Any) -> tuple[float, float]:
-    """A point of the page where the object is, away from the arrow."""
+    """A point of the page on the object, away from the arrow."""
     found = orange(picture(page))
     rows, columns = np.nonzero(found)
     low = rows > np.percentile(rows, 70)
@@ -105,7 +105,7 @@ def drag(page: Any, points: list[tuple[float, float]]) -> None:
 def grasp(page: Any, site: Site) -> str:
     """Grasps; returns the motion's number once it is shown.
 
-    What the server does and what the page shows of it have deadlines of their own: on a busy machine either takes long.
+    Server and page have separate deadlines, since either may take long on a busy machine.
     """
     before = {motion["id"] for motion in site.session.state()["motions"]}
     page.click("#grasp")
@@ -137,11 +137,11 @@ def test_the_first_picture_shows_hand_object_and_arrow(opened: Any) -> None:
 
 
 @pytest.mark.slow
-def test_the_brush_paints_what_it_goes_over(opened: Any, site: Site) -> None:
+def test_the_brush_paints_the_surface_along_its_stroke(opened: Any, site: Site) -> None:
     x, y = on_object(opened)
     before = red(picture(opened)).sum()
     opened.click("[data-tool=avoid]")
-    opened.mouse.move(x, y)  # the brush shows what it would paint, and paints nothing
+    opened.mouse.move(x, y)  # the brush shows its preview, and paints nothing
     hovered = red(picture(opened)).sum()
     assert hovered > before + 50 and site.studio["avoid_share"] == 0
     opened.mouse.move(x, 5)
@@ -192,16 +192,16 @@ def test_a_wrist_path_is_drawn_with_one_stroke(opened: Any, site: Site) -> None:
     drag(opened, [(x + 220, y - 40), (x + 140, y - 70), (x + 60, y - 60), (x + 10, y)])
     opened.wait_for_selector("[data-mask=trajectory][data-on=true]")
     (path,) = (np.array(marker["points"]) for marker in site.studio["markers"] if marker["kind"] == "polyline")
-    assert len(path) == made_up.MadeUpGrasping().task.trajectory_points
+    assert len(path) == fake.FakePolicy().task.trajectory_points
     assert np.linalg.norm(np.diff(path, axis=0), axis=-1).sum() > 0.05
     assert "wrist trajectory guides the wrist" in opened.inner_text("#explanation")
 
 
 @pytest.mark.slow
-def test_constraints_without_tools_of_their_own_are_ticked_flag_by_flag(page: Any) -> None:
-    grasping = made_up.MadeUpGrasping()
+def test_constraints_without_a_drawing_tool_are_set_by_flags(page: Any) -> None:
+    grasping = fake.FakePolicy()
     grasping.task = TaskConfig(constraints=("heading", "affordance", "fingers"))
-    session = made_up.session(grasping)
+    session = fake.session(grasping)
     server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
 
     def fingers() -> list[str]:
@@ -247,7 +247,7 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
     opened.wait_for_selector("#play:has-text('Play')")  # it has come to its end
     opened.locator("#scrub").fill("0")
     first = picture(opened)
-    # The lanes are clicked at their end: the hand has closed, the table is gone, and the heading is met.
+    # A click at the end of the lanes: the hand has closed, the table is removed, and the heading is met.
     box = opened.locator("#timeline").bounding_box()
     opened.mouse.click(box["x"] + 0.97 * box["width"], box["y"] + 10)
     opened.wait_for_selector("[data-lane=heading][data-met=true]")
@@ -278,7 +278,7 @@ def test_a_grasp_is_played_scrubbed_read_and_saved(opened: Any, site: Site, tmp_
 @pytest.mark.slow
 def test_two_motions_are_compared_and_one_is_deleted(opened: Any, site: Site) -> None:
     first = grasp(opened, site)
-    opened.check("[data-ask=affordance]")  # closes the motion: what is edited is seen
+    opened.check("[data-ask=affordance]")  # closes the motion, so that the edit is visible
     opened.wait_for_selector("#player", state="hidden")
     second = grasp(opened, site)
     opened.select_option("#speed", "1")
@@ -310,7 +310,7 @@ def test_on_a_phone_and_in_the_dark_everything_is_within_reach(opened: Any) -> N
         opened.locator("#studio").evaluate("(aside, place) => aside.scrollTo(0, place)", place)
         box = opened.locator("#grasp").bounding_box()
         assert box["y"] > 0 and box["y"] + box["height"] <= 844 and box["width"] > 300
-    corner = picture(opened)[60, 5]  # beside the hand, above the table
+    corner = picture(opened)[60, 5]  # next to the hand, above the table
     assert corner.max() < 60
     opened.emulate_media(color_scheme="light")
     assert picture(opened)[60, 5].min() > 200
@@ -356,7 +356,7 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     opened.click("tr[data-actor=a042]")
     opened.wait_for_selector("#result:has-text('thing-42')")
     # A newer episode of the actor that is watched takes its place by itself.
-    site.window.take(Keys("made-up").log("episode", "actor", "a042"), made_up.actor_episode(77), time.time())
+    site.window.take(Keys("fake").log("episode", "actor", "a042"), fake.actor_episode(77), time.time())
     opened.wait_for_selector("#result:has-text('thing-77')")
     curve = opened.locator("figure[data-curve='episode/success'] canvas")
     box = curve.bounding_box()
@@ -367,9 +367,9 @@ def test_a_training_with_a_hundred_actors_is_watched_and_a_dip_leads_to_its_epis
     opened.wait_for_selector("#result:has-text('thing-2')")
     opened.click("#show-studio")
     opened.wait_for_selector("#player", state="hidden")
-    # Once the run is over and its learner has gone, it is shown whole, and nothing is missed.
+    # After the end of the run, without its learner, everything is still shown, without a warning.
     assert opened.locator("#curves figure").count() == 4
-    site.window.take_status(made_up.status(100) | {"finished": True}, time.time())
+    site.window.take_status(fake.status(100) | {"finished": True}, time.time())
     site.window.take_status(None, time.time())
     opened.click("#show-training")
     opened.wait_for_selector("[data-tile=state] b:has-text('finished')")

@@ -1,4 +1,4 @@
-"""The page's server answers its own page alone, and any request with a result or a message."""
+"""The server answers only its page, and every request with a result or a message."""
 
 import contextlib
 import http.client
@@ -29,11 +29,11 @@ from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.server import STATIC, PageServer, Routes, _Server
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import Recordings, TrainingWindow
-from tests import studio as made_up
+from tests import studio as fake
 
 
 class Page:
-    """Asks as a browser does."""
+    """Sends requests as a browser does."""
 
     def __init__(self, port: int):
         self.port = port
@@ -72,13 +72,13 @@ class Page:
 
 
 @pytest.fixture(scope="module")
-def grasping() -> made_up.MadeUpGrasping:
-    return made_up.MadeUpGrasping()
+def grasping() -> fake.FakePolicy:
+    return fake.FakePolicy()
 
 
 @pytest.fixture(scope="module")
-def page(grasping: made_up.MadeUpGrasping) -> Iterator[Page]:
-    session: Session = made_up.session(grasping, window=made_up.window(5))
+def page(grasping: fake.FakePolicy) -> Iterator[Page]:
+    session: Session = fake.session(grasping, window=fake.window(5))
     server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
     yield Page(server.port)
     server.close()
@@ -101,13 +101,13 @@ def test_a_result_that_is_not_json_is_answered() -> None:
     assert code == 500 and "ValueError" in json.loads(found)["error"]
 
 
-def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which a cookie finds again; what one undoes is its own, and the least recent one of too many ends once idle."""
+def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cookie identifies it, edits and undo are separate, and beyond the limit the least recent idle one ends."""
     monkeypatch.setattr(server_module, "MOST", 2)
     made: list[Session] = []
 
     def new() -> Session:
-        made.append(made_up.session(made_up.MadeUpGrasping()))
+        made.append(fake.session(fake.FakePolicy()))
         return made[-1]
 
     sessions = server_module.Sessions(new)
@@ -133,7 +133,7 @@ def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch)
         assert undoable(cookies[0])  # used more recently than the second
         for path, kind in (("/api/state", "GET"), ("/api/do", "POST")):
             refused = json.loads(page.ask(kind, path, body if kind == "POST" else b"", Cookie=cookies[2])[1])
-            assert "2 browsers use this studio. Come back" in refused["error"] and len(made) == 2
+            assert "2 browsers use this studio. Try again" in refused["error"] and len(made) == 2
         monkeypatch.setattr(server_module, "IDLE", 0.0)
         assert not undoable(cookies[2]) and len(made) == 3
         assert undoable(cookies[0]) and not undoable(cookies[1]) and len(made) == 4
@@ -142,7 +142,7 @@ def test_every_browser_has_a_session_of_its_own(monkeypatch: pytest.MonkeyPatch)
         sessions.close()
 
 
-def test_a_hundred_connections_at_once_find_room() -> None:
+def test_a_hundred_simultaneous_connections_are_accepted() -> None:
     with _Server(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server, contextlib.ExitStack() as stack:
         for _ in range(100):  # none is accepted yet
             stack.enter_context(socket.create_connection(server.server_address[:2], 10.0))
@@ -197,13 +197,13 @@ def test_a_tunnel_and_a_named_proxy_reach_the_page() -> None:
         (b"", "JSON"),
         (b"[1]", "JSON"),
         (b"[" * 100_000, "JSON"),
-        (b'{"action": ["fill"]}', "cannot do"),
+        (b'{"action": ["fill"]}', "no action"),
         (b'{"action": "set_rest_pose", "rest": 0.5}', "no resting pose '0.5'"),
         (b'{"action": "draw", "points": [[0, 0, 0], [1]]}', "'draw' takes other values"),
         (b'{"action": "draw", "points": [[1e308, 0, 0], [-1e308, 0, 0]]}', "within"),
         (b'{"action": "paint", "points": [["x", 0, 0]], "radius": 0.01, "avoid": true}', "'paint' takes other values"),
         (b'{"action": "set_heading", "surface": [1e308, 0, 0], "direction": [0, 0, 1]}', "within"),
-        (b'{"action": "explode"}', "cannot do 'explode'"),
+        (b'{"action": "explode"}', "no action 'explode'"),
         (b'{"action": "set_roll", "turns": 2}', "other values"),
         (b'{"action": "object", "name": "moon"}', "no object 'moon'"),
         (b'{"action": "unit", "unit": "cm"}', "Open a mesh"),
@@ -215,7 +215,7 @@ def test_wrong_requests_are_answered_with_a_message(page: Page, body: bytes, say
     assert code == 200 and says in json.loads(found)["error"]
 
 
-def test_too_much_or_of_no_length_is_refused_before_it_is_read(page: Page) -> None:
+def test_a_body_without_length_or_beyond_the_limit_is_refused_unread(page: Page) -> None:
     for length in (str(1 << 40), "-5", "many", "9" * 5000):
         assert page.ask("POST", "/api/upload?name=a.stl", b"", Content_Length=length)[0] == 413
 
@@ -230,7 +230,7 @@ def test_too_much_or_of_no_length_is_refused_before_it_is_read(page: Page) -> No
         ("X-Nothing: else", 404),
     ],
 )
-def test_a_refused_request_is_answered_before_its_body_comes(page: Page, header: str, code: int) -> None:
+def test_a_refused_request_is_answered_before_its_body_arrives(page: Page, header: str, code: int) -> None:
     right = f"Host: 127.0.0.1:{page.port}", "Content-Type: application/json", f"Content-Length: {128 << 20}"
     lines = [line for line in right if line.partition(":")[0] not in header] + [header]
     with socket.create_connection(("127.0.0.1", page.port), timeout=10) as connection:
@@ -263,25 +263,25 @@ def test_paint_of_no_colour_leaves_the_studio_working(page: Page) -> None:
     assert page.state and page.do("fill", avoid=False)
 
 
-def test_what_no_page_asks_is_a_bad_request(tmp_path: pathlib.Path) -> None:
-    made_up.record(tmp_path, [(made_up.BEGIN, 1)])
-    session = made_up.session(window=TrainingWindow("made-up", Recordings(tmp_path)))
+def test_a_malformed_request_is_a_bad_request(tmp_path: pathlib.Path) -> None:
+    fake.record(tmp_path, [(fake.BEGIN, 1)])
+    session = fake.session(window=TrainingWindow("fake", Recordings(tmp_path)))
     server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
     page = Page(server.port)
     try:
         for name in ("..", "a/..", "a%00.stl", "a%0A.stl", "a" * 300, "%F0%9F%8D%90" * 64):
             code, found = page.ask("POST", f"/api/upload?name={name}", b"solid")
-            assert (code, "is no name of a file" in json.loads(found)["error"]) == (400, True), name
+            assert (code, "is not a file name" in json.loads(found)["error"]) == (400, True), name
         for time_ in ("nan", "inf", "-inf", "1e300", "-1"):
             assert page.ask("GET", f"/api/episodes?time={time_}&seconds=1")[0] == 400, time_
-        assert page.ask("GET", f"/api/episodes?time={made_up.BEGIN}&seconds=nan")[0] == 400
-        assert len(json.loads(page.ask("GET", f"/api/episodes?time={made_up.BEGIN}&seconds=1")[1])["episodes"]) == 1
+        assert page.ask("GET", f"/api/episodes?time={fake.BEGIN}&seconds=nan")[0] == 400
+        assert len(json.loads(page.ask("GET", f"/api/episodes?time={fake.BEGIN}&seconds=1")[1])["episodes"]) == 1
     finally:
         server.close()
         session.close()
 
 
-def test_an_object_weighs_what_it_is_said_to(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+def test_the_mass_of_an_object_is_set(page: Page, grasping: fake.FakePolicy) -> None:
     def mass() -> float:
         return page.state["studio"]["object"]["mass_g"]
 
@@ -295,7 +295,7 @@ def test_an_object_weighs_what_it_is_said_to(page: Page, grasping: made_up.MadeU
     assert mass() == own
 
 
-def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: fake.FakePolicy) -> None:
     page.do("time", approach=1.5, lift=0.2)
     page.do("time", hold=1)
     page.do("grasp")
@@ -305,16 +305,16 @@ def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: made_up.Mad
     assert page.state["phases"] == {"approach": 1.5, "lift": 0.2, "hold": 1.0}
 
 
-def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasping, tmp_path: pathlib.Path) -> None:
+def test_a_grasp_from_request_to_files(page: Page, grasping: fake.FakePolicy, tmp_path: pathlib.Path) -> None:
     page.do("paint", points=[[0.0, 0.0, 0.04]], radius=0.03, avoid=True)
     page.do("grasp")
     page.wait()
     assert tuple(grasping.asked[-1][1].constraints) == ("heading", "affordance")
     motions = page.state["motions"]
-    assert motions[0]["held"] and motions[0]["steps"] == made_up.STEPS
+    assert motions[0]["held"] and motions[0]["steps"] == fake.STEPS
     assert motions[0]["asked"].endswith("from the side")
     played = decode(page.ask("GET", f"/api/motion?id={motions[0]['id']}")[1])
-    assert played.arrays["lane/affordance/met"].shape == (made_up.STEPS,)
+    assert played.arrays["lane/affordance/met"].shape == (fake.STEPS,)
     for kind in ("npz", "mcap"):
         (tmp_path / f"m.{kind}").write_bytes(page.ask("GET", f"/api/export?id={motions[0]['id']}&kind={kind}")[1])
     motion = load_motion(tmp_path / "m.npz")
@@ -324,7 +324,7 @@ def test_a_grasp_from_request_to_files(page: Page, grasping: made_up.MadeUpGrasp
     assert b"Choose from: npz, mcap, glb" in page.ask("GET", "/api/export?id=1&kind=docx")[1]
 
 
-def test_a_fault_inside_is_shown_and_the_studio_continues(page: Page, grasping: made_up.MadeUpGrasping) -> None:
+def test_a_fault_inside_is_shown_and_the_studio_continues(page: Page, grasping: fake.FakePolicy) -> None:
     grasping.fails = "the hand fell off"
     page.do("grasp")
     with pytest.raises(
@@ -345,7 +345,7 @@ def test_a_mesh_becomes_an_object_and_an_empty_file_is_refused(page: Page) -> No
     assert state["upload"]["unit"] == "m" and state["upload"]["file"] == "x.stl"
 
 
-def test_a_mesh_of_unknown_unit_waits_for_it_and_may_get_another(page: Page) -> None:
+def test_a_mesh_of_ambiguous_unit_waits_for_a_choice_that_may_change(page: Page) -> None:
     before = page.state
     page.upload("unknown.stl")
     waiting = page.state
@@ -372,7 +372,7 @@ def test_a_mesh_of_unknown_unit_waits_for_it_and_may_get_another(page: Page) -> 
 
 
 def test_a_second_mesh_of_the_same_name_does_not_touch_the_first(tmp_path: pathlib.Path) -> None:
-    uploads = Uploads(tmp_path, made_up.objects(), made_up.MadeUpImporter())
+    uploads = Uploads(tmp_path, fake.objects(), fake.FakeImporter())
     first, second = uploads.take("model.stl", b"first"), uploads.take("model.stl", b"second")
     assert (first.path.read_bytes(), second.path.read_bytes()) == (b"first", b"second")
     assert first.view()["file"] == second.view()["file"] == "model.stl"
@@ -380,7 +380,7 @@ def test_a_second_mesh_of_the_same_name_does_not_touch_the_first(tmp_path: pathl
         uploads.take("model.txt", b"first")
 
 
-def test_a_mesh_that_comes_during_a_job_is_refused(page, grasping, monkeypatch):
+def test_an_upload_during_a_job_is_refused(page, grasping, monkeypatch):
     begun, free, grasp = threading.Event(), threading.Event(), grasping.grasp
 
     def wait(*asked: Any) -> Any:
@@ -422,7 +422,7 @@ def test_resting_poses_have_thumbnails_and_edits_are_undone(page: Page) -> None:
     assert page.do("undo")["history"] == {"undo": "", "redo": ""}  # nothing of the object before
 
 
-def test_a_run_is_shown_beside_the_studio(page: Page) -> None:
+def test_a_run_is_shown_next_to_the_studio(page: Page) -> None:
     view = page.get("/api/training?names=episode/return")
     assert list(view["curves"]) == ["episode/return"] and len(view["actors"]) == 5
     played = decode(page.ask("GET", "/api/motion?id=actor:a003")[1])

@@ -1,4 +1,4 @@
-"""What a user does in the studio, and what the priority rules make of it."""
+"""Actions of the studio's user, and the effects of the priority rules."""
 
 import dataclasses
 
@@ -71,7 +71,7 @@ def test_the_brush_labels_what_it_touches_and_asks_for_the_affordance(studio: St
     assert not studio.canvas.avoid.any() and studio.asked == set()
 
 
-def test_without_paint_the_affordance_takes_the_parts_that_the_object_came_with(studio: Studio) -> None:
+def test_without_paint_the_affordance_takes_the_parts_of_the_object(studio: Studio) -> None:
     studio.ask("affordance", True)
     np.testing.assert_array_equal(studio.canvas.avoid, MUG.non_graspable_points)
     assert 0 < studio.canvas.paint.shown.mean() < 1
@@ -126,7 +126,7 @@ def test_the_roll_is_the_angle_of_the_cross_finger_axis_from_level(studio: Studi
         )
 
 
-def test_a_drawn_path_keeps_its_begin_and_ends_at_the_wrist_of_the_grasp(studio: Studio) -> None:
+def test_a_drawn_path_keeps_its_beginning_and_ends_at_the_wrist_of_the_grasp(studio: Studio) -> None:
     up = matrix(MUG.rest_poses[0][3:])[2]
     drawn = [studio.arrow.position + up * h for h in (0.35, 0.25, 0.2)]
     studio.draw(drawn)
@@ -140,7 +140,7 @@ def test_a_drawn_path_keeps_its_begin_and_ends_at_the_wrist_of_the_grasp(studio:
     assert studio.trouble == "" and studio.explanation[0].startswith("The wrist trajectory")
 
 
-def test_what_training_would_draw_can_be_suggested(studio: Studio) -> None:
+def test_suggestions_are_drawn_as_in_training(studio: Studio) -> None:
     first = studio.arrow
     studio.suggest("heading")
     assert np.linalg.norm(studio.arrow.position - first.position) > 1e-3
@@ -150,7 +150,7 @@ def test_what_training_would_draw_can_be_suggested(studio: Studio) -> None:
     assert studio.trouble == "" and tuple(studio.request.constraints) == ("heading", "trajectory")
 
 
-def test_suggestions_are_for_the_object_as_it_is_shown(studio: Studio) -> None:
+def test_suggestions_are_for_the_object_without_the_scale_of_training(studio: Studio) -> None:
     larger = Studio(studio.hand, dataclasses.replace(studio.task, object_scale=1.4), MUG)
     for one in (studio, larger):
         one.suggest("heading")
@@ -173,7 +173,7 @@ def test_suggestions_are_for_the_object_as_it_is_shown(studio: Studio) -> None:
         (lambda s: s.set_roll(np.inf), "three numbers"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(studio: Studio, do, says) -> None:
+def test_an_impossible_action_is_an_error(studio: Studio, do, says) -> None:
     with pytest.raises(CongraspError, match=says):
         do(studio)
 
@@ -189,14 +189,14 @@ def test_an_impossible_request_is_explained_before_it_is_sent(studio: Studio) ->
     assert studio.trouble.startswith("Everything is painted")
 
 
-def test_another_object_forgets_what_was_asked_of_the_one_before(studio: Studio) -> None:
+def test_another_object_resets_the_request(studio: Studio) -> None:
     studio.ask("pose", True)
     studio.take(dataclasses.replace(MUG, name="other"))
     assert studio.asked == set() and "pose" not in studio.fields and describe(studio)["object"]["name"] == "other"
 
 
 def same(one: Studio, edit: object) -> bool:
-    """Whether the request is that of an edit, to the last bit."""
+    """True if the request equals that of an edit exactly."""
     return all(np.array_equal(a, b) for a, b in zip(leaves(one.edit), leaves(edit), strict=True))
 
 
@@ -208,7 +208,7 @@ def leaves(tree: object) -> list[object]:
     return [tree]
 
 
-def test_every_edit_is_undone_and_redone_and_a_new_one_ends_what_could_be_redone(studio: Studio) -> None:
+def test_edits_are_undone_and_redone_until_a_new_one(studio: Studio) -> None:
     studio.take(MUG)
     history, up = History(studio), matrix(MUG.rest_poses[0][3:])[2]
     edits = [
@@ -246,7 +246,7 @@ def test_every_edit_is_undone_and_redone_and_a_new_one_ends_what_could_be_redone
     assert same(studio, before)
 
 
-def test_what_one_gesture_does_is_undone_at_once_and_what_fails_is_no_edit(studio: Studio) -> None:
+def test_a_gesture_is_one_edit_and_a_failed_action_is_none(studio: Studio) -> None:
     history, first = History(studio), studio.edit
     for gesture, angle in ((1, 0.1), (1, 0.2), (1, 0.3), (2, 0.4)):
         history.do("set_roll", gesture=gesture, angle=angle)

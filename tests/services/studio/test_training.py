@@ -1,4 +1,4 @@
-"""What is known of a run: curves, a hundred actors, and episodes found by their time."""
+"""The training window: curves, a hundred actors, and episodes found by their time."""
 
 import pathlib
 import struct
@@ -17,15 +17,15 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.studio import training as training_module
 from congrasp.services.studio.training import FIRST, Curve, Follower, Recordings, TrainingWindow, labels_of
-from tests import studio as made_up
+from tests import studio as fake
 from tests.studio import BEGIN, DIP
 from tests.waits import eventually
 
-KEYS = Keys("made-up")
+KEYS = Keys("fake")
 
 
 def test_a_window_shows_a_hundred_actors_with_their_newest_episodes() -> None:
-    window = made_up.window(actors=100)
+    window = fake.window(actors=100)
     view = window.view()
     assert len(view["actors"]) == 100
     row = view["actors"][4]
@@ -38,40 +38,40 @@ def test_a_window_shows_a_hundred_actors_with_their_newest_episodes() -> None:
 
 
 def test_success_is_shown_for_every_constraint_of_the_learners_metrics() -> None:
-    window, key = made_up.window(actors=0), KEYS.log("metrics", "learner", "0")
+    window, key = fake.window(actors=0), KEYS.log("metrics", "learner", "0")
     assert list(window.view()["constraints"]) == ["heading", "pose"]
     window.take(key, Message({}, {"time": BEGIN, "update": 60, "values": {"success/fingers": 0.25}}), time.time())
     assert window.view()["constraints"]["fingers"] == 0.25
 
 
-def test_an_actors_newer_episode_takes_the_place_of_the_one_before() -> None:
-    window = made_up.window(actors=2)
-    newer = made_up.actor_episode(77)
+def test_an_actors_newer_episode_replaces_the_older_one() -> None:
+    window = fake.window(actors=2)
+    newer = fake.actor_episode(77)
     window.take(KEYS.log("episode", "actor", "a001"), newer, time.time())
     assert window.episode("a001") is newer
     assert [row["episodes"] for row in window.view()["actors"]] == [1, 2]
 
 
-def test_actors_that_are_gone_are_forgotten_after_a_while_and_an_absent_learner_is_shown() -> None:
-    window = made_up.window(actors=3)
+def test_departed_actors_expire_and_an_absent_learner_is_shown() -> None:
+    window = fake.window(actors=3)
     now = time.time()
-    window.take_status(made_up.status(2), now + 5)
+    window.take_status(fake.status(2), now + 5)
     assert [row["alive"] for row in window.view()["actors"]] == [True, True, False]
-    window.take_status(made_up.status(2), now + 60)
+    window.take_status(fake.status(2), now + 60)
     assert [row["id"] for row in window.view()["actors"]] == ["a000", "a001"]
     window.take_status(None, now + 61)
     assert window.view()["phase"] == "disconnected" and window.view()["version"] == 12
 
 
 def test_thinned_curves_keep_every_dip() -> None:
-    window = made_up.window(actors=0, updates=5000)
+    window = fake.window(actors=0, updates=5000)
     curve = window.view(["episode/success"], points=100)["curves"]["episode/success"]
     assert len(curve["steps"]) <= 100
     assert curve["values"][curve["steps"].index(DIP)] == 0.1
     assert curve["times"][curve["steps"].index(DIP)] == BEGIN + 10 * DIP
 
 
-def test_a_run_that_went_back_to_a_checkpoint_overwrites_its_curve() -> None:
+def test_a_run_resumed_from_a_checkpoint_overwrites_its_curve() -> None:
     curve = Curve()
     for step, value in ((1, 0.1), (2, 0.2), (3, 0.3), (2, 0.9)):
         curve.add(step, value, 10.0 * step)
@@ -88,7 +88,7 @@ def test_a_run_that_went_back_to_a_checkpoint_overwrites_its_curve() -> None:
     ],
 )
 def test_damaged_messages_are_counted_and_change_nothing(message: Message) -> None:
-    window = TrainingWindow("made-up")
+    window = TrainingWindow("fake")
     for kind in ("metrics", "event", "episode"):
         window.take(KEYS.log(kind, "learner", "0"), message, 0.0)
     assert window.damaged == 3 and window.view()["names"] == {}
@@ -97,15 +97,15 @@ def test_damaged_messages_are_counted_and_change_nothing(message: Message) -> No
 def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_go() -> None:
     hub = MemoryHub()
     learner, mine = MemoryTransport(hub), MemoryTransport(hub)
-    learner.serve(KEYS.status, lambda key, request: Message({}, made_up.status(2) | {"queue": {"length": 0, "limit": 4}}
+    learner.serve(KEYS.status, lambda key, request: Message({}, fake.status(2) | {"queue": {"length": 0, "limit": 4}}
                   | {"counters": dict.fromkeys(("granted", "running", "redeemed", "returned", "expired", "accepted",
                                               "consumed", "dropped", "queued"), 0)}))  # fmt: skip
-    window = TrainingWindow("made-up")
+    window = TrainingWindow("fake")
     follower = Follower(mine, window, every=0.05)
     stop = threading.Event()
     try:
         while not (window.view()["curves"] and window.view()["version"] == 12 and len(window.view()["actors"]) == 2):
-            learner.publish(KEYS.log("metrics", "learner", "0"), made_up.metrics(1))
+            learner.publish(KEYS.log("metrics", "learner", "0"), fake.metrics(1))
             stop.wait(0.05)
         assert window.view()["phase"] == "training"
         learner.close()
@@ -117,7 +117,7 @@ def test_a_follower_feeds_a_window_from_the_wire_and_sees_the_learner_come_and_g
 
 def test_episodes_around_a_time_come_from_finished_and_from_growing_files(tmp_path: pathlib.Path) -> None:
     when = BEGIN + 10 * DIP
-    made_up.record(tmp_path, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
+    fake.record(tmp_path, [(when - 100, 1), (when - 2, 2), (when + 3, 3), (when + 100, 4)])
     recordings = Recordings(tmp_path)
     reach, rows = recordings.around(when, 5.0)
     assert reach == 5.0
@@ -136,11 +136,11 @@ def test_episodes_around_a_time_come_from_finished_and_from_growing_files(tmp_pa
         recordings.episode("nothing")
 
 
-def test_damage_to_a_finished_file_costs_no_more_than_what_is_damaged(tmp_path: pathlib.Path, caplog: Any) -> None:
-    made_up.record(tmp_path, [(BEGIN + n, n) for n in range(3)])
+def test_only_the_damaged_part_of_a_finished_file_is_lost(tmp_path: pathlib.Path, caplog: Any) -> None:
+    fake.record(tmp_path, [(BEGIN + n, n) for n in range(3)])
     file = next(tmp_path.glob("*.mcap"))
     intact = file.read_bytes()
-    made_up.record(tmp_path, [(BEGIN + 700 + n, n) for n in range(3, 6)])
+    fake.record(tmp_path, [(BEGIN + 700 + n, n) for n in range(3, 6)])
 
     def found(place: int) -> list[str]:
         file.write_bytes(intact[:place] + bytes([intact[place] ^ 1]) + intact[place + 1 :])
@@ -156,23 +156,23 @@ def test_damage_to_a_finished_file_costs_no_more_than_what_is_damaged(tmp_path: 
 
 def test_of_many_episodes_the_nearest_are_taken(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training_module, "MOST", 3)
-    made_up.record(tmp_path, [(BEGIN + n, n) for n in range(5)])
+    fake.record(tmp_path, [(BEGIN + n, n) for n in range(5)])
     _, rows = Recordings(tmp_path).around(BEGIN, 1000.0)
     assert [row["actor"] for row in rows] == ["a000", "a001", "a002"]
 
 
 def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.Path) -> None:
     transport = MemoryTransport(MemoryHub())
-    with Recorder(transport, "made-up", tmp_path) as recorder:
+    with Recorder(transport, "fake", tmp_path) as recorder:
         for update in range(40):
-            transport.publish(KEYS.log("metrics", "learner", "0"), made_up.metrics(update))
+            transport.publish(KEYS.log("metrics", "learner", "0"), fake.metrics(update))
         reported = {"time": BEGIN, "version": 39, "values": {"rollouts": 12.0, "steps_per_second": 800.0, "x": 1.0}}
         transport.publish(KEYS.log("metrics", "actor", "a003"), Message({}, reported))
         told = {"time": BEGIN + 400, "level": "info", "text": "The run is complete after 40 updates."}
         transport.publish(KEYS.log("event", "learner", "0"), Message({}, told))
         eventually(lambda: recorder.messages >= 42)
-    made_up.record(tmp_path, [(BEGIN, 3), (BEGIN + 5, 3), (BEGIN + 6, 4)])
-    window = TrainingWindow("made-up", Recordings(tmp_path))
+    fake.record(tmp_path, [(BEGIN, 3), (BEGIN + 5, 3), (BEGIN + 6, 4)])
+    window = TrainingWindow("fake", Recordings(tmp_path))
     window.load()
     assert [row["id"] for row in window.view()["actors"]] == ["a003", "a004"]
     assert window.episode("a004").meta["object"] == "thing-4"
@@ -188,8 +188,8 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
 
 
 def test_a_finished_run_stays_finished_when_its_learner_has_gone() -> None:
-    window = made_up.window(actors=2)
-    window.take_status(made_up.status(2) | {"finished": True}, time.time())
+    window = fake.window(actors=2)
+    window.take_status(fake.status(2) | {"finished": True}, time.time())
     window.take_status(None, time.time())
     view = window.view()
     assert view["phase"] == "finished" and len(view["curves"]) == 6 and view["version"] == 12

@@ -1,4 +1,4 @@
-"""An evaluation's figures say what its JSON says."""
+"""The figures of an evaluation agree with its JSON."""
 
 import json
 import pathlib
@@ -42,7 +42,7 @@ def test_quantiles_are_of_the_successful_episodes(tmp_path: pathlib.Path) -> Non
     assert set(fingers["quantiles"]) == {"fingers_ratio"}
 
 
-def test_the_table_has_every_row_beside_the_papers(tmp_path: pathlib.Path) -> None:
+def test_the_table_has_every_row_with_the_paper_s(tmp_path: pathlib.Path) -> None:
     table = compared([Row.from_json(row) for row in evaluation(tmp_path / "e.json")])
     heading, composed, fingers = table.rows
     assert heading[:5] == ["heading", "40", "75.0 % (59.8-85.8)", "96.9 %", "0.0 %"]
@@ -54,7 +54,7 @@ def test_the_table_has_every_row_beside_the_papers(tmp_path: pathlib.Path) -> No
     assert fingers[at : at + 2] == ["0.250", ""]
 
 
-def test_rows_of_several_policies_are_told_apart(tmp_path: pathlib.Path) -> None:
+def test_rows_of_several_policies_have_different_labels(tmp_path: pathlib.Path) -> None:
     heading, *_ = evaluation(tmp_path / "e.json")
     rows = [Row.from_json(row) for row in (heading, {**heading, "method": "pd", "group": "small"})]
     assert [line[0] for line in compared(rows).rows] == ["heading, human, ours", "heading, small, human, pd"]

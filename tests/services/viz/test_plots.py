@@ -1,4 +1,4 @@
-"""Figures hold every metric once, and their curves are the metrics."""
+"""Figures contain every metric once, and their curves are the metrics."""
 
 import pathlib
 
@@ -67,7 +67,7 @@ def test_a_run_becomes_png_files(tmp_path: pathlib.Path, capsys: pytest.CaptureF
         assert (np.abs(learning - colour).sum(-1) < 10).sum() > 200
 
 
-def test_runs_are_drawn_over_one_another_and_what_never_changes_is_left_out(tmp_path: pathlib.Path) -> None:
+def test_runs_are_overlaid_and_constant_metrics_are_omitted(tmp_path: pathlib.Path) -> None:
     rising, flat = np.arange(4.0), np.full(4, 2.0)
     one = {"learner/0/kl": rising, "learner/0/term/drop": flat, "learner/0/term/contact": flat, "actor/a/queue": rising}
     two = {"learner/0/kl": 2 * rising, "learner/0/term/drop": flat, "learner/0/term/contact": 3 * flat}
@@ -87,7 +87,7 @@ def test_runs_are_drawn_over_one_another_and_what_never_changes_is_left_out(tmp_
         plot((tmp_path / "a", tmp_path / "b"))
 
 
-def test_every_metric_of_an_episode_has_a_title_of_its_own() -> None:
+def test_every_metric_of_an_episode_has_a_different_title() -> None:
     task = TaskConfig(constraints=tuple(constraint.name for constraint in CONSTRAINTS))
     titles = {name: titled(name)[0] for name in episode_fields(task)}
     assert len(set(titles.values())) == len(titles)
@@ -104,12 +104,12 @@ def test_smoothing_is_the_mean_of_the_last_values(values: list[float], window: i
     np.testing.assert_allclose(smooth(np.array(values), window), expected, atol=1e-9)
 
 
-def test_smoothing_skips_what_is_absent_and_keeps_constants() -> None:
+def test_smoothing_ignores_nan_and_keeps_constants() -> None:
     np.testing.assert_allclose(smooth(np.array([np.nan, 1.0, np.nan, 3.0]), 3), [np.nan, 1.0, 1.0, 2.0])
     assert (smooth(np.full(500, 5e-4), 12) == 5e-4).all()
 
 
-def test_nothing_to_draw_is_said_in_words(tmp_path: pathlib.Path) -> None:
+def test_recordings_without_metrics_are_an_error(tmp_path: pathlib.Path) -> None:
     with pytest.raises(CongraspError, match="no recording"):
         plot_runs([tmp_path], tmp_path)
     LogWriter(tmp_path / "logs", "log").close()

@@ -1,4 +1,4 @@
-"""Pictures show what is there, where it is, and in the right colours."""
+"""Pictures show all shapes, in their places and colours."""
 
 import dataclasses
 import os
@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.skin import skin_of
+from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import encode
 from congrasp.services.cli.main import load
-from congrasp.services.record.palette import AVOID, FLESH, GRASPABLE
+from congrasp.services.record.palette import FLESH
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.record.writer import Entry, LogWriter, opaque_channel
 from congrasp.services.viz.hand_sheets import hand_sheet
@@ -81,7 +82,7 @@ def test_the_nearer_shape_hides_the_other() -> None:
     assert seen[50, 50] == 1 and seen[35, 50] == 0 and seen[0, 0] == -1
 
 
-def test_what_is_seen_through_takes_its_share_of_the_colour() -> None:
+def test_a_transparent_shape_takes_its_share_of_the_colour() -> None:
     pane = box((0.02, 0.4, 0.4), BLUE, (0.3, 0, 0), alpha=0.5)
     plain, through = render_scene([ball()], FRONT, (61, 61)), render_scene([ball(), pane], FRONT, (61, 61))
     center_plain, center = plain[30, 30].astype(int), through[30, 30].astype(int)
@@ -109,10 +110,8 @@ def test_a_ball_darkens_the_ground_beneath_it() -> None:
 def test_painted_regions_meet_where_their_points_do() -> None:
     mesh = trimesh.creation.box((0.2, 0.2, 0.2))
     points = np.array([[0.1, y, z] for y in np.linspace(-0.1, 0.1, 11) for z in np.linspace(-0.1, 0.1, 11)])
-    colours = np.where(points[:, 2:] > 0, RED, BLUE)
-    painted = Shape(
-        "mesh", (0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint_points=points, paint_colours=colours
-    )
+    paint = Colours(points, np.where(points[:, 2:] > 0, (255, 0, 0), (0, 0, 255)).astype(np.uint8))
+    painted = Shape("mesh", (0, 0), WHITE, vertices=mesh.vertices, faces=mesh.faces, paint=paint)
     image = render_scene([painted], FRONT, (60, 60)).astype(int)
     assert image[20, 30, 0] > 2 * image[20, 30, 2] and image[40, 30, 2] > 2 * image[40, 30, 0]
 
@@ -147,7 +146,7 @@ def test_a_mesh_is_cut_without_a_change_of_its_surface() -> None:
     assert mesh.area == pytest.approx(box.area) and mesh.volume == pytest.approx(box.volume)
 
 
-def test_between_and_arrow_lie_where_they_are_asked_to() -> None:
+def test_between_and_arrow_connect_their_points() -> None:
     start, end = np.array([0.1, -0.2, 0.3]), np.array([-0.2, 0.1, 0.1])
     capsule = between(start, end, 0.01, RED)
     axis = Rotation.from_quat(capsule.quaternion, scalar_first=True).apply([0, 0, capsule.size[1]])
@@ -169,7 +168,7 @@ def test_beads_are_one_shape_at_the_points() -> None:
     np.testing.assert_allclose(mesh.vertices.max(0), [0.01, 0.11, 0.11], atol=1e-3)
 
 
-def test_the_camera_just_holds_all_points() -> None:
+def test_the_camera_just_contains_all_points() -> None:
     points = np.random.default_rng(0).normal(size=(50, 3)) * [0.1, 0.2, 0.3] + [1, 2, 3]
     camera = fit(points, np.array([1.0, 0.5, 0.4]), 1.0)
     places = projected(camera, points)
@@ -185,7 +184,7 @@ def test_steps_of_a_sheet_include_the_ends_and_the_removal() -> None:
     assert key_steps(np.ones(3, bool), 8) == [0, 1, 2]
 
 
-def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
+def test_links_in_contact_and_the_avoid_region_are_coloured() -> None:
     skinned, body, *_ = episode_shapes(episode(), 11)
     hand = get_hand("human")
     assert skinned.colours is not None
@@ -195,13 +194,13 @@ def test_links_in_contact_and_the_forbidden_region_are_coloured() -> None:
     thumb = skinned.colours[skin_of(hand).weights[:, hand.tip_links[0]] > 0.99]
     # FORCE of 1.5 N is three quarters of the full contact colour's 2 N: 0.3 + 0.3 * 0.75 of it.
     np.testing.assert_allclose(thumb[0], np.array(FLESH) + 0.525 * np.subtract(TOUCHING, FLESH), atol=0.01)
-    assert body.paint_colours is not None
+    assert body.paint is not None
     minus = episode().arrays["surface_avoid"]
-    np.testing.assert_allclose(body.paint_colours, np.where(minus[:, None], AVOID, GRASPABLE))
-    assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint_points is None
+    np.testing.assert_array_equal(body.paint.values, np.where(minus[:, None], (204, 41, 41), (51, 166, 82)))
+    assert episode_shapes(episode(mask=(0, 0, 0, 0)), 0)[1].paint is None
 
 
-def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_through() -> None:
+def test_the_table_is_drawn_until_its_removal_and_the_reference_pose_is_transparent() -> None:
     def flat(step: int) -> bool:
         return any(shape.kind == "table" for shape in episode_shapes(episode(), step))
 
@@ -211,7 +210,7 @@ def test_the_table_is_drawn_while_it_is_there_and_the_reference_pose_is_seen_thr
     np.testing.assert_allclose(ghost.vertices, episode_shapes(episode(), 11)[0].vertices, atol=1e-5)
 
 
-def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
+def test_frames_share_one_camera_that_contains_hand_and_object() -> None:
     camera = camera_of(episode(), [0, 6, 11], 1.0)
     for step in (0, 11):
         assert np.abs(projected(camera, episode().arrays["link_position"][step].astype(float))).max() < 1
@@ -227,13 +226,13 @@ def test_frames_share_one_camera_that_holds_hand_and_object() -> None:
     assert np.abs(frames[0].astype(int) - frames[1]).max() > 50
 
 
-def test_a_view_shows_what_touches_and_the_second_one_is_from_its_side() -> None:
+def test_the_best_view_shows_the_contacts_and_the_second_is_from_its_side() -> None:
     best, aside = views(episode(), [11])
     assert abs((best.azimuth - aside.azimuth + 180) % 360 - 180) >= 75
     hand, arrays = get_hand("human"), episode().arrays
     capsules = capsule_shapes(hand, arrays["link_position"][11], arrays["link_quaternion"][11])
     shapes = [*capsules, *episode_shapes(episode(), 11, overlays=False)[1:2]]
-    tips = np.isin([*hand.capsule_links, -1], hand.tip_links)  # what touches
+    tips = np.isin([*hand.capsule_links, -1], hand.tip_links)  # in contact
 
     def shown(view: View) -> int:
         seen = visible(shapes, camera_of(episode(), [11], view=view), (192, 144))
@@ -267,7 +266,7 @@ def test_a_sheet_keeps_its_pictures_and_shrinks_long_titles() -> None:
         contact_sheet(images, ["a"], 2)
 
 
-def test_the_title_says_what_was_asked_and_how_it_went() -> None:
+def test_the_title_names_the_constraints_and_the_outcome() -> None:
     title = episode_title(episode(mask=(1, 0, 0, 1), success=False))
     for words in ("human hand", "cylinder-0", "heading + affordance + trajectory", "no success", "return 12.5", "3"):
         assert words in title
@@ -287,10 +286,7 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
         with pytest.raises(CongraspError, match="holds"):
             pick_episode(tmp_path / "run", index, success=success)
     out = tmp_path / "out.png"
-    # An older name of --frames.
-    assert (
-        load("render")(["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", "--moments", "1"])() == 0
-    )
+    assert load("render")(["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", "--frames", "1"])() == 0
     assert 400 < Image.open(out).size[0] < 600
     frames = render_episode_frames(pick_episode(tmp_path / "run", 0), range(4), (64, 48))
     save_video(tmp_path / "film.mp4", frames, (64, 48), 0.5 / CONTROL_DT)
@@ -308,7 +304,7 @@ def test_a_video_runs_in_real_time_to_its_last_step_and_shows_no_overlays(tmp_pa
     assert len(bare) == 2 and len(marked) > 2
 
 
-def test_pictures_need_no_folder_that_can_be_written() -> None:
+def test_pictures_need_no_writable_folder() -> None:
     script = (
         "import numpy as np; from congrasp.services.viz import kernels; print(kernels.averaged(np.ones((2, 2, 3)), 2))"
     )
