@@ -53,7 +53,7 @@ class Shown(NamedTuple):
 
 
 SHOWN = (
-    Shown("mug", "examples/mug.obj", options={"affordance": "examples/handle.obj"}, film=True),
+    Shown("mug", "examples/mug.obj", rest="upright", options={"affordance": "examples/handle.obj"}, film=True),
     Shown("drill", "drill:2", options={"affordance": "grip"}),
     Shown("wine-glass", "wineglass", rest="upright"),
     Shown("water-bottle", "waterbottle", rest="upright"),
