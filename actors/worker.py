@@ -72,14 +72,20 @@ class RolloutWorker:
             taught=taught,
         )
         self.physics, self.env, self.batch = physics, self.programs.env, batch
-        self._hand, self._task, self._bank, self._staggered = hand, task, _on_device(bank), staggered
+        self._hand, self._task, self._staggered = hand, task, staggered
+        self._bank: ConstraintBank | None = None
         self._settings, self._stationary = self.env.settings, np.array(False)
         if privileged:
             self.adjust(masses=_masses(privileged))
         self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
         self.state: EnvState | None = None
         if bank is not None:
-            self.restart()
+            self.start(bank)
+
+    def start(self, bank: ConstraintBank) -> None:
+        """Starts episodes of this bank in every environment."""
+        self._bank = _on_device(bank)
+        self.restart()
 
     def adjust(self, **settings: Any) -> None:
         """Changes `Settings` by name from the next control step on; new types or shapes are recompiled."""
@@ -139,18 +145,29 @@ class RolloutWorker:
         """Observation (B, D) of the current control step by the policy."""
         return self.programs.look(self.state, self._settings).observation
 
-    def compile(self, parameters: Any, steps: int) -> None:
-        """Compiles the programs of `collect` and `renew_references` without running them; for compiled engines.
+    def compile(self, form: ConstraintBank, parameters: Any, steps: int) -> None:
+        """Compiles the programs of `start`, `collect` and `renew_references`, for compiled engines.
 
         Args:
-          parameters: parameters of the policy, as for `collect`.
+          form: shapes of the bank (`common.task.sampling.build.bank_form`); no bank is needed yet.
+          parameters: parameters of the policy, or their shapes.
           steps: number T of steps.
         """
-        given, grasps = self._scan_arguments(parameters, self._key), self.state.grasps if self.state else None
-        programs = [self.programs.scan.lower(*given, steps=steps)]
-        programs.append(harvest.renew.lower(self._hand, self._task, self._bank, grasps, self._key))
-        with concurrent.futures.ThreadPoolExecutor(len(programs)) as threads:
-            list(threads.map(lambda program: program.compile(), programs))
+        key, programs, stationary = self._key, self.programs, self._stationary
+        form, parameters = _shapes((form, parameters))
+        conditions = _shapes(jax.eval_shape(programs.sample, form, key, stationary))
+        state = _shapes(jax.eval_shape(programs.begin, conditions, None))
+        given = parameters, self._settings, stationary, form, (state, key), key
+        lowerings: list[Callable[[], jax.stages.Lowered]] = [
+            lambda: programs.scan.lower(*given, steps=steps),
+            lambda: programs.sample.lower(form, key, stationary),
+            lambda: programs.begin.lower(conditions, None),
+            lambda: harvest.renew.lower(self._hand, self._task, form, state.grasps, key),
+        ]
+        with concurrent.futures.ThreadPoolExecutor(len(lowerings)) as threads:
+            # Each is compiled while the next one is lowered, which takes Python's lock.
+            for compiled in [threads.submit(lower().compile) for lower in lowerings]:
+                compiled.result()
 
     @property
     def bank(self) -> ConstraintBank:
@@ -239,6 +256,12 @@ class RolloutWorker:
 def _on_device(tree: Any) -> Any:
     """Commits the arrays to this process's device: uncommitted ones would cause another compilation."""
     return jax.device_put(tree, jax.local_devices()[0])
+
+
+def _shapes(tree: Any) -> Any:
+    """Shapes and types of the arrays of a tree, on this process's device."""
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.tree.map(lambda array: jax.ShapeDtypeStruct(array.shape, array.dtype, sharding=device), tree)
 
 
 def _masses(objects: Sequence[GraspObject]) -> Array:

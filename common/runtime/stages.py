@@ -70,8 +70,8 @@ def _add(name: str, seconds: float) -> None:
     _log.info("Start: %s took %.1f s, until %.1f s after the start of the process.", name, seconds, ended)
 
 
-def _add_program(event: str, seconds: float, **about: str | int) -> None:
+def _add_program(event: str, duration_secs: float, **about: str | int) -> None:
     """Records JAX's work on a program, by the program's name."""
-    if event in _PROGRAM_WORK and seconds >= _PROGRAM_SECONDS:
+    if event in _PROGRAM_WORK and duration_secs >= _PROGRAM_SECONDS:
         name = str(about.get("fun_name")).removeprefix("jit(").removesuffix(")")
-        _add(f"{_PROGRAM_WORK[event]} {name}", seconds)
+        _add(f"{_PROGRAM_WORK[event]} {name}", duration_secs)

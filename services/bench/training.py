@@ -263,7 +263,7 @@ def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) 
     imported()
     programs = collections.Counter[str]()
 
-    def count(event: str, seconds: float, **about: str | int) -> None:
+    def count(event: str, duration_secs: float, **about: str | int) -> None:
         if event.endswith("backend_compile_duration"):
             programs[str(about.get("fun_name"))] += 1
 

@@ -1,6 +1,7 @@
 """Episodes: sampling, protocol, success, and rollouts that continue."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -264,19 +265,31 @@ class _Touching:
         )
 
 
-def test_a_continuing_environment_keeps_its_contacts_when_another_restarts():
+def _compiled(caplog):
+    """Names of the programs that this thread lowered or compiled."""
+    found = [re.search(r"(conversion|compilation of) jit\((\w+)\)", record.getMessage()) for record in caplog.records]
+    return {match[2] for match in found if match}
+
+
+def test_a_continuing_environment_keeps_its_contacts_when_another_restarts(caplog):
     """A compiled engine's program is one loop, which shares nothing with other tests': here of headings alone."""
     physics, task = _Touching(), dataclasses.replace(TASK, constraints=("heading",))
     worker = RolloutWorker(
-        HAND, task, physics, suite.bank(), suite.commanded, batch=2, seed=0, half_precision=False, traced="none"
+        HAND, task, physics, None, suite.commanded, batch=2, seed=0, half_precision=False, traced="none"
     )
-    state = worker.state
-    worker.state = state._replace(
-        time=jnp.array([120, 120]),
-        hold=jnp.array([25, 100]),
-        success=state.success._replace(links_at_removal=jnp.ones(2)),
-    )
-    rollout = worker.collect(NOISY, 7)
+    with jax.log_compiles():  # its programs are compiled before there is a bank or a policy, and not again
+        worker.compile(jax.eval_shape(suite.bank), jax.ShapeDtypeStruct(NOISY.shape, NOISY.dtype), 7)
+        ahead = _compiled(caplog)
+        caplog.clear()
+        worker.start(suite.bank())
+        state = worker.state
+        worker.state = state._replace(
+            time=jnp.array([120, 120]),
+            hold=jnp.array([25, 100]),
+            success=state.success._replace(links_at_removal=jnp.ones(2)),
+        )
+        rollout = worker.collect(NOISY, 7)
+    assert ahead == {"_scan", "_sample", "_begin", "renew"} and not ahead & _compiled(caplog)
     flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation
     assert np.argwhere(rollout.truncated).tolist() == [[4, 0]]
     touching = np.asarray(rollout.observation)[..., flags : flags + len(HAND.links)].all(-1)
