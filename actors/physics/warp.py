@@ -95,7 +95,6 @@ class WarpBuffers:
                 np.stack([model.actuator_gainprm[where.motors, 0], *model.actuator_biasprm[where.motors, 1:3].T], -1),
                 dtype=wp.vec3,
             )
-        wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
         leaves.object_body, leaves.object_dof = where.object_body, where.object_qvel[0]
         leaves.base_body, leaves.table, leaves.anchor = where.base_body, where.table_mocap, where.anchor_mocap
         leaves.weld, leaves.table_away = where.weld, TABLE_AWAY[2]
@@ -105,6 +104,7 @@ class WarpBuffers:
         self._blind = self._sensing | mujoco_warp.DisableBit.SENSOR
         background = concurrent.futures.ThreadPoolExecutor(1, "kernels")
         self._kernels = background.submit(_load_kernels, device, self._variants())
+        wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
 
     def fill(self, objects: Objects, meshes: dict[str, Any]) -> None:
         """Sets the sources of the environments' fields: rows, and the fields of the model with their meshes."""
