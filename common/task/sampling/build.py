@@ -80,7 +80,7 @@ def bank_form(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> C
       CongraspError: the object is too wide, or cannot be approached in any resting pose.
     """
     example = max(objects, key=lambda obj: len(obj.rest_poses))
-    row = headings_of(task, example, (0, 0), scale=object_scale(hand, task), hand=outline(hand))
+    row = headings_of(task, example, (0, 0), scale=object_scale(hand, task))  # a hand's outline takes seconds
     bank = with_columns(hand, task, _bank_of(hand, task, [example], [row], 0, _no_references))
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((len(objects), *leaf.shape[1:]), leaf.dtype), bank)
 
