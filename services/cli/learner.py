@@ -76,7 +76,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
       congrasp learner --preset human --run-dir runs/human --listen tls/0.0.0.0:7447 --certs certs
       congrasp learner --run-dir runs/human --resume
     """
-    from congrasp.common.runtime.stages import imported, stage
+    from congrasp.common.runtime.stages import imported
     from congrasp.common.transport import urls
     from congrasp.learner.distributed.ranks import Ranks, end_process
     from congrasp.learner.run_directory import listening
@@ -101,9 +101,8 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
             imported()
             if rank == 0:
                 options.prepare(config)
-            with stage("join of the ranks"):
-                ranks = Ranks.join(rank, options.ranks, options.coordinator)
-                config = run_config_from_json(ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
+            ranks = Ranks.join(rank, options.ranks, options.coordinator)
+            config = run_config_from_json(ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
             with listening(run_dir, reachable_url(url)) if rank == 0 else contextlib.nullcontext():
                 learn(
                     run_dir,
