@@ -138,7 +138,7 @@ class RolloutWorker:
             self.state = self.programs.restart(self.state, mask, conditions)
             return
         self.physics.reset(None, mask, conditions.reset_state)
-        state = self.programs.merge(self.state._replace(views=None), mask, conditions)
+        state = self.programs.restart(self.state._replace(views=None), mask, conditions)
         self.state = self.programs.with_scene(state, self.physics.read(None))
 
     def observe(self) -> Array:
@@ -228,9 +228,8 @@ class RolloutWorker:
             extras.append(kept)
             if self._bank is not None and np.asarray(transition.terminal).any():
                 self._episode_key, episode_key = _split(self._episode_key)
-                fresh = self.programs.sample(self._bank, episode_key, self._stationary)
-                self.physics.reset(None, transition.terminal, fresh.reset_state)
-                state = self.programs.merge(state, transition.terminal, fresh)
+                state = self.programs.renew(self._bank, state, episode_key, self._stationary, transition.terminal)
+                self.physics.reset(None, transition.terminal, state.reset_state)
                 physics_state = self.physics.read(None)
                 state_key = jax.random.wrap_key_data(key_data[step])
                 scene = self.programs.with_scene(state, physics_state)
