@@ -17,7 +17,7 @@ from congrasp.actors.harvest import save_references, with_kept_references
 from congrasp.actors.link import ActorLink, RunFinished, RunInfo, RunRestarted, Ticket
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import Rollout, Trace, finished_episodes
-from congrasp.actors.training_set import FailureWeights, training_set
+from congrasp.actors.training_set import FailureWeights, TrainingSet, training_set
 from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import RunConfig, run_config_from_json
 from congrasp.common.errors import CongraspError
@@ -199,7 +199,7 @@ class _Actor:
             privileged=() if PRIVILEGED.keys().isdisjoint(arrays) else self._objects,
         )
         with concurrent.futures.ThreadPoolExecutor(1, "programs") as meanwhile:
-            programs = meanwhile.submit(self._compile, training.form)
+            programs = meanwhile.submit(self._compile, training)
             bank = training.bank
             if self._references:
                 bank = with_kept_references(self._references, self._hand, config.task, bank)
@@ -212,11 +212,11 @@ class _Actor:
         self._rollouts = self._next_episode = 0
         self._follower = Follower()
 
-    def _compile(self, form: ConstraintBank) -> None:
-        """Compiles the programs of a compiled engine's rollouts for banks of this form."""
+    def _compile(self, training: TrainingSet) -> None:
+        """Compiles the programs of a compiled engine's rollouts before the bank of the training set is built."""
         if self._physics.compiled:
             with stage("programs"):
-                self._worker.compile(form, self._spec.inference_form, self._config.rollout_steps)
+                self._worker.compile(training.form(), self._spec.inference_form, self._config.rollout_steps)
 
     def act(self, stop: threading.Event) -> None:
         """Produces rollouts until `stop` is set or the run ends."""

@@ -25,11 +25,13 @@ class TrainingSet:
 
     Attributes:
       objects: the objects.
-      form: shapes and types of the bank (`bank_form`), which are known before it.
+      form: returns shapes and types of the bank (`bank_form`), which are known before it.
     """
 
-    def __init__(self, objects: list[GraspObject], form: ConstraintBank, build: Callable[[], ConstraintBank]):
-        """Keeps the function that builds the bank."""
+    def __init__(
+        self, objects: list[GraspObject], form: Callable[[], ConstraintBank], build: Callable[[], ConstraintBank]
+    ):
+        """Keeps the functions; nothing is built yet."""
         self.objects, self.form, self._build = objects, form, build
 
     @functools.cached_property
@@ -58,8 +60,8 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
     if not objects.folder:
         with stage("objects"):
             pool = scale_objects(hand, task, load_pool(objects, number))
-        build = functools.partial(build_bank, hand, task, pool, seed)
-        return TrainingSet(pool, bank_form(hand, task, pool), build)
+        form = functools.partial(bank_form, hand, task, pool)
+        return TrainingSet(pool, form, functools.partial(build_bank, hand, task, pool, seed))
     found, sets = load_pool(objects), list[Message]()
     if objects.constraints:
         found, sets = load_for(pathlib.Path(objects.constraints), found, objects.split)
@@ -89,7 +91,7 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
 
 def _built(objects: list[GraspObject], bank: ConstraintBank) -> TrainingSet:
     """The training set of a bank."""
-    return TrainingSet(objects, jax.eval_shape(lambda: bank), lambda: bank)
+    return TrainingSet(objects, lambda: jax.eval_shape(lambda: bank), lambda: bank)
 
 
 _MEMORY = 50.0
