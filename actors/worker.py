@@ -108,24 +108,43 @@ class RolloutWorker:
     def restart(self) -> None:
         """Starts new episodes in every environment."""
         self._episode_key, key = _split(self._episode_key)
-        conditions = self.programs.sample(self._bank, key, self._stationary)
-        if self._staggered:
-            whole = self._task.approach_steps + np.asarray(conditions.hold)
-            share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
-            conditions = conditions._replace(hold=_on_device(np.int32(conditions.hold - np.floor(share * whole))))
-        self.begin(conditions)
+        if self.physics.compiled:
+            conditions = self.programs.sample(self._bank, key, self._stationary)
+            return self.begin(conditions._replace(hold=self._staggered_hold(conditions.hold, key)))
+        # By the program that replaces finished episodes: another one would take as long to compile.
+        state = (self.state or self._blank(key))._replace(views=None)
+        state = self.programs.renew(self._bank, state, key, self._stationary, np.ones(self.batch, bool))
+        self._place(state._replace(hold=self._staggered_hold(state.hold, key)))
+
+    def _blank(self, key: Array) -> EnvState:
+        """An engine's environments before their first episodes."""
+        conditions = jax.eval_shape(self.programs.sample, self._bank, key, self._stationary)
+        form = jax.eval_shape(self.programs.begin, conditions, None)
+        return jax.tree.map(lambda array: _on_device(np.zeros(array.shape, array.dtype)), form)
+
+    def _staggered_hold(self, hold: Array, key: Array) -> Array:
+        """Control steps (B,) without the table of first episodes, which end early at different times if they shall."""
+        if not self._staggered:
+            return hold
+        whole = self._task.approach_steps + np.asarray(hold)
+        share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
+        return _on_device(np.int32(hold - np.floor(share * whole)))
 
     def begin(self, conditions: InitialConditions) -> None:
         """Starts these episodes, one in each environment."""
-        kept, conditions = self.state, _on_device(conditions)
+        conditions = _on_device(conditions)
         if self.physics.compiled:
-            self.state = self.programs.begin(conditions, _on_device(kept))
-            return
-        if kept is None:
-            self.physics.start(conditions.reset_state)
+            self.state = self.programs.begin(conditions, _on_device(self.state))
         else:
-            self.physics.reset(None, np.ones(self.batch, bool), conditions.reset_state)
-        state = self.programs.begin(conditions, None)
+            self._place(self.programs.begin(conditions, None))
+
+    def _place(self, state: EnvState) -> None:
+        """Starts the engine's environments, of an engine that is not compiled, at the beginning of these episodes."""
+        kept = self.state
+        if kept is None:
+            self.physics.start(state.reset_state)
+        else:
+            self.physics.reset(None, np.ones(self.batch, bool), state.reset_state)
         self.state = self.programs.with_scene(state._replace(views=None), self.physics.read(None))
         if kept is not None:
             self.state = self.state._replace(grasps=kept.grasps)
