@@ -7,13 +7,14 @@ compiled halves (`actors.worker`); for traceable engines `step` combines all thr
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from congrasp.actors import harvest
 from congrasp.actors import stress as protocols
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
-from congrasp.actors.physics.engine import Physics, PhysicsState, ResetState, where_environments
+from congrasp.actors.physics.engine import Physics, PhysicsState, ResetState
 from congrasp.actors.stress import Frame, Protocol
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
@@ -201,12 +202,17 @@ class GraspEnv:
 
     def state_of(self, initial: InitialConditions, physics: Any) -> EnvState:
         """Returns the state of episodes whose engine was just started from their `reset_state`."""
+        state = self._begun(initial)._replace(physics=physics)
+        return state if self._engine is None else self.with_scene(state, self._engine.read(physics))
+
+    def _begun(self, initial: InitialConditions) -> EnvState:
+        """State of episodes that begin, without their engine and their scene."""
         batch = initial.reset_state.q.shape[0]
         zero, no, index = jnp.zeros(batch), jnp.zeros(batch, bool), jnp.zeros(batch, jnp.int32)
         reset_state = initial.reset_state
         sums = {**metrics.empty_sums(self.task, batch), **dict.fromkeys(("return", *FORCES), zero)}
-        state = EnvState(
-            physics=physics,
+        return EnvState(
+            physics=None,
             views=None,
             reset_state=reset_state,
             goal=initial.goal,
@@ -227,20 +233,33 @@ class GraspEnv:
             finished=jnp.zeros((batch, len(episode_fields(self.task)))),
             has_finished=no,
         )
-        return state if self._engine is None else self.with_scene(state, self._engine.read(physics))
 
-    def restart(self, state: EnvState, mask: Array, initial: InitialConditions) -> EnvState:
-        """Starts new episodes in the masked environments (B,); the others continue, with their contacts."""
-        physics = self._traced.reset(state.physics, mask, initial.reset_state)
-        return self.merge(state, mask, self.state_of(initial, physics))
+    def restart(self, state: EnvState, rows: Array, initial: InitialConditions) -> EnvState:
+        """Starts K new episodes; the other environments continue, with their contacts.
 
-    def merge(self, state: EnvState, mask: Array, fresh: EnvState) -> EnvState:
-        """Selects `fresh` in the masked environments (B,) for all episode fields; the engine is already merged."""
-        kept: dict[str, Any] = {name: getattr(state, name) for name in ("grasps", "finished", "has_finished")}
-        views = None if self._engine is None else where_environments(mask, fresh.views, state.views)
-        apart: dict[str, Any] = {"physics": None, "views": None}
-        merged = where_environments(mask, fresh._replace(**kept, **apart), state._replace(**apart))
-        return merged._replace(physics=fresh.physics, views=views)
+        Only the episodes that start are computed: sampling them and their scene cost several times a step of the task.
+
+        Args:
+          state: the environments; an engine that is stepped outside is reset separately, to the new `reset_state`.
+          rows: (K,) int, environments in which the episodes start; numbers from B on are ignored.
+          initial: the episodes (K,).
+        """
+
+        def placed(new: Any, old: Any) -> Any:
+            return jax.tree.map(lambda some, every: every.at[rows].set(some, mode="drop"), new, old)
+
+        fresh, names = self._begun(initial), ("physics", "views", "grasps", "finished", "has_finished")
+        kept: dict[str, Any] = {name: getattr(state, name) for name in names}
+        without: dict[str, Any] = dict.fromkeys(names)
+        merged: EnvState = placed(fresh._replace(**without), state._replace(**without))._replace(**kept)
+        if self._engine is None:
+            return merged
+        started = jnp.zeros(len(state.time), bool).at[rows].set(True, mode="drop")
+        physics = self._engine.reset(state.physics, started, merged.reset_state)
+        seen = self._engine.read(physics)
+        some: dict[str, Any] = {name: array[rows] for name, array in seen._asdict().items() if name != "occupancy"}
+        scene = self.with_scene(fresh, seen._replace(**some))
+        return merged._replace(physics=physics, views=placed(scene.views, state.views))
 
     def step(self, state: EnvState, action: Array, settings: Settings | None = None) -> tuple[EnvState, Transition]:
         """Simulates one control step of a traceable engine; finished episodes are not restarted.

@@ -65,7 +65,13 @@ class RequestedEpisodes(NamedTuple):
 
 
 def sample(
-    hand: Hand, task: TaskConfig, bank: ConstraintBank, key: Array, batch: int, stationary: Array | bool = False
+    hand: Hand,
+    task: TaskConfig,
+    bank: ConstraintBank,
+    key: Array,
+    batch: int,
+    stationary: Array | bool = False,
+    rows: Array | None = None,
 ) -> InitialConditions:
     """Draws objects, resting poses, constraints and initial hands at random.
 
@@ -78,13 +84,17 @@ def sample(
       key: random key.
       batch: number B of episodes.
       stationary: () bool, fixes the objects (the paper's first phase).
+      rows: (K,) int, draws only these of the B episodes; all by default.
     """
-    uniform = _uniforms(hand, task, key, batch)
+    uniform, sensors = _uniforms(hand, task, key, batch), draw_sensors(task.sensing, task.control_dt, key, batch)
+    if rows is not None:
+        uniform, sensors = jax.tree.map(lambda numbers: numbers[rows], (uniform, sensors))
     episode = uniform[_TRAINING].T
+    count = len(episode[0])
     objects, rests = chance.weighted(episode[0], bank.weight), chance.index(episode[1], bank.rest.shape[1])
     # A constraint that is never requested is a constant, so that its share of the program is not even compiled.
     wanted = {
-        c.name: uniform[c.name][:, 0] < share if (share := getattr(task, f"p_{c.name}")) else jnp.zeros(batch, bool)
+        c.name: uniform[c.name][:, 0] < share if (share := getattr(task, f"p_{c.name}")) else jnp.zeros(count, bool)
         for c in optional(task)
     }
     active = active_blocks(wanted)
@@ -95,7 +105,7 @@ def sample(
     if task.disturbed_references:
         disturbance = jnp.where(episode[3] < task.disturbed_references, episode[4], 0.0)
     draw = Draw(bank, objects, rests, disturbance=disturbance)
-    return _drawn(hand, task, draw, key, uniform, wanted, stationary, _varied(task, *episode[5:]))
+    return _drawn(hand, task, draw, uniform, sensors, wanted, stationary, _varied(task, *episode[5:]))
 
 
 _TRAINING, _EPISODE = "training", "episode"
@@ -159,7 +169,8 @@ def planned(
         own = jax.random.fold_in(jax.random.fold_in(key, episode.names), episode.numbers)
         draw = Draw(bank, episode.objects[None], episode.rests[None])
         wanted = {name: jnp.reshape(flag, 1) for name, flag in asked.items()}
-        return _drawn(hand, task, draw, own, _uniforms(hand, task, own, 1), wanted, False, _nominal(task, 1))
+        sensors = draw_sensors(task.sensing, task.control_dt, own, 1)
+        return _drawn(hand, task, draw, _uniforms(hand, task, own, 1), sensors, wanted, False, _nominal(task, 1))
 
     return jax.tree.map(lambda leaf: leaf[:, 0], jax.vmap(one)(plan))
 
@@ -190,15 +201,15 @@ def _drawn(
     hand: Hand,
     task: TaskConfig,
     draw: Draw,
-    key: Array,
     uniform: Mapping[str, Array],
+    sensors: Sensors,
     wanted: Mapping[str, Array],
     stationary: Array | bool,
     approach: Approach,
 ) -> InitialConditions:
-    """Draws the rest of B episodes with given objects, resting poses and (where available) constraints.
+    """Draws the rest of B episodes with given objects, resting poses, sensors and (where available) constraints.
 
-    `uniform` are numbers of `_uniforms`, the key is that of the sensors.
+    `uniform` are numbers of `_uniforms`.
     """
     bank, batch = draw.bank, draw.objects.shape
     mass, friction, length, gain, common = uniform[_EPISODE].T
@@ -229,7 +240,6 @@ def _drawn(
     # Squared, so that short holds, whose beginning every episode shares, remain the most common.
     longer = jnp.floor(length**2 * (task.hold_steps_max - task.hold_steps + 1)).astype(jnp.int32)
     hold = jnp.minimum(task.hold_steps + longer, task.hold_steps_max)
-    sensors = draw_sensors(task.sensing, task.control_dt, key, len(hold))
     return InitialConditions(reset_state, goal, surface, draw.region, hold, sensors)
 
 

@@ -1,5 +1,6 @@
 """The actor process: pulls weights, steps environments, uploads rollouts, until the run ends."""
 
+import concurrent.futures
 import pathlib
 import threading
 import time
@@ -16,7 +17,7 @@ from congrasp.actors.harvest import save_references, with_kept_references
 from congrasp.actors.link import ActorLink, RunFinished, RunInfo, RunRestarted, Ticket
 from congrasp.actors.physics import make_physics
 from congrasp.actors.rollout import Rollout, Trace, finished_episodes
-from congrasp.actors.training_set import FailureWeights, training_set
+from congrasp.actors.training_set import FailureWeights, TrainingSet, training_set
 from congrasp.actors.worker import RolloutWorker
 from congrasp.common.config import RunConfig, run_config_from_json
 from congrasp.common.errors import CongraspError
@@ -179,31 +180,43 @@ class _Actor:
         self._own_references = config.task.own_references and draws_references(config.task)
         self._references = references if self._own_references else None
         self._saved = time.monotonic()
-        self._objects, bank = training_set(self._hand, config, self._number)
-        if self._references:
-            bank = with_kept_references(self._references, self._hand, config.task, bank)
+        training = training_set(self._hand, config, self._number)
+        self._objects = training.objects
         with stage("engine"):
             self._physics = make_physics(physics, self._hand, config.task, self._objects, threads=threads)
+        self._worker = RolloutWorker(
+            self._hand,
+            config.task,
+            self._physics,
+            None,
+            acting(self._spec.layout, mean=False),
+            batch=config.environments,
+            # Another incarnation must not repeat the episodes of the one it replaces.
+            seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
+            half_precision=config.half_observations,
+            staggered=True,
+            taught=not TAUGHT.keys().isdisjoint(arrays),
+            privileged=() if PRIVILEGED.keys().isdisjoint(arrays) else self._objects,
+        )
+        with concurrent.futures.ThreadPoolExecutor(1, "programs") as meanwhile:
+            programs = meanwhile.submit(self._compile, training)
+            bank = training.bank
+            if self._references:
+                bank = with_kept_references(self._references, self._hand, config.task, bank)
+            programs.result()
         with stage("first episodes"):
-            self._worker = RolloutWorker(
-                self._hand,
-                config.task,
-                self._physics,
-                bank,
-                acting(self._spec.layout, mean=False),
-                batch=config.environments,
-                # Another incarnation must not repeat the episodes of the one it replaces.
-                seed=zlib.crc32(f"{config.seed}/{link.actor}/{link.incarnation}".encode()),
-                half_precision=config.half_observations,
-                staggered=True,
-                taught=not TAUGHT.keys().isdisjoint(arrays),
-                privileged=() if PRIVILEGED.keys().isdisjoint(arrays) else self._objects,
-            )
+            self._worker.start(bank)
         self._failures = self._failure_weights(bank)
         self._on_rollout = on_rollout
         self._bundle: PolicyBundle | None = None
         self._rollouts = self._next_episode = 0
         self._follower = Follower()
+
+    def _compile(self, training: TrainingSet) -> None:
+        """Compiles the programs of a compiled engine's rollouts before the bank of the training set is built."""
+        if self._physics.compiled:
+            with stage("programs"):
+                self._worker.compile(training.form(), self._spec.inference_form, self._config.rollout_steps)
 
     def act(self, stop: threading.Event) -> None:
         """Produces rollouts until `stop` is set or the run ends."""
@@ -236,14 +249,18 @@ class _Actor:
     def _renew_objects(self) -> None:
         """Replaces all objects, and starts new episodes with them."""
         self._number += 1
-        self._objects, bank = training_set(self._hand, self._config, self._number)
+        training = training_set(self._hand, self._config, self._number)
+        self._objects, bank = training.objects, training.bank
         self._worker.replace_objects(self._objects, bank)
         self._worker.restart()
         self._follower.forget()
         self._failures = self._failure_weights(bank)
 
     def _warm_up(self, stop: threading.Event) -> None:
-        """Compiles before the first ticket is requested, so that its rollout is not stale when it is finished."""
+        """Waits for the first policy, and compiles the programs around an engine that JAX cannot trace.
+
+        This is before the first ticket is requested, so that its rollout is not stale when it is finished.
+        """
         while not self._refresh():
             if stop.is_set():
                 return
@@ -251,13 +268,11 @@ class _Actor:
                 self._link.give_back(ticket)
         assert self._bundle is not None
         self._configure(self._bundle.version)
-        parameters, steps = self._bundle.inference_parameters, self._config.rollout_steps
-        with stage("compile rollout"):
-            if self._physics.compiled:
-                self._worker.compile(parameters, steps)
-                return
+        if self._physics.compiled:
+            return
+        with stage("programs"):
             for _ in range(2):  # the second time, after a restart of environments, which is traced separately
-                self._worker.collect(parameters, steps)
+                self._worker.collect(self._bundle.inference_parameters, self._config.rollout_steps)
                 self._worker.restart()
 
     def _configure(self, version: int) -> None:

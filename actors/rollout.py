@@ -34,6 +34,9 @@ Probe = Callable[[Scene, Array, Any], Any]
 every environment and step."""
 Traced = Literal["first", "all", "none"]
 """Environments whose steps are recorded (`Trace`)."""
+_RENEWALS, _LEAST_TOGETHER = 64, 8
+"""A batch of new episodes is this fraction of the environments, and at least so many: about three times as many as end
+in a control step."""
 _WHICH: dict[Traced, int | slice] = {"first": 0, "all": slice(None), "none": slice(0)}
 
 
@@ -149,11 +152,12 @@ class Programs:
         self.env = GraspEnv(hand, task, engine)
         self._engine, self._policy, self._probe = engine, policy, probe
         self._batch, self._traced, self._taught = batch, _WHICH[traced], taught
+        self._together = min(batch, max(_LEAST_TOGETHER, batch // _RENEWALS))
         self._dtype = jnp.float16 if half_precision else jnp.float32
         self.sample = jax.jit(self._sample)
         self.begin = jax.jit(self._begin)
-        self.merge = jax.jit(self._merge)
-        self.restart = jax.jit(self.env.restart)
+        self.renew = jax.jit(self._renew)
+        self.restart = jax.jit(self._restart)
         self.with_scene = jax.jit(self.env.with_scene)
         self.look = jax.jit(self._look)
         self.decide = jax.jit(self._decide)
@@ -173,9 +177,20 @@ class Programs:
         physics = self._engine.reset(kept.physics, jnp.ones(self._batch, bool), conditions.reset_state)
         return self.env.state_of(conditions, physics)._replace(grasps=kept.grasps)
 
-    def _merge(self, state: EnvState, mask: Array, fresh: InitialConditions) -> EnvState:
-        """Merges fresh episodes into the masked environments (B,), whose engine was reset separately."""
-        return self.env.merge(state, mask, self.env.state_of(fresh, None))
+    def _restart(self, state: EnvState, mask: Array, conditions: InitialConditions) -> EnvState:
+        """Starts these episodes in the masked environments (B,); see `GraspEnv.restart`."""
+        return self.env.restart(state, jnp.where(mask, jnp.arange(self._batch), self._batch), conditions)
+
+    def _renew(self, bank: ConstraintBank, state: EnvState, key: Array, stationary: Array, ended: Array) -> EnvState:
+        """Draws new episodes for environments whose episodes ended (B,), a small batch at a time."""
+
+        def some(carry: tuple[EnvState, Array]) -> tuple[EnvState, Array]:
+            state, left = carry
+            rows = jnp.nonzero(left, size=self._together, fill_value=self._batch)[0]
+            fresh = initial.sample(self.env.hand, self.env.task, bank, key, self._batch, stationary, rows)
+            return self.env.restart(state, rows, fresh), left.at[rows].set(False, mode="drop")
+
+        return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), some, (state, ended))[0]
 
     def _look(self, state: EnvState, settings: Settings) -> _Seen:
         """Returns the observations of the current control step."""
@@ -237,7 +252,7 @@ class Programs:
             state, episode_key, terminal = operand
             episode_key, own = jax.random.split(episode_key)
             assert bank is not None
-            return self.env.restart(state, terminal, self._sample(bank, own, stationary)), episode_key
+            return self._renew(bank, state, own, stationary, terminal), episode_key
 
         def body(carry: Any, step_key: Array) -> tuple[Any, Any]:
             state, episode_key = carry

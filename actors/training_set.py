@@ -1,10 +1,11 @@
 """Training set of an actor: its objects and the constraint bank of their episodes."""
 
 import dataclasses
+import functools
 import pathlib
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
 
 from congrasp.common.config import RunConfig
@@ -14,16 +15,34 @@ from congrasp.common.objects.pool import load_pool, scale_objects
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.stages import stage
 from congrasp.common.task.sampling.bank import ConstraintBank, rows_of, stacked
-from congrasp.common.task.sampling.build import build_bank, with_columns
+from congrasp.common.task.sampling.build import bank_form, build_bank, with_columns
 from congrasp.common.task.sampling.sets import bank_of, load_for
 from congrasp.common.wire.codec import Message
 
 
-class TrainingSet(NamedTuple):
-    """N objects scaled for the hand, and their constraints."""
+class TrainingSet:
+    """N objects scaled for the hand, and their constraints.
 
-    objects: list[GraspObject]
-    bank: ConstraintBank
+    Attributes:
+      objects: the objects.
+      form: returns shapes and types of the bank (`bank_form`), which are known before it.
+    """
+
+    def __init__(
+        self, objects: list[GraspObject], form: Callable[[], ConstraintBank], build: Callable[[], ConstraintBank]
+    ):
+        """Keeps the functions; nothing is built yet."""
+        self.objects, self.form, self._build = objects, form, build
+
+    @functools.cached_property
+    def bank(self) -> ConstraintBank:
+        """Constraint bank of the objects, which is built on first use.
+
+        Raises:
+          CongraspError: see `build_bank`.
+        """
+        with stage("constraint bank"):
+            return self._build()
 
 
 def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
@@ -41,8 +60,8 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
     if not objects.folder:
         with stage("objects"):
             pool = scale_objects(hand, task, load_pool(objects, number))
-        with stage("constraint bank"):
-            return TrainingSet(pool, build_bank(hand, task, pool, seed))
+        form = functools.partial(bank_form, hand, task, pool)
+        return TrainingSet(pool, form, functools.partial(build_bank, hand, task, pool, seed))
     found, sets = load_pool(objects), list[Message]()
     if objects.constraints:
         found, sets = load_for(pathlib.Path(objects.constraints), found, objects.split)
@@ -60,14 +79,19 @@ def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
     captured = with_columns(hand, task, bank_of(sets, objects.split)) if sets else None
     bank = captured or build_bank(hand, task, pool, seed)
     if not objects.procedural:
-        return TrainingSet(pool, bank)
+        return _built(pool, bank)
     more = dataclasses.replace(objects, folder="", constraints="", count=objects.procedural)
     beside = scale_objects(hand, task, load_pool(more, number))
     both = stacked([*rows_of(bank), *rows_of(build_bank(hand, task, beside, seed))])
     if share := objects.folder_share:
         weights = [share / len(pool)] * len(pool) + [(1 - share) / len(beside)] * len(beside)
         both = both._replace(weight=both.weight * np.array(weights, np.float32))
-    return TrainingSet(pool + beside, with_columns(hand, task, both))
+    return _built(pool + beside, with_columns(hand, task, both))
+
+
+def _built(objects: list[GraspObject], bank: ConstraintBank) -> TrainingSet:
+    """The training set of a bank."""
+    return TrainingSet(objects, lambda: jax.eval_shape(lambda: bank), lambda: bank)
 
 
 _MEMORY = 50.0

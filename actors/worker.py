@@ -72,14 +72,20 @@ class RolloutWorker:
             taught=taught,
         )
         self.physics, self.env, self.batch = physics, self.programs.env, batch
-        self._hand, self._task, self._bank, self._staggered = hand, task, _on_device(bank), staggered
+        self._hand, self._task, self._staggered = hand, task, staggered
+        self._bank: ConstraintBank | None = None
         self._settings, self._stationary = self.env.settings, np.array(False)
         if privileged:
             self.adjust(masses=_masses(privileged))
         self._episode_key, self._key = _split(_on_device(jax.random.key(seed)))
         self.state: EnvState | None = None
         if bank is not None:
-            self.restart()
+            self.start(bank)
+
+    def start(self, bank: ConstraintBank) -> None:
+        """Starts episodes of this bank in every environment."""
+        self._bank = _on_device(bank)
+        self.restart()
 
     def adjust(self, **settings: Any) -> None:
         """Changes `Settings` by name from the next control step on; new types or shapes are recompiled."""
@@ -102,24 +108,43 @@ class RolloutWorker:
     def restart(self) -> None:
         """Starts new episodes in every environment."""
         self._episode_key, key = _split(self._episode_key)
-        conditions = self.programs.sample(self._bank, key, self._stationary)
-        if self._staggered:
-            whole = self._task.approach_steps + np.asarray(conditions.hold)
-            share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
-            conditions = conditions._replace(hold=_on_device(np.int32(conditions.hold - np.floor(share * whole))))
-        self.begin(conditions)
+        if self.physics.compiled:
+            conditions = self.programs.sample(self._bank, key, self._stationary)
+            return self.begin(conditions._replace(hold=self._staggered_hold(conditions.hold, key)))
+        # By the program that replaces finished episodes: another one would take as long to compile.
+        state = (self.state or self._blank(key))._replace(views=None)
+        state = self.programs.renew(self._bank, state, key, self._stationary, np.ones(self.batch, bool))
+        self._place(state._replace(hold=self._staggered_hold(state.hold, key)))
+
+    def _blank(self, key: Array) -> EnvState:
+        """An engine's environments before their first episodes."""
+        conditions = jax.eval_shape(self.programs.sample, self._bank, key, self._stationary)
+        form = jax.eval_shape(self.programs.begin, conditions, None)
+        return jax.tree.map(lambda array: _on_device(np.zeros(array.shape, array.dtype)), form)
+
+    def _staggered_hold(self, hold: Array, key: Array) -> Array:
+        """Control steps (B,) without the table of first episodes, which end early at different times if they shall."""
+        if not self._staggered:
+            return hold
+        whole = self._task.approach_steps + np.asarray(hold)
+        share = np.random.default_rng(np.asarray(jax.random.key_data(key))).uniform(size=whole.shape)
+        return _on_device(np.int32(hold - np.floor(share * whole)))
 
     def begin(self, conditions: InitialConditions) -> None:
         """Starts these episodes, one in each environment."""
-        kept, conditions = self.state, _on_device(conditions)
+        conditions = _on_device(conditions)
         if self.physics.compiled:
-            self.state = self.programs.begin(conditions, _on_device(kept))
-            return
-        if kept is None:
-            self.physics.start(conditions.reset_state)
+            self.state = self.programs.begin(conditions, _on_device(self.state))
         else:
-            self.physics.reset(None, np.ones(self.batch, bool), conditions.reset_state)
-        state = self.programs.begin(conditions, None)
+            self._place(self.programs.begin(conditions, None))
+
+    def _place(self, state: EnvState) -> None:
+        """Starts the engine's environments, of an engine that is not compiled, at the beginning of these episodes."""
+        kept = self.state
+        if kept is None:
+            self.physics.start(state.reset_state)
+        else:
+            self.physics.reset(None, np.ones(self.batch, bool), state.reset_state)
         self.state = self.programs.with_scene(state._replace(views=None), self.physics.read(None))
         if kept is not None:
             self.state = self.state._replace(grasps=kept.grasps)
@@ -132,25 +157,36 @@ class RolloutWorker:
             self.state = self.programs.restart(self.state, mask, conditions)
             return
         self.physics.reset(None, mask, conditions.reset_state)
-        state = self.programs.merge(self.state._replace(views=None), mask, conditions)
+        state = self.programs.restart(self.state._replace(views=None), mask, conditions)
         self.state = self.programs.with_scene(state, self.physics.read(None))
 
     def observe(self) -> Array:
         """Observation (B, D) of the current control step by the policy."""
         return self.programs.look(self.state, self._settings).observation
 
-    def compile(self, parameters: Any, steps: int) -> None:
-        """Compiles the programs of `collect` and `renew_references` without running them; for compiled engines.
+    def compile(self, form: ConstraintBank, parameters: Any, steps: int) -> None:
+        """Compiles the programs of `start`, `collect` and `renew_references`, for compiled engines.
 
         Args:
-          parameters: parameters of the policy, as for `collect`.
+          form: shapes of the bank (`common.task.sampling.build.bank_form`); no bank is needed yet.
+          parameters: parameters of the policy, or their shapes.
           steps: number T of steps.
         """
-        given, grasps = self._scan_arguments(parameters, self._key), self.state.grasps if self.state else None
-        programs = [self.programs.scan.lower(*given, steps=steps)]
-        programs.append(harvest.renew.lower(self._hand, self._task, self._bank, grasps, self._key))
-        with concurrent.futures.ThreadPoolExecutor(len(programs)) as threads:
-            list(threads.map(lambda program: program.compile(), programs))
+        key, programs, stationary = self._key, self.programs, self._stationary
+        form, parameters = _shapes((form, parameters))
+        conditions = _shapes(jax.eval_shape(programs.sample, form, key, stationary))
+        state = _shapes(jax.eval_shape(programs.begin, conditions, None))
+        given = parameters, self._settings, stationary, form, (state, key), key
+        lowerings: list[Callable[[], jax.stages.Lowered]] = [
+            lambda: programs.scan.lower(*given, steps=steps),
+            lambda: programs.sample.lower(form, key, stationary),
+            lambda: programs.begin.lower(conditions, None),
+            lambda: harvest.renew.lower(self._hand, self._task, form, state.grasps, key),
+        ]
+        with concurrent.futures.ThreadPoolExecutor(len(lowerings)) as threads:
+            # Each is compiled while the next one is lowered, which takes Python's lock.
+            for compiled in [threads.submit(lower().compile) for lower in lowerings]:
+                compiled.result()
 
     @property
     def bank(self) -> ConstraintBank:
@@ -211,9 +247,8 @@ class RolloutWorker:
             extras.append(kept)
             if self._bank is not None and np.asarray(transition.terminal).any():
                 self._episode_key, episode_key = _split(self._episode_key)
-                fresh = self.programs.sample(self._bank, episode_key, self._stationary)
-                self.physics.reset(None, transition.terminal, fresh.reset_state)
-                state = self.programs.merge(state, transition.terminal, fresh)
+                state = self.programs.renew(self._bank, state, episode_key, self._stationary, transition.terminal)
+                self.physics.reset(None, transition.terminal, state.reset_state)
                 physics_state = self.physics.read(None)
                 state_key = jax.random.wrap_key_data(key_data[step])
                 scene = self.programs.with_scene(state, physics_state)
@@ -239,6 +274,12 @@ class RolloutWorker:
 def _on_device(tree: Any) -> Any:
     """Commits the arrays to this process's device: uncommitted ones would cause another compilation."""
     return jax.device_put(tree, jax.local_devices()[0])
+
+
+def _shapes(tree: Any) -> Any:
+    """Shapes and types of the arrays of a tree, on this process's device."""
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.tree.map(lambda array: jax.ShapeDtypeStruct(array.shape, array.dtype, sharding=device), tree)
 
 
 def _masses(objects: Sequence[GraspObject]) -> Array:

@@ -5,6 +5,7 @@ The others receive configuration, state and versions from it, and write only jou
 update.
 """
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import functools
@@ -171,11 +172,10 @@ class _Learner:
         self._dropped = self._dropped_in_a_row = 0
         self._saved, self._unsaved = self._state.version, 0
         self._run_id, self._skipped, hubs = meta["run_id"], meta["skipped"], meta["hubs"]
-        if ranks.count > 1:
-            # Before the hub exists, and so before an actor in this process captures its engine's graphs.
-            self._warm_up()
         log_error = functools.partial(self._event, "error")
         folder = run_dir / FOLDER / name
+        # Computed meanwhile: the first rollout needs them.
+        ranges = concurrent.futures.ThreadPoolExecutor(1, "ranges").submit(task_ranges, config.task, config.curriculum)
         self._rollouts = RolloutQueue(
             self._run_id,
             self._form,
@@ -186,8 +186,7 @@ class _Learner:
             audit=AuditLog(run_dir, name, log_error) if audit else None,
             log=WriteAheadLog(folder, staleness, write=config.write_ahead, log_error=log_error) if audit else None,
         )
-        admission = Admission(functools.partial(task_ranges, config.task, config.curriculum))
-        self._hub = LearnerHub(transport, self._rollouts, events, to_json(config), admission)
+        self._hub = LearnerHub(transport, self._rollouts, events, to_json(config), Admission(ranges.result))
         self._is_new = not hubs
         if hubs and len(hubs) != ranks.count:
             self._event("warning", f"The checkpoint has {len(hubs)} rank(s), this run has {ranks.count}: {_COUNTERS}.")
@@ -244,6 +243,10 @@ class _Learner:
         """Updates until the end, a stop, or a thread's death; writes a checkpoint in each case."""
         if self._is_new:  # before any rollout is accepted, so that a resume can recover what a kill undoes
             self._save_if_possible()
+        if self._ranks.count > 1:
+            # Its collectives must not start while an actor in this process captures its engine's graph, which it does
+            # in its first rollout. Until there are weights, the actor builds its training set and its programs.
+            self._warm_up()
         self._publish()
         if self._ranks.count == 1:
             self._warm_up()

@@ -8,10 +8,13 @@ per batch, so that their addresses never change and one CUDA graph of a control 
 wherever JAX places its arrays.
 """
 
+import concurrent.futures
 import dataclasses
+import functools
 import itertools
+import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -36,6 +39,8 @@ from congrasp.actors.physics.slots import Catalogue
 from congrasp.actors.physics.warp_kernels import DATA_LEAVES, MODEL_LEAVES, OBJECT_FIELDS, Leaves, Objects, count, place
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.stages import stage
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import CONTACTS_PER_LINK, Array
 
@@ -90,7 +95,6 @@ class WarpBuffers:
                 np.stack([model.actuator_gainprm[where.motors, 0], *model.actuator_biasprm[where.motors, 1:3].T], -1),
                 dtype=wp.vec3,
             )
-        wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
         leaves.object_body, leaves.object_dof = where.object_body, where.object_qvel[0]
         leaves.base_body, leaves.table, leaves.anchor = where.base_body, where.table_mocap, where.anchor_mocap
         leaves.weld, leaves.table_away = where.weld, TABLE_AWAY[2]
@@ -98,6 +102,9 @@ class WarpBuffers:
         self._model.opt.warn_overflow = 0
         self._sensing = self._model.opt.disableflags
         self._blind = self._sensing | mujoco_warp.DisableBit.SENSOR
+        background = concurrent.futures.ThreadPoolExecutor(1, "kernels")
+        self._kernels = background.submit(_load_kernels, device, self._variants())
+        wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
 
     def fill(self, objects: Objects, meshes: dict[str, Any]) -> None:
         """Sets the sources of the environments' fields: rows, and the fields of the model with their meshes."""
@@ -116,6 +123,7 @@ class WarpBuffers:
         occupancy: Any,
     ) -> None:
         """Steps all environments on the current stream; modifies the first three arrays and writes the last two."""
+        self._kernels.result()
         data = self._data
         state = (data.qpos, qpos), (data.qvel, qvel), (data.qacc_warmstart, qacc_warmstart)
         for mine, given in (*state, (data.ctrl, ctrl)):
@@ -132,6 +140,31 @@ class WarpBuffers:
             for _ in range(steps):
                 self._launch()
         wp.synchronize_device(self._device)
+
+    def _variants(self) -> set[tuple[wp.Module, int | None]]:
+        """Modules with the kernels of a control step, and their block sizes.
+
+        Only `mujoco_warp.step` knows which kernels a model needs: here its launches are listed and not made.
+        """
+        found: set[tuple[wp.Module, int | None]] = {(place.module, None)}
+        me, launches, options = threading.get_ident(), (wp.launch, wp.launch_tiled), self._model.opt
+
+        def listed(launch: Callable[..., None], kernel: wp.Kernel, *given: Any, **named: Any) -> None:
+            if threading.get_ident() == me:
+                found.add((kernel.module, named.get("block_dim")))
+            else:
+                launch(kernel, *given, **named)
+
+        conditional = options.graph_conditional
+        wp.launch, wp.launch_tiled = (functools.partial(listed, launch) for launch in launches)
+        options.graph_conditional = False  # a loop until the solver's kernels have converged would not end
+        try:
+            with wp.ScopedDevice(self._device):
+                self._substep_all()
+        finally:
+            wp.launch, wp.launch_tiled = launches
+            options.graph_conditional, options.disableflags = conditional, self._sensing
+        return found
 
     def _launch(self) -> None:
         """Launches the kernels of one control step."""
@@ -186,6 +219,15 @@ def register(buffers: WarpBuffers) -> int:
     handle = next(_handles)
     _buffers[handle] = buffers
     return handle
+
+
+def _load_kernels(device: wp.Device, variants: Iterable[tuple[wp.Module, int | None]]) -> None:
+    """Builds modules for block sizes in parallel, or reads them from Warp's cache.
+
+    Launches would do this one after another. Warp compiles without Python's lock.
+    """
+    with stage("kernels"), concurrent.futures.ThreadPoolExecutor(cores()) as threads:
+        list(threads.map(lambda variant: wp.force_load(device, [variant[0]], variant[1]), variants))
 
 
 def _control_step(

@@ -81,6 +81,13 @@ class PolicySpec:
         text = json.dumps([_SCHEMA, self.hand, self.layout, self.action_size, sizes])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
+    @property
+    def inference_form(self) -> "InferenceParameters":
+        """Shapes and types of the parameters with which policies of this spec act."""
+        tree = network.shapes(self.layout, self.action_size, self.network)
+        row = jax.ShapeDtypeStruct((sum(size for _, size in self.layout),), np.float32)
+        return InferenceParameters({"actor": tree["actor"]}, Affine(row, row))
+
     def require(self, spec: "PolicySpec", source: str) -> None:
         """Raises a `CongraspError` unless `spec`, that of `source`, has the schema of this one."""
         if spec.schema != self.schema:

@@ -1,12 +1,16 @@
-"""Timing of the stages of a run's start, up to its first update, in any thread."""
+"""Timing of the stages of a run's start, up to its first update, in any thread; each is a line of the log."""
 
 import contextlib
+import logging
 import threading
 import time
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import jax
 import psutil
+
+_log = logging.getLogger(__name__)
 
 
 class Stage(NamedTuple):
@@ -18,6 +22,13 @@ class Stage(NamedTuple):
 
 
 _BEGAN = psutil.Process().create_time()
+_PROGRAM_SECONDS = 0.5
+"""Least duration of the work on a compiled program that is a stage."""
+_PROGRAM_WORK = {
+    "/jax/core/compile/jaxpr_trace_duration": "trace",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower",
+    "/jax/core/compile/backend_compile_duration": "compile or read",
+}
 _lock = threading.Lock()
 _stages: dict[str, Stage] = {}
 
@@ -34,17 +45,33 @@ def stage(name: str) -> Iterator[None]:
     try:
         yield
     finally:
-        with _lock:
-            _stages.setdefault(name, Stage(name, began, since_start()))
+        _add(name, since_start() - began)
 
 
 def imported() -> None:
-    """Records everything up to now as the stage of imports."""
-    with _lock:
-        _stages.setdefault("imports", Stage("imports", 0.0, since_start()))
+    """Records everything up to now as the stage of imports, and from now on JAX's work on programs as stages."""
+    _add("imports", since_start())
+    jax.monitoring.register_event_duration_secs_listener(_add_program)
 
 
 def stages() -> list[Stage]:
     """Stages so far, ordered by their start; those of different threads overlap."""
     with _lock:
         return sorted(_stages.values(), key=lambda one: one.began)
+
+
+def _add(name: str, seconds: float) -> None:
+    """Records and logs a stage that has just ended, if it is the first of its name."""
+    ended = since_start()
+    with _lock:
+        if name in _stages:
+            return
+        _stages[name] = Stage(name, ended - seconds, ended)
+    _log.info("Start: %s took %.1f s, until %.1f s after the start of the process.", name, seconds, ended)
+
+
+def _add_program(event: str, duration_secs: float, **about: str | int) -> None:
+    """Records JAX's work on a program, by the program's name."""
+    if event in _PROGRAM_WORK and duration_secs >= _PROGRAM_SECONDS:
+        name = str(about.get("fun_name")).removeprefix("jit(").removesuffix(")")
+        _add(f"{_PROGRAM_WORK[event]} {name}", duration_secs)

@@ -23,6 +23,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.runtime.stages import stage
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.learner.distributed.collectives import AXIS
 
@@ -168,6 +169,7 @@ class Ranks:
             threading.Thread(target=self._beat, daemon=True, name="rank-heartbeat").start()
 
     @classmethod
+    @stage("join of the ranks")
     def join(cls, rank: int, count: int, coordinator: str, on_lost: Callable[[str], object] = end_process) -> "Ranks":
         """Joins the other ranks; must be called before anything else initialises JAX.
 

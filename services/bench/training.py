@@ -205,11 +205,6 @@ def _print(console: Console, config: RunConfig, stages: Sequence[Stage]) -> None
 
 
 _STOPPED_SECONDS = 30.0
-_EVENTS = {
-    "/jax/core/compile/jaxpr_trace_duration": "tracing",
-    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lowering",
-    "/jax/core/compile/backend_compile_duration": "compiling or reading",
-}
 
 
 def bench_startup(config: RunConfig, physics: PhysicsName, deadline: float) -> None:
@@ -266,19 +261,16 @@ def _start(config: RunConfig, physics: PhysicsName, caches: dict[str, str], dead
 def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) -> None:
     """Trains until the first update, and sends the stages of the start."""
     imported()
-    seconds, programs = collections.defaultdict[str, float](float), collections.Counter[str]()
+    programs = collections.Counter[str]()
 
-    def timed(event: str, duration_secs: float, **about: str | int) -> None:
-        if event in _EVENTS:
-            seconds[_EVENTS[event]] += duration_secs
-            if event.endswith("backend_compile_duration"):
-                programs[str(about.get("fun_name"))] += 1
+    def count(event: str, duration_secs: float, **about: str | int) -> None:
+        if event.endswith("backend_compile_duration"):
+            programs[str(about.get("fun_name"))] += 1
 
-    jax.monitoring.register_event_duration_secs_listener(timed)
+    jax.monitoring.register_event_duration_secs_listener(count)
 
     def report() -> None:
         rows = {one.name: f"{one.ended - one.began:.2f} (at {one.began:.1f})" for one in stages()}
-        rows |= {f"{name}, all threads": f"{total:.2f}" for name, total in seconds.items()}
         rows["compiled programs"] = str(programs.total())
         rows["compiled more than once"] = ", ".join(f"{name} {n}" for name, n in programs.items() if n > 1)
         rows["total, from the start of the process"] = f"{since_start():.2f}"

@@ -46,6 +46,7 @@ class Actor:
         from congrasp.actors.process import run_actor
         from congrasp.common.io.journal import Journal
         from congrasp.common.runtime.parallel import cores
+        from congrasp.common.runtime.stages import imported
         from congrasp.common.transport import urls
         from congrasp.common.transport.keys import process_name
         from congrasp.services.ops.metrics import ActorMetrics
@@ -58,6 +59,7 @@ class Actor:
             log("info", f"Rollout {values['rollouts']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
 
         with self.watch.watched("actor", name, self.run, metrics), on_signal() as stop:
+            imported()
             with announced(f"Waiting up to {self.patience:g} s for the learner at {self.connect}"):
                 transport = urls.connect(self.connect, "actor", certs=self.certs, wait=self.patience, run=self.run)
             with transport:

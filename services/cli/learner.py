@@ -76,6 +76,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
       congrasp learner --preset human --run-dir runs/human --listen tls/0.0.0.0:7447 --certs certs
       congrasp learner --run-dir runs/human --resume
     """
+    from congrasp.common.runtime.stages import imported
     from congrasp.common.transport import urls
     from congrasp.learner.distributed.ranks import Ranks, end_process
     from congrasp.learner.run_directory import listening
@@ -86,6 +87,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
     try:
         with (
             on_signal() as stop,
+            logging_as(watch.log_format, role="learner", id=str(rank), run=config.name),
             urls.listen(
                 url := rank_url(options.listen, rank),
                 "learner",
@@ -95,14 +97,12 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
                 longest_rollout=longest_rollout(config) if options.ranks == 1 else None,  # others use rank 0's settings
             ) as transport,
         ):
+            imported()
             if rank == 0:
                 options.prepare(config)
             ranks = Ranks.join(rank, options.ranks, options.coordinator)
             config = run_config_from_json(ranks.exchange({"config": to_json(config)}).meta["entries"][0]["config"])
-            with (
-                listening(run_dir, reachable_url(url)) if rank == 0 else contextlib.nullcontext(),
-                logging_as(watch.log_format, role="learner", id=str(rank), run=config.name),
-            ):
+            with listening(run_dir, reachable_url(url)) if rank == 0 else contextlib.nullcontext():
                 learn(
                     run_dir,
                     config,

@@ -243,6 +243,8 @@ def _prepare_environment() -> None:
     if folder.is_dir() or can_cache(folder.parent, "XDG_CACHE_HOME"):
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    # XLA's cache of GPU tuning would make the folder's path a part of every key: programs could not move to another.
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES", "none")
     os.environ.setdefault("MUJOCO_GL", "disable")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 

@@ -189,15 +189,15 @@ class _Progress:
         self._print()
 
     def update(self, values: dict[str, float]) -> None:
-        """Shows the metrics of an update of this process's learner, and the duration of the start after the first."""
-        if self._first is None:
-            console.print(f"  [dim]{first_update()}[/]")
+        """Shows the metrics of an update of this process's learner."""
         self.show({"values": values, "actors": 1, "update": values["update"], "version": int(values["version"])})
 
     def show(self, status: dict[str, Any]) -> None:
-        """Shows the learner's newest metrics, if there are any, and the number of actors."""
+        """Shows the learner's newest metrics, if any, the number of actors and, after the first update, the start."""
         now = time.monotonic()
         if "transitions" in status.get("values", {}):
+            if self._first is None:
+                console.print(f"[dim]{first_update()}[/]")
             self._line = self._progress(status, now)
         elif self._first is None:
             self._line = (
@@ -232,9 +232,9 @@ class _Progress:
 
 
 def first_update() -> str:
-    """Stages of the time until the first update of this process's learner."""
-    parts = ", ".join(f"{one.name} {one.ended - one.began:.1f}" for one in stages())
-    return f"first update {since_start():.1f} s after the start, including (partly in parallel): {parts}"
+    """Stages of this process until the first update, one on each line; other processes log theirs."""
+    lines = [f"    {one.began:6.1f} to {one.ended:6.1f} s: {one.name}" for one in stages()]
+    return "\n".join([f"  First update {since_start():.1f} s after the start; its stages, partly in parallel:", *lines])
 
 
 def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:

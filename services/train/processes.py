@@ -26,6 +26,7 @@ from congrasp.common.io.inputs import read_json
 from congrasp.common.io.journal import AUDIT
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.stages import stage
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
@@ -122,7 +123,8 @@ def leave_gpus_to(ranks: int) -> bool:
     Raises:
       CongraspError: there are fewer GPUs than ranks, but not none.
     """
-    backend, count = accelerators()
+    with stage("search for accelerators"):
+        backend, count = accelerators()
     if backend == "cpu":
         return False
     if count < ranks:
@@ -188,9 +190,10 @@ def train(
     logs.mkdir(exist_ok=True)
     learners, actors = _learners(run_dir, plan, endpoint), _actors(run_dir, plan, config.name, endpoint)
     try:
-        for child in (*learners, *actors):
-            child.start()
-        transport = _connect(reachable_url(endpoint), learners[0], stop, launch.certs)
+        with stage("start of the learner's process"):
+            for child in (*learners, *actors):
+                child.start()
+            transport = _connect(reachable_url(endpoint), learners[0], stop, launch.certs)
         if transport is not None:
             shown = " ".join(command("congrasp", "view", run_dir, certs=launch.certs))
             notify(f"Watch it in the browser with: {shown}")

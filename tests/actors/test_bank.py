@@ -13,7 +13,7 @@ from congrasp.common import rotations as module
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
 from congrasp.common.task.sampling.bank import SHARED, surface_of
-from congrasp.common.task.sampling.build import POSES, build_bank, make_references
+from congrasp.common.task.sampling.build import POSES, bank_form, build_bank, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
 from tests import task as suite
 from tests.compiled import Compiled
@@ -77,6 +77,17 @@ def test_references_with_fingers_in_the_table_are_not_valid():
     rest = jnp.array([[[0, 0, 0.05, 1, 0, 0, 0]]] * 2, jnp.float32)
     *_, valid = references(HAND, poses, rest, jax.random.key(0), TASK.trajectory_points)
     np.testing.assert_array_equal(valid, [[True], [False]])
+
+
+@pytest.mark.parametrize("constraints", [TASK.constraints, ("heading",)])
+def test_the_form_of_a_bank_is_known_before_it(constraints):
+    """Of a task with references and of one without."""
+    task = dataclasses.replace(TASK, constraints=constraints)
+    bank = suite.bank() if task == TASK else build_bank(HAND, task, suite.OBJECTS, 0)
+    form = bank_form(HAND, task, suite.OBJECTS)
+    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), form) == jax.tree.map(
+        lambda leaf: (leaf.shape, leaf.dtype), bank
+    )
 
 
 def test_an_object_that_cannot_be_approached_is_named():

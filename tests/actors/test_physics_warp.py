@@ -139,6 +139,26 @@ def test_steps_without_jax_go_on_from_the_last_and_leave_every_state_as_it_was(s
     physics.close()
 
 
+def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeypatch):
+    """Of those that MuJoCo Warp launches; JAX's call is a module without kernels."""
+    import warp as wp  # takes seconds in every worker
+
+    physics, loaded, load = warp_engine(OBJECTS), set(), wp._src.context.Module.load
+
+    def noted(module, device, block_dim=None, **options):
+        loaded.add((module.name, block_dim))
+        return load(module, device, block_dim, **options)
+
+    monkeypatch.setattr(wp._src.context.Module, "load", noted)
+    state = physics.start(start)
+    physics._buffers[len(OBJECTS)][1]._kernels.result()
+    ahead = set(loaded)
+    physics.step(state, jnp.asarray(grasp(start, 5)), jnp.ones(len(OBJECTS), bool))
+    assert len(ahead) > 40
+    assert loaded - ahead == {("congrasp.actors.physics.warp", 1)}
+    physics.close()
+
+
 def test_rows_are_what_mujoco_compiles():
     catalogue = Catalogue(HAND, TASK, OBJECTS[0], 8)
     before = {name: getattr(catalogue.model, name).copy() for name in ("geom_dataid", "geom_size", "body_mass")}

@@ -105,6 +105,9 @@ class InventedWorker:
     def collect(self, parameters, steps):
         return self.rollout
 
+    def start(self, bank):
+        pass
+
     def restart(self):
         pass
 
@@ -117,7 +120,8 @@ def heard(monkeypatch):
         objects = [procedural.generate(0, "box"), procedural.generate(0, "mug")]
         monkeypatch.setattr(InventedWorker, "rollout", rollout, raising=False)
         monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
-        found = TrainingSet(objects, types.SimpleNamespace(weight=np.ones(len(objects))))
+        invented = types.SimpleNamespace(weight=np.ones(len(objects)))
+        found = TrainingSet(objects, lambda: pytest.fail("nothing is compiled"), lambda: invented)
         numbers = []
         monkeypatch.setattr(process, "training_set", lambda hand, config, number: numbers.append(number) or found)
         broker, stop = MemoryHub(), threading.Event()

@@ -1,6 +1,7 @@
 """Episodes: sampling, protocol, success, and rollouts that continue."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.actors.env import GraspEnv, episode_fields, metric_names
 from congrasp.actors.physics.engine import PhysicsState, where_environments
 from congrasp.actors.physics.native import NativePhysics
-from congrasp.actors.rollout import finished_episodes
+from congrasp.actors.rollout import Programs, finished_episodes, no_probe
 from congrasp.actors.worker import RolloutWorker
 from congrasp.common import chance, rotations
 from congrasp.common.hands.kinematics import capsules, grasp_frame, keypoints, link_transforms
@@ -264,19 +265,31 @@ class _Touching:
         )
 
 
-def test_a_continuing_environment_keeps_its_contacts_when_another_restarts():
+def _compiled(caplog):
+    """Names of the programs that this thread lowered or compiled."""
+    found = [re.search(r"(conversion|compilation of) jit\((\w+)\)", record.getMessage()) for record in caplog.records]
+    return {match[2] for match in found if match}
+
+
+def test_a_continuing_environment_keeps_its_contacts_when_another_restarts(caplog):
     """A compiled engine's program is one loop, which shares nothing with other tests': here of headings alone."""
     physics, task = _Touching(), dataclasses.replace(TASK, constraints=("heading",))
     worker = RolloutWorker(
-        HAND, task, physics, suite.bank(), suite.commanded, batch=2, seed=0, half_precision=False, traced="none"
+        HAND, task, physics, None, suite.commanded, batch=2, seed=0, half_precision=False, traced="none"
     )
-    state = worker.state
-    worker.state = state._replace(
-        time=jnp.array([120, 120]),
-        hold=jnp.array([25, 100]),
-        success=state.success._replace(links_at_removal=jnp.ones(2)),
-    )
-    rollout = worker.collect(NOISY, 7)
+    with jax.log_compiles():  # its programs are compiled before there is a bank or a policy, and not again
+        worker.compile(jax.eval_shape(suite.bank), jax.ShapeDtypeStruct(NOISY.shape, NOISY.dtype), 7)
+        ahead = _compiled(caplog)
+        caplog.clear()
+        worker.start(suite.bank())
+        state = worker.state
+        worker.state = state._replace(
+            time=jnp.array([120, 120]),
+            hold=jnp.array([25, 100]),
+            success=state.success._replace(links_at_removal=jnp.ones(2)),
+        )
+        rollout = worker.collect(NOISY, 7)
+    assert ahead == {"_scan", "_sample", "_begin", "renew"} and not ahead & _compiled(caplog)
     flags = 3 * len(HAND.joints) + 18  # where the contact flags begin in the observation
     assert np.argwhere(rollout.truncated).tolist() == [[4, 0]]
     touching = np.asarray(rollout.observation)[..., flags : flags + len(HAND.links)].all(-1)
@@ -284,6 +297,23 @@ def test_a_continuing_environment_keeps_its_contacts_when_another_restarts():
     # Environment 0 restarts at step 5 without contacts; the very first step has none either.
     assert touching[:, 0].tolist() == [False, True, True, True, True, False, True]
     assert touching[:, 1].tolist() == [False] + [True] * 6
+
+
+def test_episodes_that_are_drawn_a_few_at_a_time_are_those_of_a_draw_of_all():
+    """A program of its own, of headings alone: five environments restart, two at a time."""
+    task = dataclasses.replace(TASK, constraints=("heading",))
+    settings = {"batch": BATCH, "half_precision": True, "probe": no_probe, "traced": "none", "taught": False}
+    programs = Programs(HAND, task, None, suite.commanded, **settings)
+    programs._together = 2
+    bank, (old, new) = suite.bank(), jax.random.split(jax.random.key(0))
+    ended = np.array([True, False, True, True, False, True, False, True])
+    state = programs.begin(programs.sample(bank, old, np.array(False)), None)._replace(time=jnp.full(BATCH, 9))
+    renewed = programs.renew(bank, state, new, np.array(False), ended)
+    drawn = programs.begin(programs.sample(bank, new, np.array(False)), None)._replace(grasps=state.grasps)
+    for after, fresh, before in zip(*map(jax.tree.leaves, (renewed, drawn, state)), strict=True):
+        np.testing.assert_array_equal(after[~ended], before[~ended])
+        np.testing.assert_allclose(after[ended], fresh[ended], rtol=1e-5, atol=1e-6)
+    assert not np.array_equal(state.reset_state.q, drawn.reset_state.q)
 
 
 def test_workers_of_one_task_share_programs_that_compile_once():

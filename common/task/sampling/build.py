@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import json
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +70,21 @@ def build_bank(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], see
     return with_columns(hand, task, bank)
 
 
+def bank_form(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]) -> ConstraintBank:
+    """Shapes and types of the bank of a pool, for programs that are compiled while it is built.
+
+    They are those of the object with the most resting poses. The bank of a pool in which none of these objects can be
+    approached in all of its poses has a shorter axis R.
+
+    Raises:
+      CongraspError: the object is too wide, or cannot be approached in any resting pose.
+    """
+    example = max(objects, key=lambda obj: len(obj.rest_poses))
+    row = headings_of(task, example, (0, 0), scale=object_scale(hand, task))  # a hand's outline takes seconds
+    bank = with_columns(hand, task, _bank_of(hand, task, [example], [row], 0, _no_references))
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((len(objects), *leaf.shape[1:]), leaf.dtype), bank)
+
+
 def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int) -> ConstraintBank:
     """Builds the bank of `build_bank` without the cache."""
     count, scale = len(objects), object_scale(hand, task)
@@ -87,7 +103,20 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
             f"None of {count} objects can be grasped: in every resting pose they lie too flat on the table.",
             "Add other objects.",
         )
-    rests = max(len(row["rest"]) for row in rows)
+    make = _references if draws_references(task) else _no_references  # closing a hand around objects takes seconds
+    return _bank_of(hand, task, objects, rows, seed, make)
+
+
+def _bank_of(
+    hand: Hand,
+    task: TaskConfig,
+    objects: Sequence[GraspObject],
+    rows: Sequence[dict[str, np.ndarray]],
+    seed: int,
+    make: Callable[..., dict[str, Any]],
+) -> ConstraintBank:
+    """Bank of objects with the rows of `headings_of` and the references of `make`."""
+    count, rests = len(objects), max(len(row["rest"]) for row in rows)
     for row in rows:
         fill = np.resize(np.arange(len(row["rest"])), rests)
         row["rest"], row["has_affordance"] = row["rest"][fill], row["has_affordance"][fill]
@@ -96,7 +125,6 @@ def _build(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: i
     chosen = [columns.pop(f"chosen_{name}") for name in Headings._fields]
     surfaces = [np.stack([getattr(obj, name) for obj in objects]).astype(np.float32) for name in ("points", "normals")]
     key, waypoints = jax.random.key(seed), task.trajectory_points
-    make = _references if draws_references(task) else _no_references  # closing a hand around objects takes seconds
     references = make(hand, *surfaces, *chosen, columns["rest"], key, waypoints=waypoints)
     own = {"renewable": np.ones(count, bool), "grasps": np.zeros((count, 2), int)}
     own["mass"] = np.array([obj.mass for obj in objects], np.float32)

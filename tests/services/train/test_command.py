@@ -9,6 +9,7 @@ from rich.console import Console
 
 from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.runtime.stages import stage
 from congrasp.common.task.config import TaskConfig
 from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.train import command
@@ -43,6 +44,8 @@ def status(update, **values):
 
 
 def test_progress_counts_the_time_left_from_the_first_update(said, clock):
+    with stage("a stage"):
+        pass
     with _Progress(CONFIG) as progress:
         clock.seconds += 30  # compiling
         progress.show({"actors": 2})
@@ -50,7 +53,8 @@ def test_progress_counts_the_time_left_from_the_first_update(said, clock):
         progress.show(status(1))
         clock.seconds += 20
         progress.show(status(3, **{"episode/success": 0.256, "episode/links_at_removal": 2.5, "episode/return": -7.25}))
-    first, early, late = (line.strip() for line in said())
+    first, *start, early, late = (line.strip() for line in said())
+    assert "First update" in start[0] and any(line.endswith(": a stage") for line in start[1:])
     assert first == "compiling, and filling the first batch: 30 s, 2 actor(s)"
     assert early.startswith("update    1/10") and early.endswith("left ?")
     # Two updates took 20 s, so that the seven others take 70.

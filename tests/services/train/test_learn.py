@@ -1,9 +1,16 @@
-"""A training that ends with its first update, as warm-up and benchmarks run it."""
+"""A training that ends with its first update, as warm-up and benchmarks run it, and the caches that it fills."""
 
+import io
+import json
 import pathlib
+import tarfile
 import threading
 
+import pytest
+
 from congrasp.common.config import RunConfig
+from congrasp.common.errors import CongraspError
+from congrasp.services.cli import warmup
 from congrasp.services.train import learn as training
 
 
@@ -35,3 +42,94 @@ def test_nothing_is_reported_of_a_start_that_was_stopped(monkeypatch):
     monkeypatch.setattr(training, "learn", learn)
     training.until_first_update(RunConfig(), "native", threading.Event(), lambda: reported.append(1))
     assert not reported
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """Makes this a machine with empty caches and a version of JAX; returns the caches' parent folder."""
+
+    def become(name, version="1.2"):
+        folders = {kind: tmp_path / name / "caches" / kind for kind in ("jax", "warp")}
+        monkeypatch.setattr(warmup, "_folders", lambda: folders)
+        monkeypatch.setattr(warmup, "_machine", lambda: {"JAX": version, "device": "GPU"})
+        return tmp_path / name
+
+    return become
+
+
+def test_caches_travel_with_a_file(machine, tmp_path, monkeypatch):
+    caches, file = machine("a") / "caches", tmp_path / "caches.tar"
+
+    def first_update(config, physics, stop, report):
+        for name, content in (("jax/program", b"1"), ("warp/module/kernel.cubin", b"2"), ("warp/.module.tmp", b"3")):
+            (caches / name).parent.mkdir(parents=True, exist_ok=True)
+            (caches / name).write_bytes(content)
+        (caches / "jax/link").symlink_to("program")
+        stop.set()
+
+    monkeypatch.setattr(training, "until_first_update", first_update)
+    assert warmup.warmup(export=file) == 0
+    there = machine("b") / "caches"
+    (there / "jax").mkdir(parents=True)
+    (there / "jax/program").write_bytes(b"in use")
+    assert warmup.warmup(source=file) == 0
+    files = {str(path.relative_to(there)): path.read_bytes() for path in there.rglob("*") if path.is_file()}
+    assert files == {"jax/program": b"in use", "warp/module/kernel.cubin": b"2"}
+
+
+def _written(path, *members, manifest=None):
+    """A file of caches with a manifest and these members, of which each is a name or a `TarInfo`."""
+    text = json.dumps({"JAX": "1.2", "device": "GPU"} if manifest is None else manifest).encode()
+    with tarfile.open(path, "w") as archive:
+        about = tarfile.TarInfo("caches.json")
+        about.size = len(text)
+        archive.addfile(about, io.BytesIO(text))
+        for member in members:
+            archive.addfile(member if isinstance(member, tarfile.TarInfo) else tarfile.TarInfo(member))
+    return path
+
+
+def _link(kind, target):
+    link = tarfile.TarInfo("jax/link")
+    link.type, link.linkname = kind, target
+    return link
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        "jax/../../escaped",
+        "jax//escaped",
+        "jax",
+        "jax/.",
+        "/jax/escaped",
+        "../jax/escaped",
+        "elsewhere/escaped",
+        _link(tarfile.SYMTYPE, "../../escaped"),
+        _link(tarfile.LNKTYPE, "caches.json"),
+        _link(tarfile.FIFOTYPE, ""),
+    ],
+    ids=str,
+)
+def test_only_files_in_the_folders_of_the_caches_are_written(machine, tmp_path, member):
+    file, here = _written(tmp_path / "caches.tar", "jax/program", member), machine("a")
+    with pytest.raises(CongraspError, match="no file of a cache"):
+        warmup.import_caches(file)
+    assert not here.exists()  # not even the members before it
+
+
+def test_caches_of_other_versions_and_files_of_other_kinds_are_one_line(machine, tmp_path):
+    machine("a")
+    with pytest.raises(CongraspError, match=r"made for JAX '1.1', but this machine has 1.2"):
+        warmup.import_caches(_written(tmp_path / "old.tar", manifest={"JAX": "1.1", "device": "GPU"}))
+    (tmp_path / "text").write_text("no archive")
+    other = [_written(tmp_path / f"{n}.tar", manifest=made_for) for n, made_for in enumerate(([], {}, "text"))]
+    with tarfile.open(tmp_path / "plain.tar", "w") as archive:
+        archive.addfile(tarfile.TarInfo("jax/program"))
+    for path in (tmp_path / "text", tmp_path / "plain.tar", *other):
+        with pytest.raises(CongraspError, match="is not a file of caches, or is damaged"):
+            warmup.import_caches(path)
+    with pytest.raises(CongraspError, match=r"cannot be read: No such file"):
+        warmup.import_caches(tmp_path / "missing.tar")
+    with pytest.raises(CongraspError, match="cannot be read: Is a directory"):
+        warmup.import_caches(tmp_path)
