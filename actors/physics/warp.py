@@ -14,7 +14,7 @@ import functools
 import itertools
 import threading
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -102,8 +102,7 @@ class WarpBuffers:
         self._model.opt.warn_overflow = 0
         self._sensing = self._model.opt.disableflags
         self._blind = self._sensing | mujoco_warp.DisableBit.SENSOR
-        background = concurrent.futures.ThreadPoolExecutor(1, "kernels")
-        self._kernels = background.submit(_load_kernels, device, self._variants())
+        self._kernels = concurrent.futures.ThreadPoolExecutor(1, "kernels").submit(self._load_kernels)
         wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
 
     def fill(self, objects: Objects, meshes: dict[str, Any]) -> None:
@@ -140,6 +139,16 @@ class WarpBuffers:
             for _ in range(steps):
                 self._launch()
         wp.synchronize_device(self._device)
+
+    def _load_kernels(self) -> None:
+        """Builds the kernels of a control step in parallel, or reads them from Warp's cache.
+
+        Launches would do this one after another. Warp compiles without Python's lock.
+        """
+        with stage("list of the kernels"):  # factorisations are compiled here: Warp names a kernel by its code
+            variants = self._variants()
+        with stage("kernels"), concurrent.futures.ThreadPoolExecutor(cores()) as threads:
+            list(threads.map(lambda variant: wp.force_load(self._device, [variant[0]], variant[1]), variants))
 
     def _variants(self) -> set[tuple[wp.Module, int | None]]:
         """Modules with the kernels of a control step, and their block sizes.
@@ -219,15 +228,6 @@ def register(buffers: WarpBuffers) -> int:
     handle = next(_handles)
     _buffers[handle] = buffers
     return handle
-
-
-def _load_kernels(device: wp.Device, variants: Iterable[tuple[wp.Module, int | None]]) -> None:
-    """Builds modules for block sizes in parallel, or reads them from Warp's cache.
-
-    Launches would do this one after another. Warp compiles without Python's lock.
-    """
-    with stage("kernels"), concurrent.futures.ThreadPoolExecutor(cores()) as threads:
-        list(threads.map(lambda variant: wp.force_load(device, [variant[0]], variant[1]), variants))
 
 
 def _control_step(
