@@ -57,7 +57,7 @@ _DIRECTIONS = 300  # of the extreme vertices that larger hulls are reduced to
 _NEAR = 5e-4  # m; pieces whose boxes are nearer than this are neighbours
 _INNER, _ENOUGH, _FEW = 60_000, 500, 30  # points inside of the mesh; enough, and too few of them for one piece
 _FULL, _MOST = 0.03, 0.9  # hollow shares of its hull from which on a piece is thinned, and by which it is at most
-_WALL = 0.025  # m; thicker pieces are not walls, and stay as thick as they are
+_WALL = 0.02  # m; thicker pieces are not walls, and stay as thick as they are
 _LEAST = 1e-11  # m^3; smaller pieces are dropped
 
 

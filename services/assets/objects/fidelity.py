@@ -24,7 +24,7 @@ MOST_SURFACE, MOST_VOLUME = 3e-3, 0.05
 REACH = 2e-3
 """Radius of the ball, m."""
 _RAYS = 256  # along the longest side of the box around both bodies
-_COARSE = 80  # cubes along the longest side, for voids
+_FINE = 0.75  # of the ball's radius: side of a cube that tells voids from the outside
 _SEAM = 4e-4  # m
 _OVERLAP = 1e-3  # share of its volume that a mesh may count twice
 _FACING = 0.5  # cosine; walls that face one another within `_SEAM` are a crack, too
@@ -252,9 +252,10 @@ def _cut(triangles: np.ndarray, low: np.ndarray, spacing: float) -> tuple[float,
         ends = np.concatenate([entries, exits, closed])
         surfaces.append(_Surface(found.points[ends], found.normals[ends], np.arange(len(ends)) < 2 * len(entries)))
     points, normals, outer = map(np.concatenate, zip(*surfaces, strict=True))
-    cubes = voxels(triangles, 2 * REACH, _COARSE)
+    cubes = voxels(triangles, 2 * REACH, min(_RAYS, int(np.ptp(triangles, axis=(0, 1)).max() / (_FINE * REACH)) + 1))
     spaces, _ = label(distance_transform_edt(~cubes.inside, cubes.spacing) > _TOUCHES * REACH)
-    outer &= binary_dilation(spaces == spaces[0, 0, 0], iterations=2)[cubes.at(points + REACH * normals)]
+    reached = binary_dilation(spaces == spaces[0, 0, 0], iterations=2, mask=~cubes.inside)
+    outer &= reached[cubes.at(points + REACH * normals)]
     return float(np.mean(volumes)), _Surface(points, normals, outer)
 
 

@@ -208,7 +208,7 @@ def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
 
 
 def test_a_hull_of_an_ell_is_not_reliable(tmp_path, options, hull_alone):
-    """An ell's hull has 64 % more volume; squeezed to its volume, it is far from its surface."""
+    """An ell's hull has 64 % more volume, and is far from its surface."""
     ell().export(tmp_path / "ell.stl")
     (obj,) = objects_of(tmp_path / "ell.stl", options)
     assert not obj.shape_reliable
