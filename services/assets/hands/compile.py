@@ -281,6 +281,9 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
         names = Counter(element.get("name") for element in robot.findall(kind))
         if repeated := [name for name, count in names.items() if count > 1]:
             raise _Known(f"several {kind}s are called '{repeated[0]}'. Rename all but one")
+    children = {child.get("link") for child in robot.findall("joint/child")}
+    if robot.find("link") is not None and all(link.get("name") in children for link in robot.findall("link")):
+        raise _Known("its links form a loop, and none is the root. Remove the joint that closes it")
     _check_joints(robot, notes)
     assets, lacking = dict[str, bytes](), dict[str, None]()
     for link in robot.iter("link"):

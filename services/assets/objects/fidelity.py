@@ -68,17 +68,18 @@ def fidelity(mesh: np.ndarray, pieces: list[np.ndarray], closed: bool) -> Fideli
         wanted, wanted_surface = _cut(mesh, low, spacing)
     else:
         points, normals, _ = shapes.on_triangles(mesh, _random().random((2 * POINTS, 3)))
-        wanted, wanted_surface = 0.0, _Surface(points, normals, np.ones(len(points), bool))
+        wanted, wanted_surface = 0.0, _Surface(points, normals, *np.ones((2, len(points)), bool))
     distance = max(_farthest(surface, wanted_surface), _farthest(wanted_surface, surface))
     return Fidelity(volume / wanted - 1 if closed else None, distance)
 
 
 class _Surface(NamedTuple):
-    """Points of a surface (N, 3), m, outward unit normals (N, 3) there, and which (N,) are in no seam or void."""
+    """Points of a surface (N, 3), m, outward unit normals (N, 3) there, which (N,) are in no seam, which in no void."""
 
     points: np.ndarray
     normals: np.ndarray
     outer: np.ndarray
+    reached: np.ndarray
 
 
 def _random() -> np.random.Generator:
@@ -89,7 +90,7 @@ def _random() -> np.random.Generator:
 def _farthest(surface: _Surface, other: _Surface) -> float:
     """The largest distance of a point of a surface that the ball can touch from the other surface, m."""
     # Sorted: neighbouring points are then neighbours in the tree and in memory.
-    some = np.sort(_random().permutation(np.flatnonzero(surface.outer))[:POINTS])
+    some = np.sort(_random().permutation(np.flatnonzero(surface.outer & surface.reached))[:POINTS])
     points, normals = surface.points[some], surface.normals[some]
     tree = cKDTree(surface.points)
     distance, near = tree.query(points, k=8, distance_upper_bound=_SEAM)
@@ -250,13 +251,12 @@ def _cut(triangles: np.ndarray, low: np.ndarray, spacing: float) -> tuple[float,
         entries, exits, closed = _intervals(found, _SEAM / spacing)
         volumes.append((found.place[exits] - found.place[entries]).sum() * spacing**3)
         ends = np.concatenate([entries, exits, closed])
-        surfaces.append(_Surface(found.points[ends], found.normals[ends], np.arange(len(ends)) < 2 * len(entries)))
+        surfaces.append((found.points[ends], found.normals[ends], np.arange(len(ends)) < 2 * len(entries)))
     points, normals, outer = map(np.concatenate, zip(*surfaces, strict=True))
     cubes = voxels(triangles, 2 * REACH, min(_RAYS, int(np.ptp(triangles, axis=(0, 1)).max() / (_FINE * REACH)) + 1))
     spaces, _ = label(distance_transform_edt(~cubes.inside, cubes.spacing) > _TOUCHES * REACH)
-    reached = binary_dilation(spaces == spaces[0, 0, 0], iterations=2, mask=~cubes.inside)
-    outer &= reached[cubes.at(points + REACH * normals)]
-    return float(np.mean(volumes)), _Surface(points, normals, outer)
+    free = binary_dilation(spaces == spaces[0, 0, 0], iterations=2, mask=~cubes.inside)
+    return float(np.mean(volumes)), _Surface(points, normals, outer, free[cubes.at(points + REACH * normals)])
 
 
 def _crossings(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
