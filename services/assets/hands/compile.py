@@ -120,7 +120,10 @@ def _unread(path: pathlib.Path, error: Exception) -> str:
     """One line about an error of reading; MuJoCo's begins with its kind, and names the element in the second line."""
     lines = [line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()]
     reason = re.sub(r"^(?:(?:XML )?Error: )+", "", ", ".join(lines)) or "MuJoCo gives no reason"
-    return f"{path} cannot be read: {reason[:400]}." + ("" if isinstance(error, _Known) else f" {_REMEDY}")
+    remedy = f" {_REMEDY}" if not isinstance(error, _Known) else ""
+    if "unrecognized attribute" in reason or "unrecognized element" in reason:
+        remedy = f" MuJoCo {mujoco.__version__} has none of that name: delete it."
+    return f"{path} cannot be read: {reason[:400]}.{remedy}"
 
 
 class _Known(ValueError):
@@ -143,7 +146,9 @@ def _spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
         raise _Known(f"this is xacro, of which ROS makes a URDF. Run 'xacro {path.name} > {plain}' and import that")
     if kind == "robot":
         spec = _urdf(path, text, notes)
-    elif kind in ("mujoco", "mujocoinclude"):
+    elif kind == "mujocoinclude":
+        raise _Known("it is a part of an MJCF. Import the file that includes it")
+    elif kind == "mujoco":
         try:
             files = {name: other.encode() for name, other in included.items()}
             spec = mujoco.MjSpec.from_string(text, include=files)
@@ -276,6 +281,9 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
         names = Counter(element.get("name") for element in robot.findall(kind))
         if repeated := [name for name, count in names.items() if count > 1]:
             raise _Known(f"several {kind}s are called '{repeated[0]}'. Rename all but one")
+    children = {child.get("link") for child in robot.findall("joint/child")}
+    if robot.find("link") is not None and all(link.get("name") in children for link in robot.findall("link")):
+        raise _Known("its links form a loop, and none is the root. Remove the joint that closes it")
     _check_joints(robot, notes)
     assets, lacking = dict[str, bytes](), dict[str, None]()
     for link in robot.iter("link"):

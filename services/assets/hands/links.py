@@ -217,6 +217,8 @@ def link_mesh(tree: Tree, link: int) -> tuple[np.ndarray, np.ndarray] | None:
         whole = whole.simplify_quadric_decimation(face_count=MAX_FACES)
     if not 0 < len(whole.faces) <= MAX_FACES:  # many separate parts cannot be simplified that far
         whole = joined.convex_hull
+        if len(whole.faces) > MAX_FACES:
+            whole = whole.simplify_quadric_decimation(face_count=MAX_FACES)
     return np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32)
 
 

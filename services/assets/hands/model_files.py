@@ -108,6 +108,8 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     palm = model.body(tree.palm).name
     if len(tree.ends) < 2:
         shown = identifier(palm, f"body_{tree.palm}")
+        if not model.njnt:
+            raise CongraspError(f"{path} has no joints.", "If it is a part, import the file that includes it.")
         raise CongraspError(f"{path} has {len(tree.ends)} finger(s) on its palm '{shown}'.", "Pass another --palm.")
     wide = np.sqrt(model.body_inertia.max(1) / np.maximum(model.body_mass, LEAST[0])) > _LINK[1]
     if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
@@ -120,8 +122,9 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
         links = [dataclasses.replace(x, solids=solids_of(tree, i)) for x, i in zip(links, tree.groups, strict=True)]
         if kept := [link.name for link in links if not link.solids]:
             notes.append(f"only meshes as collision geometry, capsules are used: {', '.join(kept)}")
+    name = identifier(choices.name or path.stem, "hand").lower()
     hand = Hand(
-        name=identifier(choices.name or path.stem, "hand").lower(),
+        name=f"hand_{name}" if name[0].isdigit() else name,
         links=tuple(links),
         thumb=next(link.name for link in links if link.tip is not None),
         open_pose={},
@@ -147,7 +150,7 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     _check(path, hand)
     hand = hand_from_text(hand_text(hand), str(path))
     meshes = _meshes(tree, notes)
-    return Proposal(hand, palm, tuple(notes), meshes)
+    return Proposal(hand, palm, tuple(dict.fromkeys(notes)), meshes)
 
 
 def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:

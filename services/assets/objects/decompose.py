@@ -13,11 +13,12 @@ import heapq
 import pathlib
 import tempfile
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import ConvexHull, QhullError
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import is_watertight
 
@@ -27,7 +28,15 @@ from congrasp.common.objects.spec import MAX_MESH_PIECES, MAX_MESH_VERTICES
 from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.confined import call_confined
 from congrasp.services.assets.objects import repair
-from congrasp.services.assets.objects.fidelity import MOST_SURFACE, MOST_VOLUME, Fidelity, enclosed, fidelity, interior
+from congrasp.services.assets.objects.fidelity import (
+    MOST_SURFACE,
+    MOST_VOLUME,
+    Fidelity,
+    enclosed,
+    fidelity,
+    interior,
+    voxels,
+)
 from congrasp.services.assets.objects.options import ImportOptions
 
 FALLBACK_LIMIT = 30.0
@@ -43,11 +52,12 @@ DEPTH = 1.5e-3
 """Largest depth of the surface in a hull, or distance of the hull from it, for joins below the limit of pieces, m."""
 GROWTH = 0.02
 """Share of the volume that joins may add below the limit of pieces."""
-_SAMPLES, _PROBES = 6000, 100  # points on the whole surface, and on the hull of two pieces
+_SAMPLES, _PROBES = 6000, 200  # points on the whole surface, and on the hull of two pieces
+_DIRECTIONS = 300  # of the extreme vertices that larger hulls are reduced to
 _NEAR = 5e-4  # m; pieces whose boxes are nearer than this are neighbours
-_ON = 1e-4  # m; points of a hull that are nearer to a piece than this belong to it
-_INNER = 30_000  # points inside of the mesh
+_INNER, _ENOUGH, _FEW = 60_000, 500, 30  # points inside of the mesh; enough, and too few of them for one piece
 _FULL, _MOST = 0.03, 0.9  # hollow shares of its hull from which on a piece is thinned, and by which it is at most
+_WALL = 0.02  # m; thicker pieces are not walls, and stay as thick as they are
 _LEAST = 1e-11  # m^3; smaller pieces are dropped
 
 
@@ -56,8 +66,10 @@ class Surfaces(NamedTuple):
 
     meshes: Sequence[trimesh.Trimesh]
     """One of the whole, or one of each part, m."""
+    shown: Sequence[trimesh.Trimesh]
+    """The same without hollows that no finger enters."""
     triangles: np.ndarray
-    """(F, 3, 3) of all of them."""
+    """(F, 3, 3) of all that are shown."""
     volume: float | None
     """Volume that they enclose (`fidelity.enclosed`), m^3; None if one is open."""
 
@@ -122,13 +134,14 @@ def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collis
     volumes = np.array([hull.volume for hull in whole])
     limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
     hulls, owners = list[np.ndarray](), list[int]()
-    for owner, (mesh, limit) in enumerate(zip(meshes, limits, strict=True)):
+    for owner, (mesh, shown, limit) in enumerate(zip(meshes, surfaces.shown, limits, strict=True)):
         small = repair.with_few_faces(mesh)
         closed = volume is not None and (small is mesh or repair.encloses(small))
         found = decompose(
             np.asarray(small.vertices),
             np.asarray(small.faces),
-            volume=(volume if len(meshes) == 1 else float(mesh.volume)) if closed else None,
+            shown=np.asarray((small if shown is mesh else shown).triangles),
+            volume=(volume if len(meshes) == 1 else float(shown.volume)) if closed else None,
             time_limit=options.time_limit,
             max_pieces=limit,
         )
@@ -168,6 +181,7 @@ def decompose(
     vertices: np.ndarray,
     faces: np.ndarray,
     *,
+    shown: np.ndarray,
     volume: float | None,
     time_limit: float,
     max_pieces: int = MAX_MESH_PIECES,
@@ -177,8 +191,9 @@ def decompose(
     Args:
       vertices: (V, 3), m, not all in a plane.
       faces: (F, 3).
-      volume: volume that a closed mesh encloses (`fidelity.enclosed`), m^3; one close to that of the hull needs no
-        decomposition.
+      shown: (T, 3, 3) corners of the surface to approximate: that of the mesh, or the mesh without its hollows.
+      volume: volume that it encloses if the mesh is closed (`fidelity.enclosed`), m^3; one close to that of the hull
+        needs no decomposition.
       time_limit: processor time for CoACD, s; V-HACD gets half a minute after it.
       max_pieces: most pieces.
 
@@ -187,11 +202,13 @@ def decompose(
     """
     hull = shapes.hull_of(vertices)
     whole = [hull.points[hull.vertices]]
-    if volume is not None and _convex(hull, vertices[faces], volume):
+    if volume is not None and _convex(hull, shown, volume):
         return Decomposition(whole, "convex", [])
     notes: list[str] = []
     for method, limit in (("coacd", time_limit), ("vhacd", FALLBACK_LIMIT)):
-        found, failure = _in_child(method, vertices, faces, volume, max_pieces, limit)
+        found, failure = _in_child(
+            method, {"vertices": vertices, "faces": faces, "shown": shown}, volume, max_pieces, limit
+        )
         if found:
             return Decomposition(found, method, notes)
         notes.append(f"{method} {failure}")
@@ -200,13 +217,13 @@ def decompose(
 
 
 def _in_child(
-    method: str, vertices: np.ndarray, faces: np.ndarray, volume: float | None, max_pieces: int, limit: float
+    method: str, mesh: dict[str, Any], volume: float | None, max_pieces: int, limit: float
 ) -> tuple[list[np.ndarray], str]:
     """Returns the pieces, or none and the reason."""
     most = min(_MEMORY, max(LEAST_MEMORY, memory() // cores()))
     with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
         folder, options = pathlib.Path(name), {"method": method, "volume": volume, "max_pieces": max_pieces}
-        np.savez(folder / _MESH, vertices=vertices, faces=faces)
+        np.savez(folder / _MESH, **mesh)
         patience = STARVED * limit + STARVED
         try:
             call_confined(write_pieces, folder, options, memory=most, seconds=limit, patience=patience)
@@ -225,7 +242,7 @@ def _in_child(
 def write_pieces(folder: pathlib.Path, method: str, volume: float | None, max_pieces: int) -> None:
     """Decomposes the mesh in a folder, in the confined process."""
     with np.load(folder / _MESH) as arrays:
-        vertices, faces = arrays["vertices"], arrays["faces"]
+        vertices, faces, shown = arrays["vertices"], arrays["faces"], arrays["shown"]
     if method == "coacd":
         # A closed mesh may be of several bodies that intersect, which CoACD cuts forever.
         parts = repair.bodies(vertices, faces) if volume else [(vertices, faces)]
@@ -236,7 +253,7 @@ def write_pieces(folder: pathlib.Path, method: str, volume: float | None, max_pi
         rows = np.insert(faces, 0, 3, axis=1).astype(np.uint32)  # the number of corners comes first, as in VTK
         found = [piece[0] for piece in vhacdx.compute_vhacd(vertices, rows, maxConvexHulls=max_pieces)]
     solid = [hull for hull in (solid_hull(np.asarray(piece, np.float64)) for piece in found) if hull is not None]
-    np.savez(folder / _PIECES, *merge([hull.points for hull in solid], max_pieces, vertices[faces], volume))
+    np.savez(folder / _PIECES, *merge([hull.points for hull in solid], max_pieces, shown, volume))
 
 
 def _by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[np.ndarray]:
@@ -270,19 +287,18 @@ class _Part(NamedTuple):
     vertices: np.ndarray
     """(V, 3) before it was thinned, m."""
     hull: ConvexHull
-    shift: float
-    """Largest displacement of a vertex by thinning, m."""
+    hollow: float
+    """Volume of its hull before it was thinned, without that of the mesh in it, m^3."""
+    error: float
+    """Largest of the way that thinning moves a side, the depth of the surface in it, and its distance from it, m."""
 
 
 class _Join(NamedTuple):
     """Cost of joining two pieces."""
 
     cost: float
-    checked: bool
-    """True if `depth` includes parts that stand out from the surface; this is slow, and done for the cheapest joins."""
     first: int
     second: int
-    depth: float
     growth: float
     part: _Part
 
@@ -294,11 +310,15 @@ class _Merger:
         """Takes the arguments of `merge`."""
         random = np.random.default_rng(0)
         self._surface = _sorted(shapes.on_triangles(triangles, random.random((_SAMPLES, 3)))[0])
-        self._tree = cKDTree(self._surface)
         self._probes = random.random((_PROBES, 3))
+        self._directions = random.normal(size=(3, _DIRECTIONS))
         hulls = [hull for hull in map(solid_hull, pieces) if hull is not None]
         self._volume = sum(hull.volume for hull in hulls) if volume is None else volume
         self._inner = None if volume is None else _sorted(interior(triangles, _INNER))
+        if volume is None:
+            triangles = np.concatenate([shapes.triangulate(hull.points).triangles for hull in hulls])
+        self._voxels = voxels(triangles, MOST_SURFACE)
+        self._distance = distance_transform_edt(~self._voxels.inside, self._voxels.spacing)
         self.parts = {i: self._part(hull) for i, hull in enumerate(hulls)}
         self._count = len(self.parts)
         self._neighbors: dict[int, set[int]] = {i: set() for i in self.parts}
@@ -312,19 +332,26 @@ class _Merger:
 
     def _part(self, hull: ConvexHull) -> _Part:
         """A piece of this hull, thinner along its shortest axis where the mesh does not fill it."""
-        vertices = hull.points[hull.vertices]
-        if self._inner is None:
-            return _Part(vertices, hull, 0.0)
-        inside = (_beyond(hull, _near(hull, self._inner)) < 0).sum()
-        hollow = 1 - inside * self._volume / len(self._inner) / hull.volume
-        if hollow < _FULL:
-            return _Part(vertices, hull, 0.0)
+        vertices, thin, shift = hull.points[hull.vertices], hull, 0.0
+        hollow = 1.0 if self._inner is None else self._hollow(hull, self._inner)
         axis = np.linalg.svd(vertices - vertices.mean(0), full_matrices=False)[2][-1]
         along = vertices @ axis
-        inwards = min(hollow, _MOST) * ((along.max() + along.min()) / 2 - along)
-        shift = np.abs(inwards).max()
-        inwards *= min(1.0, MOST_SURFACE / shift)
-        return _Part(vertices, shapes.hull_of(vertices + np.outer(inwards, axis)), min(shift, MOST_SURFACE))
+        if self._inner is not None and hollow > _FULL and np.ptp(along) < _WALL:
+            inwards = min(hollow, _MOST) * ((along.max() + along.min()) / 2 - along)
+            shift = min(MOST_SURFACE, largest := np.abs(inwards).max())
+            thin = shapes.hull_of(vertices + np.outer(inwards * shift / largest, axis))
+        depth = -_beyond(thin, _near(thin, self._surface)).min(initial=0.0)
+        outside, _, _ = shapes.on_triangles(thin.points[thin.simplices], self._probes)
+        error = max(shift, depth, self._distance[self._voxels.at(outside)].max())
+        return _Part(vertices, thin, hollow * hull.volume, float(error))
+
+    def _hollow(self, hull: ConvexHull, inner: np.ndarray) -> float:
+        """Share of a hull that the mesh does not fill, by its inner points."""
+        near = _near(hull, inner)
+        if hull.volume * len(inner) < _FEW * self._volume or not len(near):
+            return 0.0
+        share = (_beyond(hull, near[:: 1 + len(near) // _ENOUGH]) < 0).mean()
+        return float(1 - share * len(near) / len(inner) * self._volume / hull.volume)
 
     def reduce(self, max_pieces: int) -> None:
         """Makes joins, cheapest first, until none is left; below the limit of pieces only those within tolerances."""
@@ -334,34 +361,22 @@ class _Merger:
             if join.first not in self.parts or join.second not in self.parts:
                 continue
             enough = len(self.parts) <= max_pieces
-            if enough and (join.depth > DEPTH or grown + join.growth > GROWTH * self._volume):
-                continue
-            if not join.checked:
-                self._check(join)
+            if enough and (join.part.error > DEPTH or grown + join.growth > GROWTH * self._volume):
                 continue
             grown += join.growth
             self._make(join)
 
     def _consider(self, i: int, j: int) -> None:
-        """Enters the join of two pieces, by the depth of the surface points in it, or of its sides in a bent wall."""
+        """Enters the join of two pieces."""
         a, b = self.parts[i], self.parts[j]
-        part = self._part(shapes.hull_of(np.concatenate([a.vertices, b.vertices])))
-        depth = max(part.shift, -_beyond(part.hull, _near(part.hull, self._surface)).min(initial=0.0))
-        self._push(False, i, j, depth, max(0.0, part.hull.volume - a.hull.volume - b.hull.volume), part)
-
-    def _check(self, join: _Join) -> None:
-        """Enters a join again, with the distance of its hull from the surface outside of the neighbouring pieces."""
-        points, _, _ = shapes.on_triangles(join.part.hull.points[join.part.hull.simplices], self._probes)
-        i, j = join.first, join.second
-        for k in {i, j} | self._neighbors[i] | self._neighbors[j]:
-            points = points[_beyond(self.parts[k].hull, points) > _ON]
-        stands_out = self._tree.query(points)[0].max(initial=0.0)
-        self._push(True, i, j, max(join.depth, stands_out), join.growth, join.part)
-
-    def _push(self, checked: bool, i: int, j: int, depth: float, growth: float, part: _Part) -> None:
-        """Enters a join under its cost."""
-        cost = depth / MOST_SURFACE + growth / (MOST_VOLUME * self._volume)
-        heapq.heappush(self._joins, _Join(cost, checked, i, j, depth, growth, part))
+        vertices = np.concatenate([a.vertices, b.vertices])
+        if len(vertices) > _DIRECTIONS:
+            vertices = vertices[np.unique((vertices @ self._directions).argmax(0))]
+        part = self._part(shapes.hull_of(vertices))
+        growth = max(0.0, part.hull.volume - a.hull.volume - b.hull.volume)
+        filled = max(0.0, part.hollow - a.hollow - b.hollow)
+        cost = part.error / MOST_SURFACE + filled / (MOST_VOLUME * self._volume)
+        heapq.heappush(self._joins, _Join(cost, i, j, growth, part))
 
     def _make(self, join: _Join) -> None:
         """Replaces two pieces by their join."""
@@ -380,7 +395,7 @@ def merge(pieces: list[np.ndarray], max_pieces: int, triangles: np.ndarray, volu
 
     The cost of a join is the volume that it adds and its deviation from the surface, each as a share of the tolerance
     (`fidelity.MOST_VOLUME`, `MOST_SURFACE`). The deviation is the depth of the deepest surface point in the piece, the
-    way that thinning moves its sides, or the distance of its farthest point from the surface, by samples. Pieces that
+    way that thinning moves its sides, or the distance of its farthest point from the mesh, by samples. Pieces that
     do not touch are never joined, so that more than `max_pieces` remain if there are more separate bodies.
 
     Args:

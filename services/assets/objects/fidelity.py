@@ -3,14 +3,15 @@
 Both bodies are cut by parallel rays along each axis, the same for both. A ray is inside where the winding number of the
 triangles around it is above zero: bodies may overlap, walls inside of others do not count, and neither does a gap along
 a ray that is narrower than `_SEAM`. The rays' interior length gives the volume; their entries and exits give the outer
-surface. The inside of a cup is outside. Only the part of the surface that a ball of radius `REACH` can touch counts: no
-finger reaches into a crack.
+surface. The inside of a cup is outside. Only the part of the surface that a ball of radius `REACH` can touch from
+outside counts: no finger reaches into a crack, or into a void between pieces.
 """
 
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_dilation, distance_transform_edt, label
 from scipy.spatial import cKDTree
 from trimesh.triangles import mass_properties
 
@@ -23,6 +24,7 @@ MOST_SURFACE, MOST_VOLUME = 3e-3, 0.05
 REACH = 2e-3
 """Radius of the ball, m."""
 _RAYS = 256  # along the longest side of the box around both bodies
+_FINE = 0.75  # of the ball's radius: side of a cube that tells voids from the outside
 _SEAM = 4e-4  # m
 _OVERLAP = 1e-3  # share of its volume that a mesh may count twice
 _FACING = 0.5  # cosine; walls that face one another within `_SEAM` are a crack, too
@@ -66,17 +68,18 @@ def fidelity(mesh: np.ndarray, pieces: list[np.ndarray], closed: bool) -> Fideli
         wanted, wanted_surface = _cut(mesh, low, spacing)
     else:
         points, normals, _ = shapes.on_triangles(mesh, _random().random((2 * POINTS, 3)))
-        wanted, wanted_surface = 0.0, _Surface(points, normals, np.ones(len(points), bool))
+        wanted, wanted_surface = 0.0, _Surface(points, normals, *np.ones((2, len(points)), bool))
     distance = max(_farthest(surface, wanted_surface), _farthest(wanted_surface, surface))
     return Fidelity(volume / wanted - 1 if closed else None, distance)
 
 
 class _Surface(NamedTuple):
-    """Points of a surface (N, 3), m, outward unit normals (N, 3) there, and which (N,) do not lie in closed seams."""
+    """Points of a surface (N, 3), m, outward unit normals (N, 3) there, which (N,) are in no seam, which in no void."""
 
     points: np.ndarray
     normals: np.ndarray
     outer: np.ndarray
+    reached: np.ndarray
 
 
 def _random() -> np.random.Generator:
@@ -87,7 +90,7 @@ def _random() -> np.random.Generator:
 def _farthest(surface: _Surface, other: _Surface) -> float:
     """The largest distance of a point of a surface that the ball can touch from the other surface, m."""
     # Sorted: neighbouring points are then neighbours in the tree and in memory.
-    some = np.sort(_random().permutation(np.flatnonzero(surface.outer))[:POINTS])
+    some = np.sort(_random().permutation(np.flatnonzero(surface.outer & surface.reached))[:POINTS])
     points, normals = surface.points[some], surface.normals[some]
     tree = cKDTree(surface.points)
     distance, near = tree.query(points, k=8, distance_upper_bound=_SEAM)
@@ -143,6 +146,48 @@ def interior(triangles: np.ndarray, count: int) -> np.ndarray:
     chosen = np.searchsorted(along, wanted)
     share = (along[chosen] - wanted) / np.linalg.norm(end - start, axis=-1)[chosen]
     return end[chosen] - share[:, None] * (end - start)[chosen]
+
+
+class Voxels(NamedTuple):
+    """Cubes that tile the space in and around a closed mesh."""
+
+    inside: np.ndarray
+    """(X, Y, Z) bool; a wall thinner than a cube is a layer without holes, too."""
+    low: np.ndarray
+    """(3,) center of the first cube, m."""
+    spacing: float
+    """m."""
+
+    def at(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Indices of the cubes around points (N, 3); those outside of the grid have the nearest cube."""
+        nearest = np.rint((points - self.low) / self.spacing).astype(int)
+        return tuple(np.clip(nearest, 0, np.array(self.inside.shape) - 1).T)
+
+
+def voxels(triangles: np.ndarray, margin: float, count: int = 128) -> Voxels:
+    """Cubes inside of the outward triangles (F, 3, 3) of a closed mesh, and outside up to a margin.
+
+    Args:
+      triangles: m.
+      margin: m.
+      count: cubes along the longest side.
+    """
+    corners = triangles.reshape(-1, 3)
+    spacing = float(np.ptp(corners, axis=0).max()) / count
+    edge = int(np.ceil(margin / spacing)) + 1
+    low = corners.min(0) - edge * spacing
+    shape = np.ceil(np.ptp(corners, axis=0) / spacing).astype(int) + 2 * edge + 2
+    inside = np.zeros(shape, bool)
+    for found in _rays(triangles, low, spacing):
+        entries, exits, _ = _intervals(found, 0.0)
+        start, end = (np.ceil(found.place[some] + _OFF_GRID[found.axis]).astype(int) for some in (entries, exits))
+        order = np.roll(range(3), 2 - found.axis)  # the rays' axis is the last
+        steps = np.zeros(shape[order], np.int8)
+        rows = found.rays[entries].T
+        np.add.at(steps, (*rows, start), 1)
+        np.add.at(steps, (*rows, np.maximum(end, start + 1)), -1)
+        inside |= np.moveaxis(np.cumsum(steps, -1, dtype=np.int8) > 0, [0, 1, 2], order)
+    return Voxels(inside, low - _OFF_GRID * spacing, spacing)
 
 
 class Enclosed(NamedTuple):
@@ -206,8 +251,12 @@ def _cut(triangles: np.ndarray, low: np.ndarray, spacing: float) -> tuple[float,
         entries, exits, closed = _intervals(found, _SEAM / spacing)
         volumes.append((found.place[exits] - found.place[entries]).sum() * spacing**3)
         ends = np.concatenate([entries, exits, closed])
-        surfaces.append(_Surface(found.points[ends], found.normals[ends], np.arange(len(ends)) < 2 * len(entries)))
-    return float(np.mean(volumes)), _Surface(*map(np.concatenate, zip(*surfaces, strict=True)))
+        surfaces.append((found.points[ends], found.normals[ends], np.arange(len(ends)) < 2 * len(entries)))
+    points, normals, outer = map(np.concatenate, zip(*surfaces, strict=True))
+    cubes = voxels(triangles, 2 * REACH, min(_RAYS, int(np.ptp(triangles, axis=(0, 1)).max() / (_FINE * REACH)) + 1))
+    spaces, _ = label(distance_transform_edt(~cubes.inside, cubes.spacing) > _TOUCHES * REACH)
+    free = binary_dilation(spaces == spaces[0, 0, 0], iterations=2, mask=~cubes.inside)
+    return float(np.mean(volumes)), _Surface(points, normals, outer, free[cubes.at(points + REACH * normals)])
 
 
 def _crossings(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -304,6 +304,8 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
       ValueError: an index is 0, or the numbers have decimal commas.
     """
     data = data.removeprefix(_MARK)
+    if b"\n" not in data:
+        data = data.replace(b"\r", b"\n")
     if _ZERO.search(data):
         raise ValueError("a face has the index 0, but OBJ counts from 1")
     if _COMMA.search(data):

@@ -23,7 +23,7 @@ from congrasp.common.objects.spec import Colours, GraspObject, Piece
 from congrasp.common.runtime.parallel import cores, memory
 from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
-from congrasp.services.assets.objects.fidelity import enclosed
+from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
 from congrasp.services.assets.objects.mesh_files import read_mesh, sample_colours, up_of
 from congrasp.services.assets.objects.options import ImportOptions, Up, check_options, metres_per_unit
@@ -31,7 +31,7 @@ from congrasp.services.assets.objects.repair import encloses
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
-_CACHE_VERSION = 10
+_CACHE_VERSION = 11
 _DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
@@ -163,7 +163,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     solid = enclosed(np.asarray(whole.triangles)) if closed else None
     if solid and solid.overlaps:
         notes.append("its bodies overlap: what lies in several of them weighs once")
-    surfaces = decompose.Surfaces(meshes, np.asarray(whole.triangles), solid and solid.volume)
+    surfaces = _surfaces(meshes, solid, notes)
     hulls, owners, errors = _cut(source, [factor * piece for piece in given], surfaces, options, notes)
     if options.material:
         found = weigh_parts(meshes, parts or meshes, options.material, [part.part for part in source.parts])
@@ -239,6 +239,15 @@ def _read(source: Source, up: Up, notes: list[str]) -> _Files:
     if not source.parts:
         visuals = [repair.closed(mesh, notes) for mesh in visuals]
     return _Files(given, visuals, parts, found, coloured)
+
+
+def _surfaces(meshes: list[trimesh.Trimesh], solid: Enclosed | None, notes: list[str]) -> decompose.Surfaces:
+    """The surfaces of meshes, closed ones without hollows that no finger enters."""
+    shown = meshes if solid is None else [repair.without_hollows(mesh, notes) for mesh in meshes]
+    triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in shown])
+    if solid is not None and any(some is not mesh for some, mesh in zip(shown, meshes, strict=True)):
+        solid = enclosed(triangles)
+    return decompose.Surfaces(meshes, shown, triangles, solid and solid.volume)
 
 
 def _cut(

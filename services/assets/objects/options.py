@@ -93,6 +93,8 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
     """
     taken: str = "m" if unit in ("auto", "guess") else unit
     longest = max(sides) * scale
+    if not longest:
+        raise CongraspError(f"{path} is a point: all of its corners coincide.", "Check the scales of its nodes.")
     low, high = _PLAUSIBLE if unit in ("auto", "guess") else _POSSIBLE
     if not low <= longest * METRES[taken] <= high:
         others = [other for other in ("mm", "cm", "in", "m") if other != taken]

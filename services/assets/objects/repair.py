@@ -2,11 +2,16 @@
 
 import numpy as np
 import trimesh
+from scipy.ndimage import binary_propagation, distance_transform_edt, label
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import connected_component_labels
 
+from congrasp.services.assets.objects.fidelity import voxels
+
 MAX_FACES = 20_000
 """Triangles beyond which a mesh is reduced before anything else is done with it."""
+OPENING = 0.01
+"""Width of an opening that no finger enters, m."""
 _REDUCED = 200_000  # triangles above which a mesh is reduced before other checks
 _FEW = 0.05  # share of a mesh that may be missing
 _APART = 0.02  # of the mesh's size: bodies whose boxes are nearer than this belong together
@@ -176,6 +181,30 @@ def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
         mesh.invert()
         notes.append("it was inside out and was turned")
     return mesh
+
+
+def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
+    """A closed mesh without the walls of hollows that no finger enters, whose openings are closed.
+
+    A hollow is where a ball as wide as `OPENING` fits that cannot get out; it ends where one from outside gets to. The
+    mesh is returned unchanged if its openings cannot be closed.
+    """
+    cubes = voxels(np.asarray(mesh.triangles), OPENING)
+    spaces, count = label(distance_transform_edt(~cubes.inside, cubes.spacing) > OPENING / 2)
+    if count < 2:
+        return mesh
+    outer = spaces == spaces[0, 0, 0]
+    entered = distance_transform_edt(~outer, cubes.spacing) < OPENING / 2 + cubes.spacing
+    hollow = binary_propagation((spaces > 0) & ~outer, mask=~cubes.inside & ~entered)
+    centers, normals = np.asarray(mesh.triangles_center), np.asarray(mesh.face_normals)
+    inner = np.any([hollow[cubes.at(centers + step * cubes.spacing * normals)] for step in (1.0, 1.5, 2.0)], axis=0)
+    rest = trimesh.Trimesh(mesh.vertices, mesh.faces[~inner], process=False)
+    filled = _filled(rest, holes) if (holes := _loops(rest)) else rest
+    volume = float(hollow.sum()) * cubes.spacing**3
+    if not encloses(filled) or not 0.8 < (filled.volume - mesh.volume) / volume < 1.2:
+        return mesh
+    notes.append(f"its hollow of {1e6 * volume:.0f} cm^3, which no finger enters, is filled in its collision shape")
+    return filled
 
 
 def _loops(mesh: trimesh.Trimesh) -> list[np.ndarray]:

@@ -65,6 +65,15 @@ def test_a_slot_counts_if_the_ball_gets_in(width, counts):
         assert errors.surface < 0.002
 
 
+@pytest.mark.parametrize(("top", "counts"), [(0.01, False), (0.005, True)])
+def test_a_void_between_pieces_counts_if_the_ball_gets_in(top, counts):
+    """Slabs around a void of 2 cm in a cube of 6 cm; the last leaves a slot of 5 mm, or none."""
+    slabs = [block((0.06, 0.06, 0.02), (0, 0, z)) for z in (-0.02, 0.02)]
+    slabs += [block((0.06, 0.02, 0.02), (0, y, 0)) for y in (-0.02, 0.02)]
+    slabs += [block((0.02, 0.02, 0.02), (-0.02, 0, 0)), block((0.02, 0.02, top + 0.01), (0.02, 0, (top - 0.01) / 2))]
+    assert (compared(block((0.06,) * 3), slabs).surface > 0.01) == counts
+
+
 def test_the_inside_of_a_cup_is_outside():
     outer = trimesh.creation.cylinder(0.03, 0.08, sections=48)
     cup = trimesh.creation.annulus(0.026, 0.03, 0.08, sections=48)

@@ -184,22 +184,31 @@ def test_pieces_are_kept_if_a_cut_is_no_closer(tmp_path, options, hull_alone):
     assert obj.notes[0].endswith("; pieces cut from its mesh are no closer")
 
 
+def decomposed(mesh, time_limit):
+    shown = np.asarray(mesh.triangles)
+    return decompose.decompose(mesh.vertices, mesh.faces, shown=shown, volume=mesh.volume, time_limit=time_limit)
+
+
 def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
     mesh = ell()
-    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
+    result = decompose.decompose(
+        mesh.vertices, mesh.faces, shown=np.asarray(mesh.triangles), volume=mesh.volume, time_limit=0.01
+    )
     assert result.method == "vhacd"
     assert result.notes == ["coacd took longer than 0.01 s of processor time"]
     volume = sum(shapes.hull_of(piece).volume for piece in result.pieces)
     assert 0.8 * mesh.volume < volume < 1.2 * mesh.volume
     monkeypatch.setattr(decompose, "FALLBACK_LIMIT", 0.01)
-    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
+    result = decompose.decompose(
+        mesh.vertices, mesh.faces, shown=np.asarray(mesh.triangles), volume=mesh.volume, time_limit=0.01
+    )
     assert (result.method, len(result.pieces)) == ("hull", 1)
     np.testing.assert_allclose(shapes.hull_of(result.pieces[0]).volume, 0.08**2 * 0.02 - 0.06**2 / 2 * 0.02, rtol=1e-6)
     assert "hull" in result.notes[-1]
 
 
 def test_a_hull_of_an_ell_is_not_reliable(tmp_path, options, hull_alone):
-    """An ell's hull has 64 % more volume; squeezed to its volume, it is far from its surface."""
+    """An ell's hull has 64 % more volume, and is far from its surface."""
     ell().export(tmp_path / "ell.stl")
     (obj,) = objects_of(tmp_path / "ell.stl", options)
     assert not obj.shape_reliable
@@ -212,12 +221,14 @@ def test_a_busy_machine_changes_no_shape(monkeypatch):
     monkeypatch.setattr(decompose, "STARVED", 0.001)
     mesh = ell()
     with pytest.raises(CongraspError, match=r"The machine is too busy: coacd .* Stop other programs and try again"):
-        decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
+        decompose.decompose(
+            mesh.vertices, mesh.faces, shown=np.asarray(mesh.triangles), volume=mesh.volume, time_limit=60
+        )
 
 
 def test_a_decomposer_that_dies_is_reported(monkeypatch):
     mesh = ell()
-    pieces, failure = decompose._in_child("no such method", mesh.vertices, np.zeros((1, 3), int), mesh.volume, 8, 60)
+    pieces, failure = decompose._in_child("no such method", {"vertices": mesh.vertices}, mesh.volume, 8, 60)
     assert pieces == []
     assert failure.startswith("f")
 
@@ -249,8 +260,7 @@ def test_a_bowl_is_as_thin_as_its_wall(tmp_path, options):
     outside[0, 0] = inside[0, 0] = 0.0
     trimesh.creation.revolve(np.concatenate([outside, inside[::-1]]), sections=48).export(tmp_path / "bowl.stl")
     (obj,) = objects_of(tmp_path / "bowl.stl", options)
-    assert obj.shape_reliable and abs(obj.volume_error) < 0.1
-    assert obj.surface_error < 4e-3
+    assert obj.surface_error < 3e-3 and abs(obj.volume_error) < 0.05
 
 
 def test_given_convex_pieces_are_used(tmp_path, options, quick_import):
@@ -272,7 +282,9 @@ def test_given_convex_pieces_are_used(tmp_path, options, quick_import):
 
 def test_coacd_cuts_an_ell_in_two():
     mesh = ell()
-    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
+    result = decompose.decompose(
+        mesh.vertices, mesh.faces, shown=np.asarray(mesh.triangles), volume=mesh.volume, time_limit=60
+    )
     assert result.method == "coacd"
     assert 2 <= len(result.pieces) <= 3
     np.testing.assert_allclose(sum(shapes.hull_of(piece).volume for piece in result.pieces), mesh.volume, rtol=0.05)

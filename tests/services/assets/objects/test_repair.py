@@ -7,7 +7,7 @@ import trimesh
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.repair import closed, largest_body, reduced
+from congrasp.services.assets.objects.repair import closed, largest_body, reduced, without_hollows
 
 RADIUS = 0.03
 
@@ -22,6 +22,28 @@ def test_an_opening_is_left_and_bodies_that_touch_stay_together():
     assert len(closed(half, said).faces) == len(half.faces) and not said  # a bowl stays a bowl
     pair = trimesh.util.concatenate([ball(), ball().apply_translation([2 * RADIUS, 0, 0])])
     assert len(largest_body(pair, said).faces) == 2 * len(ball().faces) and not said
+
+
+@pytest.mark.parametrize(("neck", "filled"), [(0.004, True), (0.012, False)])
+def test_a_hollow_that_no_finger_enters_is_filled(neck, filled):
+    """A bottle with a wall of 3 mm."""
+    outer = [(0, 0), (0.035, 0), (0.035, 0.12), (neck + 0.003, 0.15), (neck + 0.003, 0.18)]
+    inner = [(neck, 0.18), (neck, 0.149), (0.032, 0.119), (0.032, 0.003), (0, 0.003)]
+    bottle, full = (
+        trimesh.creation.revolve(np.array(line), sections=32) for line in (outer + inner, [*outer, (0, 0.18)])
+    )
+    said = list[str]()
+    shown = without_hollows(bottle, said)
+    np.testing.assert_allclose(shown.volume, (full if filled else bottle).volume, rtol=0.01)
+    assert repair.encloses(shown) and bool(said) == filled
+
+
+def test_a_hollow_without_an_opening_is_filled():
+    void = ball()
+    void.apply_scale(0.9)
+    void.invert()
+    shown = without_hollows(trimesh.util.concatenate([ball(), void]), [])
+    np.testing.assert_allclose(shown.volume, ball().volume, rtol=1e-6)
 
 
 @pytest.mark.slow
