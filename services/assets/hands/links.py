@@ -216,9 +216,9 @@ def link_mesh(tree: Tree, link: int) -> tuple[np.ndarray, np.ndarray] | None:
     if len(whole.faces) > MAX_FACES:
         whole = whole.simplify_quadric_decimation(face_count=MAX_FACES)
     if not 0 < len(whole.faces) <= MAX_FACES:  # many separate parts cannot be simplified that far
-        whole = joined.convex_hull
-        if len(whole.faces) > MAX_FACES:
-            whole = whole.simplify_quadric_decimation(face_count=MAX_FACES)
+        outer = np.asarray(joined.convex_hull.vertices)
+        directions = np.random.default_rng(0).normal(size=(3, MAX_FACES // 2))  # a hull of N points has 2 N - 4 faces
+        whole = trimesh.Trimesh(outer[np.unique((outer @ directions).argmax(0))]).convex_hull
     return np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.int32)
 
 

@@ -4,9 +4,11 @@ import pathlib
 
 import numpy as np
 import pytest
+import trimesh
 
 from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.kinematics import grasp_frame
+from congrasp.common.hands.meshes import MAX_FACES
 from congrasp.common.hands.mjcf import add_hand
 from congrasp.services.assets.hands.model_files import Choices, describe, propose
 from congrasp.services.cli import main
@@ -107,3 +109,22 @@ def test_the_commands_import_list_and_draw(tmp_path, capsys):
     assert main.run(["hands", "list"]) == 0
     said = capsys.readouterr().out
     assert all(name in said for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO"))
+
+
+def test_a_link_of_many_parts_is_drawn_by_a_coarse_hull(tmp_path):
+    """1,000 tetrahedra around a ball, which cannot be reduced to the triangles that a link may have."""
+    turn, height = np.arange(1000) * np.pi * (3 - np.sqrt(5)), np.linspace(-1, 1, 1000)
+    axes = np.sqrt(1 - height**2) * [np.cos(turn), np.sin(turn)]
+    corners = (
+        0.0005 * np.random.default_rng(0).normal(size=(1000, 4, 3)) + 0.03 * np.column_stack([*axes, height])[:, None]
+    )
+    faces = np.arange(4000).reshape(-1, 1, 4)[..., [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]].reshape(-1, 3)
+    trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False).export(tmp_path / "ball.obj")
+    box = '<geom type="box" size=".03 .05 .015" pos="0 0 .015"/>'
+    text = (pathlib.Path(__file__).parents[3] / "cases/_hand/pinch.xml").read_text()
+    assert box in text and "<asset/>" in text
+    text = text.replace("<asset/>", '<asset><mesh name="ball" file="ball.obj" inertia="shell"/></asset>')
+    (tmp_path / "hand.xml").write_text(text.replace(box, '<geom type="mesh" mesh="ball"/>'))
+    vertices, drawn = propose(tmp_path / "hand.xml").meshes["palm"]
+    assert 1000 < len(drawn) <= MAX_FACES
+    np.testing.assert_allclose(np.abs(vertices).max(), 0.03, atol=0.003)
