@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from congrasp.actors import harvest
@@ -113,7 +112,7 @@ class RolloutWorker:
             return self.begin(conditions._replace(hold=self._staggered_hold(conditions.hold, key)))
         # By the program that replaces finished episodes: another one would take as long to compile.
         state = (self.state or self._blank(key))._replace(views=None)
-        state = self.programs.renew(self._bank, state, key, self._stationary, np.ones(self.batch, bool))
+        state = self.programs.renew(self._bank, state, key, self._stationary, _on_device(np.ones(self.batch, bool)))
         self._place(state._replace(hold=self._staggered_hold(state.hold, key)))
 
     def _blank(self, key: Array) -> EnvState:
@@ -196,7 +195,7 @@ class RolloutWorker:
 
     def weigh_objects(self, weight: np.ndarray) -> None:
         """Sets the weights (N,) with which episodes that start from now on draw objects."""
-        self._bank = self.bank._replace(weight=jnp.asarray(weight, jnp.float32))
+        self._bank = self.bank._replace(weight=_on_device(np.asarray(weight, np.float32)))
 
     def renew_references(self) -> None:
         """Stores the grasps that succeeded since the last call as reference poses in the bank."""

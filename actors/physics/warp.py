@@ -50,6 +50,10 @@ CONSTRAINTS_PER_ENVIRONMENT = 320
 """Capacity of constraint rows for each environment."""
 
 
+_listing = threading.Lock()
+"""Held while Warp's launches are only listed (`WarpBuffers._variants`), which one thread does at a time."""
+
+
 class WarpBuffers:
     """Buffers of a batch of environments on one device."""
 
@@ -145,7 +149,8 @@ class WarpBuffers:
 
         Launches would do this one after another. Warp compiles without Python's lock.
         """
-        with stage("list of the kernels"):  # factorisations are compiled here: Warp names a kernel by its code
+        # Warp names a kernel by its code, and so compiles the factorisations already here.
+        with stage("list of the kernels"), _listing:
             variants = self._variants()
         with stage("kernels"), concurrent.futures.ThreadPoolExecutor(cores()) as threads:
             list(threads.map(lambda variant: wp.force_load(self._device, [variant[0]], variant[1]), variants))
@@ -165,8 +170,8 @@ class WarpBuffers:
                 launch(kernel, *given, **named)
 
         conditional = options.graph_conditional
-        wp.launch, wp.launch_tiled = (functools.partial(listed, launch) for launch in launches)
         options.graph_conditional = False  # a loop until the solver's kernels have converged would not end
+        wp.launch, wp.launch_tiled = (functools.partial(listed, launch) for launch in launches)
         try:
             with wp.ScopedDevice(self._device):
                 self._substep_all()

@@ -64,11 +64,16 @@ def warmup(
 
     imported()
     console = Console(highlight=False, soft_wrap=True)
+    if source is not None and export is not None:
+        raise CongraspError("--import and --export were given together.", "Run one after the other.")
     if source is not None:
         console.print(f"{import_caches(source)} files of {source} are in the caches.", markup=False)
         return 0
     if export is not None:
         check_output("--export", export)
+        if export.is_dir():
+            raise CongraspError(f"--export is {export}, which is a folder.", "Pass a file in it.")
+        export.absolute().parent.mkdir(parents=True, exist_ok=True)
     config = get_preset(preset, hand, environments=environments, rollout_steps=rollout_steps)
     with on_signal() as stop, console.status("compiling"):
         until_first_update(config, physics, stop, lambda: console.print(first_update()))
@@ -83,7 +88,7 @@ def export_caches(path: pathlib.Path) -> None:
     Raises:
       CongraspError: the file cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.absolute().with_name(f".{path.name}.tmp")
     try:
         with tarfile.open(temporary, "w") as archive:
             manifest = tarfile.TarInfo(_MANIFEST)
@@ -93,13 +98,15 @@ def export_caches(path: pathlib.Path) -> None:
             for name, folder in _folders().items():
                 for file in sorted(folder.rglob("[!.]*")):
                     if file.is_file() and not file.is_symlink():
-                        archive.add(file, f"{name}/{file.relative_to(folder)}", recursive=False)
+                        with contextlib.suppress(FileNotFoundError):  # another process may tidy up meanwhile
+                            archive.add(file, f"{name}/{file.relative_to(folder)}", recursive=False)
         temporary.replace(path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise CongraspError(
             f"{path} could not be written: {error.strerror}.", "Free space or pass another path."
         ) from None
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def import_caches(path: pathlib.Path) -> int:
@@ -114,6 +121,10 @@ def import_caches(path: pathlib.Path) -> int:
             if member.name == _MANIFEST:
                 continue
             name, _, inside = member.name.partition("/")
+            if name == "jax" and name not in folders:
+                raise CongraspError(
+                    "The cache of compiled programs cannot be written.", "Set JAX_COMPILATION_CACHE_DIR."
+                )
             if name not in folders or not _is_inside(member, inside, folders[name]):
                 raise CongraspError(f"{path} has an entry that is no file of a cache: {member.name!a:.80}.", _REMEDY)
             members[member] = folders[name] / inside
@@ -124,14 +135,11 @@ def import_caches(path: pathlib.Path) -> int:
 
 
 def _is_inside(member: tarfile.TarInfo, name: str, folder: pathlib.Path) -> bool:
-    """True if a member is a regular file that has this name in the folder."""
-    if not member.isreg() or f"{folder}/{name}" != str(folder / name):
+    """True if a member is a regular file that has this name in the folder, and no link leads out of there."""
+    target = folder / name
+    if not member.isreg() or member.sparse or ".." in target.parts or f"{folder}/{name}" != str(target):
         return False
-    try:
-        tarfile.data_filter(member.replace(name=name, deep=False), str(folder))
-    except tarfile.FilterError:
-        return False
-    return True
+    return target.resolve().is_relative_to(folder.resolve())
 
 
 _REMEDY = "Pass a file that 'congrasp warmup --export' wrote."
@@ -158,7 +166,7 @@ def _opened(path: pathlib.Path) -> Iterator[tarfile.TarFile]:
 
 def _content(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
     """Content of a regular file."""
-    file = archive.extractfile(member)
+    file = archive.extractfile(member) if member.isreg() else None
     if file is None:
         raise ValueError(f"{member.name} is no file")
     return file.read()

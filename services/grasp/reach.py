@@ -50,7 +50,7 @@ _OF_STEPS = {name for name, spec in EPISODE.arrays.items() if spec.shape and spe
 
 
 class NoReachError(CongraspError):
-    """Every approach to the grasp touches the object or the table."""
+    """Every planned approach to the grasp touches the object or the table."""
 
 
 class Reach(NamedTuple):
@@ -142,7 +142,7 @@ def plan_reach(
         if (found >= needed).all():
             return curve.at(np.arange(steps) / steps, steps * dt, speed)
     raise NoReachError(
-        f"Every approach to a grasp of '{obj.name}' touches the object or the table.",
+        f"Every planned approach to a grasp of '{obj.name}' touches the object or the table.",
         "Leave out the approach, or set another heading.",
     )
 

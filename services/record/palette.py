@@ -86,7 +86,7 @@ def bisected(corners: np.ndarray, longest: float, most: float = np.inf) -> np.nd
         middle = (start + end) / 2
         corners = np.concatenate([np.stack([start, middle, across], 1), np.stack([middle, end, across], 1)])
         count += len(cut)
-    return np.concatenate(small)
+    return np.concatenate([*small, corners])
 
 
 def painted(vertices: np.ndarray, faces: np.ndarray, colours: Colours) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

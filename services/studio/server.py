@@ -239,7 +239,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         elif (routes := self._routes()) is None:
             self._drain(length)
         elif (route := routes.posts.get(path)) is None:
-            self._error(404, "There is no such page.")
+            self._error(404, "There is no such action.")
             self._drain(length)
         else:
             body = self.rfile.read(length)

@@ -323,7 +323,10 @@ def test_workers_of_one_task_share_programs_that_compile_once():
         worker = suite.worker(seed=steps)
         worker.collect(parameters, steps)
         worker.restart()
-        assert worker.programs is programs
+        before = programs.renew._cache_size()
+        worker.weigh_objects(np.asarray(worker.bank.weight))
+        worker.restart()
+        assert worker.programs is programs and programs.renew._cache_size() == before
         compiled = programs.decide, programs.advance, programs.sample, programs.with_scene
         sizes.add(tuple(program._cache_size() for program in compiled))
         worker.physics.close()

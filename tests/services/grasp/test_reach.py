@@ -100,7 +100,9 @@ def test_the_reach_ends_at_nine_tenths_of_the_speed_of_the_guidance() -> None:
 def test_an_unreachable_grasp_is_an_error(ball) -> None:
     hand = get_hand("human")
     first = beginning(hand, np.array([0.0, 0.0, 1.0]), ball, 0.16)  # from below, through the table
-    with pytest.raises(CongraspError, match=r"Every approach to a grasp of .* touches .* Leave out the approach"):
+    with pytest.raises(
+        CongraspError, match=r"Every planned approach to a grasp of .* touches .* Leave out the approach"
+    ):
         plan_reach(hand, ball, np.asarray(ball.rest_poses[0], float), np.array([0.0, 0.0, 1.0]), first, 1.0, DT)
 
 

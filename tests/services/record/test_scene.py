@@ -325,6 +325,8 @@ def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhe
     for name in colours:
         with pytest.raises(CongraspError, match="colour_points without colour_values, or the reverse"):
             check_episode(Message(whole.arrays | {name: colours[name]}, whole.meta))
+    with pytest.raises(CongraspError, match="of an earlier version"):
+        check_episode(Message(whole.arrays | {"goal/mask": np.zeros(4, np.float32)}, whole.meta))
     far = {**colours, "colour_points": np.full((2, 3), 1e3, np.float32)}
     with pytest.raises(CongraspError, match="colour_points are more than 10 m"):
         check_episode(Message(whole.arrays | far, whole.meta))

@@ -68,7 +68,15 @@ def test_caches_travel_with_a_file(machine, tmp_path, monkeypatch):
         stop.set()
 
     monkeypatch.setattr(training, "until_first_update", first_update)
+    for path in (tmp_path, pathlib.Path()):
+        with pytest.raises(CongraspError, match="is a folder"):
+            warmup.warmup(export=path)
+    with pytest.raises(CongraspError, match="given together"):
+        warmup.warmup(export=file, source=file)
+    assert not caches.exists()
+    file = tmp_path / "new" / "caches.tar"
     assert warmup.warmup(export=file) == 0
+    assert [path.name for path in file.parent.iterdir()] == ["caches.tar"]
     there = machine("b") / "caches"
     (there / "jax").mkdir(parents=True)
     (there / "jax/program").write_bytes(b"in use")
@@ -102,6 +110,7 @@ def _link(kind, target):
         "jax//escaped",
         "jax",
         "jax/.",
+        "jax/deeper/..",
         "/jax/escaped",
         "../jax/escaped",
         "elsewhere/escaped",
