@@ -118,7 +118,7 @@ def _link(kind, target):
         _link(tarfile.LNKTYPE, "caches.json"),
         _link(tarfile.FIFOTYPE, ""),
     ],
-    ids=str,
+    ids=lambda member: member if isinstance(member, str) else f"{member.type.decode()}:{member.linkname}",
 )
 def test_only_files_in_the_folders_of_the_caches_are_written(machine, tmp_path, member):
     file, here = _written(tmp_path / "caches.tar", "jax/program", member), machine("a")
