@@ -83,6 +83,8 @@ class JournalLines(NamedTuple):
     """Lines that were changed after they were written."""
     missing: int
     """Places where written lines are missing."""
+    unchecked: int
+    """Lines of older versions of congrasp, which lack the checksum of the previous line."""
 
     @property
     def intact(self) -> list[dict[str, Any]]:
@@ -101,7 +103,7 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
       CongraspError: the file cannot be read.
     """
     entries: list[dict[str, Any] | None] = []
-    lost = damaged = missing = run = 0
+    lost = damaged = missing = unchecked = run = 0
     before, cut = "", False
     try:
         with open_file(path) as file:
@@ -110,11 +112,13 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
                     continue
                 cut = not line.endswith(b"\n")
                 entry, check = _parse(line)
-                if entry is None or "after" not in entry or not is_entry(entry):
+                if entry is None or not is_entry(entry):
                     run += 1
                     entries.append(None)
                     continue
-                if entry.pop("after") != before and not run:
+                after = entry.pop("after", None)
+                unchecked += after is None
+                if after not in (None, before) and not run:
                     missing += 1
                     entries.append(None)
                 before = check
@@ -125,7 +129,7 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
     except OSError as error:
         raise CongraspError(f"The journal {path} cannot be read: {error.strerror}.") from None
     cut = cut and run > 0
-    return JournalLines(entries, lost + cut, damaged + run - cut, missing + (not entries))
+    return JournalLines(entries, lost + cut, damaged + run - cut, missing + (not entries), unchecked)
 
 
 def number(value: Any) -> int:

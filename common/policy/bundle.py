@@ -42,6 +42,7 @@ _LARGEST, _LARGEST_STATISTIC, _LARGEST_LOG_STD = 1e4, 1e30, 10.0
 """Limits of the magnitude of weights, statistics, and logarithms of standard deviations: beyond them, inference in
 float32 overflows."""
 _SAMPLES_KEPT = 1e5
+"""Most samples that count when inputs are added: samples of these soon outweigh the unit variance of their start."""
 _MALFORMED = (LookupError, AttributeError, TypeError, ValueError, OverflowError)
 _REMEDY = "Use a bundle from 'congrasp train' of this version."
 
@@ -239,7 +240,6 @@ def with_inputs_of(spec: PolicySpec, task: TaskConfig, bundle: PolicyBundle) -> 
     same_critic = spec.privileged == bundle.spec.privileged
     privileged = np.arange(spec.privileged_size) if same_critic else np.full(spec.privileged_size, -1)
     rows = np.concatenate([state, np.arange(size, len(bundle.observation.mean))])
-    # So few samples that those of the new inputs soon outweigh the unit variance with which they begin.
     fewer = min(count, _SAMPLES_KEPT) if (state < 0).any() else count
     scale = fewer / count if count else 1.0
     mean = np.where(rows < 0, 0.0, bundle.observation.mean[rows])

@@ -33,7 +33,7 @@ def episode(
     out: pathlib.Path = pathlib.Path("episode.png"),
     index: int = -1,
     success: bool = False,
-    frames: int = 8,
+    frames: Annotated[int, tyro.conf.arg(aliases=["--moments"])] = 8,
     video: pathlib.Path | None = None,
 ) -> int:
     """Draw frames of a recorded episode with its constraints: approach arrow, avoid region in red, waypoints, pose.

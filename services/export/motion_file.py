@@ -35,6 +35,8 @@ TRAJECTORY_START = 10**9
 _LARGEST = 1e6
 _INDICES = ("object_colour_values", "object_faces", "joint_link", "link_parent", "capsule_link")
 _META = "meta"
+_OLDER = {"pose_joints": "pose_q"}
+"""Names of goal arrays in files of format 1."""
 _GOALS = {
     f"{constraint.name}_{name}": f"({', '.join(map(str, array.shape))}{',' * (len(array.shape) == 1)}) {array.meaning}"
     for constraint in CONSTRAINTS
@@ -257,14 +259,15 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
     arrays = read_npz(pathlib.Path(path), remedy, kind="a grasp motion", largest=MAX_BYTES)
     try:
         meta = json.loads(str(arrays.pop(_META)))
-        if meta["format"] != FORMAT:
+        if meta["format"] not in (1, FORMAT):
             raise CongraspError(f"{path} has format {meta['format']!r:.20}, not {FORMAT}.", remedy)
         facts = {name: meta[name] for name in _FACTS}
         facts["constraints"] = tuple(facts["constraints"])
         _check_facts(facts)
-        goal = {name: array for name, array in arrays.items() if name in _GOALS}
+        named = {_OLDER.get(name, name): array for name, array in arrays.items()}
+        goal = {name: array for name, array in named.items() if name in _GOALS}
         own = _COLOURS if _COLOURS.keys() & arrays.keys() else {}
-        _check_arrays(arrays, {**_ARRAYS, **own, **{name: _GOALS[name] for name in goal}})
+        _check_arrays({**arrays, **goal}, {**_ARRAYS, **own, **{name: _GOALS[name] for name in goal}})
         colours = Colours(arrays[_POINTS], arrays[_VALUES].astype(np.uint8)) if own else None
         arm = arm_of(str(meta["arm"]), arrays, len(arrays["time"])) if "arm" in meta else None
         return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal, arm=arm)

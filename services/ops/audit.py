@@ -58,6 +58,8 @@ class Report(NamedTuple):
     """Damaged lines of the journals."""
     missing: int
     """Places in the journals from which lines were removed, and journals without a line."""
+    unchecked: int
+    """Lines of older versions of congrasp, between which missing ones cannot be detected."""
 
     @property
     def exit_code(self) -> int:
@@ -137,7 +139,7 @@ class _Session:
     version: int
     max_staleness: int
     kept: bool
-    """Accepted rollouts were written to disk before the acknowledgement."""
+    """Accepted rollouts were written to disk before the acknowledgement; older versions of congrasp did not."""
     falls_back: bool
     """It began from a checkpoint older than the newest, which was damaged or missing."""
     started: bool
@@ -250,6 +252,7 @@ def _compare(made: dict[Identity, Made], found: _Outcomes, gaps: _Gaps, journals
         sum(journal.lost for journal in journals),
         sum(journal.damaged for journal in journals),
         sum(journal.missing for journal in journals),
+        sum(journal.unchecked for journal in journals),
     )
 
 
@@ -304,6 +307,7 @@ def audit(run_dir: Annotated[pathlib.Path, tyro.conf.Positional], journals: tupl
         table.add_row(name, str(value), FAULTS.get(name, ""), style=style)
     table.add_section()
     table.add_row("damaged lines", str(report.damaged), "damage", style="bold red" if report.damaged else "")
+    table.add_row("lines of older versions", str(report.unchecked), "unchecked" if report.unchecked else "")
     console.print(table)
     console.print(f"Lag: mean {report.lag_mean:.2f}, maximum {report.lag_max} of {report.max_staleness} versions.")
     if report.holes:

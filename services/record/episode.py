@@ -20,6 +20,8 @@ from congrasp.common.task.constraints.base import Marker
 from congrasp.common.wire.codec import Message
 
 _LATEST = 1e4  # s
+_OLDER = ("affordance", "pose_finger", "pose_wrist", "trajectory")
+"""Default blocks of the `goal/mask` of recordings without names."""
 UNLIMITED = 1e3
 """Limit of joints without limits, rad or m."""
 _PREFIX = "arm_"
@@ -36,6 +38,8 @@ _INDICES = {
 
 def active_blocks(arrays: Mapping[str, np.ndarray]) -> dict[str, bool]:
     """Activity of each block of the observation, by name."""
+    if "goal/mask" in arrays:
+        return dict(zip(_OLDER, (np.asarray(arrays["goal/mask"]) > 0).tolist(), strict=True))
     found = {name.removeprefix("active/"): value for name, value in arrays.items() if name.startswith("active/")}
     return {name: bool(np.asarray(value)) for name, value in found.items()}
 

@@ -162,8 +162,6 @@ def check_episode(episode: Message) -> None:
     for name in ("visual_vertices", "colour_points"):
         if np.abs(episode.arrays.get(name, 0.0)).max() > LARGEST:
             raise CongraspError(f"The episode's {name} are more than {LARGEST:g} m from the object's centre.")
-    if "goal/mask" in episode.arrays:
-        raise CongraspError("The episode is of an earlier version: its constraints have no names.", "Record it again.")
     if any(array.size > _GOAL for name, array in episode.arrays.items() if name.startswith("goal/")):
         raise CongraspError(f"The episode has a goal array of more than {_GOAL} values.")
     arm_of_episode(episode)

@@ -6,6 +6,7 @@ import os
 import pathlib
 import shutil
 import tempfile
+import zlib
 
 import pytest
 from hypothesis import given, settings
@@ -159,6 +160,19 @@ def test_a_line_that_a_killed_process_left_unfinished_is_no_damage(run_dir):
     Journal(path).write(actor="a", incarnation="2")
     report = audit(run_dir)
     assert (report.holes, report.damaged, report.exit_code, report.counts["accepted"]) == (1, 0, 0, 5)
+
+
+def test_lines_of_older_versions_are_read_and_reported_as_unchecked(run_dir, capsys):
+    learner(run_dir, life(), used(0, 1), used(2, 3), used(4, 5), {"end": []})
+    for path in (run_dir / AUDIT).iterdir():
+        lines = [json.loads(line) for line in path.read_text().split("\n") if line]
+        texts = [json.dumps({k: v for k, v in line.items() if k not in ("after", "crc32")})[:-1] for line in lines]
+        path.write_text("".join(f'{text}, "crc32": "{zlib.crc32(text.encode()):08x}"}}\n' for text in texts))
+    Journal(run_dir / AUDIT / "a.jsonl").write(actor="a", incarnation="2")
+    report = audit(run_dir)
+    assert (report.counts["used"], report.unchecked, report.damaged, report.missing) == (6, 18, 0, 0)
+    assert command(run_dir) == 0
+    assert any("older versions" in line and "18" in line for line in capsys.readouterr().out.split("\n"))
 
 
 @pytest.mark.parametrize("which", ["a.jsonl", "learner-0.jsonl"])

@@ -36,6 +36,31 @@ def test_a_motion_survives_its_file_and_the_file_says_what_every_array_means(tmp
             assert all(n in (None, size) for n, size in zip(wanted, file[name].shape, strict=True)), name
 
 
+def test_a_file_of_the_first_format_is_read(tmp_path):
+    motion = motion_of_episode(episode(mask=(0, 1, 1, 1)))
+    arrays = {name: value for name, value in vars(motion).items() if isinstance(value, np.ndarray)}
+    for name in ("heading_position", "heading_direction", "pose_position", "pose_quaternion"):
+        arrays[name] = motion.goal[name]
+    arrays["pose_joints"] = motion.goal["pose_q"]
+    arrays["trajectory_position"] = motion.goal["trajectory_position"]
+    arrays["trajectory_quaternion"] = motion.goal["trajectory_quaternion"]
+    meta = {"format": 1, "hand": "human", "object": "mug", "success": True, "control_dt": 0.01}
+    meta |= {"constraints": ["heading", "pose", "trajectory"], "metrics": {"held": 1.0}, "about": {"version": 3}}
+    np.savez_compressed(path := tmp_path / "older.npz", **arrays, meta=np.array(json.dumps(meta)))
+    read = load_motion(path)
+    assert (read.hand, read.object, read.success, read.metrics) == ("human", "mug", True, {"held": 1.0})
+    assert read.constraints == ("heading", "pose", "trajectory") and "pose_joints" not in read.goal
+    wanted = {name: value for name, value in motion.goal.items() if name != "heading_cross"}
+    np.testing.assert_equal(read.goal, wanted)
+    np.testing.assert_array_equal(read.link_position, motion.link_position)
+    save_motion(again := tmp_path / "again.npz", read)
+    np.testing.assert_equal(load_motion(again).goal, wanted)
+    arrays["pose_joints"] = arrays["pose_joints"][:3]
+    np.savez_compressed(path, **arrays, meta=np.array(json.dumps(meta)))
+    with pytest.raises(CongraspError, match=r"pose_q has shape \(3,\), but \(F,\) requires \(20,\)"):
+        load_motion(path)
+
+
 def test_arrays_that_are_not_known_are_left_alone(tmp_path):
     save_motion(path := tmp_path / "a.npz", motion := motion_of_episode(episode()))
     with np.load(path) as file:

@@ -25,12 +25,13 @@ from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.record import scene
+from congrasp.services.record.episode import active_blocks, active_constraints
 from congrasp.services.record.palette import JOINT, SKIN
 from congrasp.services.record.palette import MATERIALS as COLOURS
 from congrasp.services.record.recorder import Converter
 from congrasp.services.record.scene import SPACING, check_episode, surface_parts, surface_points
 from congrasp.services.record.writer import Entry, LogWriter
-from tests.episodes import CONTROL_DT, FORCE, episode
+from tests.episodes import CONTROL_DT, FORCE, episode, older
 
 HAND = get_hand("human")
 START = 1_000_000_000_000
@@ -108,6 +109,14 @@ def test_only_active_constraints_are_drawn(mask: tuple[int, ...], shown: set[str
     (entry,) = of(Converter()(KEY, episode(mask=mask), START), "scene")
     ids = {e.id for e in SceneUpdate.FromString(entry.data).entities}
     assert {name.removeprefix("constraint/") for name in ids if name.startswith("constraint/")} == shown
+
+
+def test_an_older_recording_is_drawn_as_it_is_now() -> None:
+    made = episode(mask=(1, 1, 0, 1))
+    (now,), (before,) = (of(Converter()(KEY, message, START), "scene") for message in (made, older(made)))
+    assert before.data == now.data
+    assert active_blocks(older(made).arrays) == active_blocks(made.arrays)
+    assert active_constraints(older(made).arrays) == ("heading", "affordance", "pose", "trajectory")
 
 
 def test_a_new_episode_removes_what_the_last_one_left(entries: list[Entry]) -> None:
@@ -325,8 +334,6 @@ def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhe
     for name in colours:
         with pytest.raises(CongraspError, match="colour_points without colour_values, or the reverse"):
             check_episode(Message(whole.arrays | {name: colours[name]}, whole.meta))
-    with pytest.raises(CongraspError, match="of an earlier version"):
-        check_episode(Message(whole.arrays | {"goal/mask": np.zeros(4, np.float32)}, whole.meta))
     far = {**colours, "colour_points": np.full((2, 3), 1e3, np.float32)}
     with pytest.raises(CongraspError, match="colour_points are more than 10 m"):
         check_episode(Message(whole.arrays | far, whole.meta))

@@ -6,7 +6,7 @@ import pytest
 from congrasp.common.task.constraints import get_constraint
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.studio.page import for_page, lanes
-from tests.episodes import episode
+from tests.episodes import episode, older
 
 STEPS, REMOVAL = 30, 18
 TOLERANCES = {(name, error.unit): error.tolerance for name in ("heading", "trajectory")
@@ -86,7 +86,14 @@ def test_the_page_gets_one_message_with_everything_it_plays() -> None:
     np.testing.assert_allclose(message.arrays["ghost/pose/position"], last, atol=1e-5)
 
 
-def test_without_recorded_errors_there_is_only_the_lane_of_contact() -> None:
+def test_an_older_recording_has_its_markers_and_only_the_lane_of_contact() -> None:
     made = episode(STEPS, removal=REMOVAL, mask=(1, 1, 0, 1))
-    arrays = {name: array for name, array in made.arrays.items() if not name.startswith("error/")}
-    assert set(lanes(Message(arrays, made.meta))) == {"contact"}
+    found = lanes(older(made))
+    assert set(found) == {"contact"}
+    np.testing.assert_array_equal(found["contact"].met, lanes(made)["contact"].met)
+    page, now = for_page(older(made)), for_page(made)
+    kinds = ("arrow/", "polyline/", "ghost/", "paint/")
+    drawn = {name: array for name, array in now.arrays.items() if name.startswith(kinds)}
+    assert drawn.keys() == {name for name in page.arrays if name.startswith(kinds)}
+    for name, array in drawn.items():
+        np.testing.assert_array_equal(page.arrays[name], array)

@@ -286,7 +286,10 @@ def test_a_recorded_episode_is_picked_drawn_and_filmed(tmp_path: pathlib.Path) -
         with pytest.raises(CongraspError, match="holds"):
             pick_episode(tmp_path / "run", index, success=success)
     out = tmp_path / "out.png"
-    assert load("render")(["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", "--frames", "1"])() == 0
+    # An older name of --frames.
+    assert (
+        load("render")(["episode", str(tmp_path / "run"), "--out", str(out), "--index", "0", "--moments", "1"])() == 0
+    )
     assert 400 < Image.open(out).size[0] < 600
     frames = render_episode_frames(pick_episode(tmp_path / "run", 0), range(4), (64, 48))
     save_video(tmp_path / "film.mp4", frames, (64, 48), 0.5 / CONTROL_DT)
