@@ -83,14 +83,13 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
     from congrasp.services.ops.shutdown import on_signal
     from congrasp.services.train.learn import learn, longest_rollout
 
-    run_dir, rank = options.run_dir, options.rank
+    run_dir, rank, config = options.run_dir, options.rank, with_hand(config, options.hand)
     try:
-        config, url = with_hand(config, options.hand), rank_url(options.listen, rank)
         with (
             on_signal() as stop,
             logging_as(watch.log_format, role="learner", id=str(rank), run=config.name),
             urls.listen(
-                url,
+                url := rank_url(options.listen, rank),
                 "learner",
                 certs=options.certs,
                 insecure=options.insecure,
