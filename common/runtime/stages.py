@@ -45,12 +45,16 @@ def stage(name: str) -> Iterator[None]:
     try:
         yield
     finally:
-        _add(name, since_start() - began)
+        _add(Stage(name, began, since_start()))
 
 
-def imported() -> None:
-    """Records everything up to now as the stage of imports, and from now on JAX's work on programs as stages."""
-    _add("imports", since_start())
+def imported(ended: float | None = None) -> None:
+    """Records everything up to now as the stage of imports, and from now on JAX's work on programs as stages.
+
+    Args:
+      ended: the end of the imports in seconds since this process began, if it is earlier.
+    """
+    _add(Stage("imports", 0.0, since_start() if ended is None else ended))
     jax.monitoring.register_event_duration_secs_listener(_add_program)
 
 
@@ -60,18 +64,19 @@ def stages() -> list[Stage]:
         return sorted(_stages.values(), key=lambda one: one.began)
 
 
-def _add(name: str, seconds: float) -> None:
-    """Records and logs a stage that has just ended, if it is the first of its name."""
-    ended = since_start()
+def _add(one: Stage) -> None:
+    """Records and logs a stage, if it is the first of its name."""
     with _lock:
-        if name in _stages:
+        if one.name in _stages:
             return
-        _stages[name] = Stage(name, ended - seconds, ended)
-    _log.info("Start: %s took %.1f s, until %.1f s after the start of the process.", name, seconds, ended)
+        _stages[one.name] = one
+    text = "Start: %s took %.1f s, until %.1f s after the start of the process."
+    _log.info(text, one.name, one.ended - one.began, one.ended)
 
 
 def _add_program(event: str, duration_secs: float, **about: str | int) -> None:
     """Records JAX's work on a program, by the program's name."""
     if event in _PROGRAM_WORK and duration_secs >= _PROGRAM_SECONDS:
         name = str(about.get("fun_name")).removeprefix("jit(").removesuffix(")")
-        _add(f"{_PROGRAM_WORK[event]} {name}", duration_secs)
+        ended = since_start()
+        _add(Stage(f"{_PROGRAM_WORK[event]} {name}", ended - duration_secs, ended))

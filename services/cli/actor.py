@@ -46,7 +46,7 @@ class Actor:
         from congrasp.actors.process import run_actor
         from congrasp.common.io.journal import Journal
         from congrasp.common.runtime.parallel import cores
-        from congrasp.common.runtime.stages import imported
+        from congrasp.common.runtime.stages import imported, since_start
         from congrasp.common.transport import urls
         from congrasp.common.transport.keys import process_name
         from congrasp.services.ops.metrics import ActorMetrics
@@ -59,11 +59,12 @@ class Actor:
             log("info", f"Rollout {values['rollouts']:.0f}: {values['steps_per_second']:.0f} steps/s.", values)
 
         with self.watch.watched("actor", name, self.run, metrics), on_signal() as stop:
-            imported()
+            ready = since_start()
             with announced(f"Waiting up to {self.patience:g} s for the learner at {self.connect}"):
                 transport = urls.connect(self.connect, "actor", certs=self.certs, wait=self.patience, run=self.run)
             with transport:
                 log("info", f"Connected to the learner at {self.connect}.")
+                imported(ready)
                 journal = Journal(self.audit, lambda text: log("error", text)) if self.audit else None
                 run_actor(
                     transport,

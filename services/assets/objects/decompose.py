@@ -140,7 +140,7 @@ def _cut(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collis
         found = decompose(
             np.asarray(small.vertices),
             np.asarray(small.faces),
-            shown=np.asarray((small if shown is mesh else shown).triangles),
+            shown=None if shown is mesh else np.asarray(shown.triangles),
             volume=(volume if len(meshes) == 1 else float(shown.volume)) if closed else None,
             time_limit=options.time_limit,
             max_pieces=limit,
@@ -181,25 +181,27 @@ def decompose(
     vertices: np.ndarray,
     faces: np.ndarray,
     *,
-    shown: np.ndarray,
     volume: float | None,
     time_limit: float,
     max_pieces: int = MAX_MESH_PIECES,
+    shown: np.ndarray | None = None,
 ) -> Decomposition:
     """Decomposes a triangle mesh into as few convex pieces as preserve its shape, at most `max_pieces`.
 
     Args:
       vertices: (V, 3), m, not all in a plane.
       faces: (F, 3).
-      shown: (T, 3, 3) corners of the surface to approximate: that of the mesh, or the mesh without its hollows.
-      volume: volume that it encloses if the mesh is closed (`fidelity.enclosed`), m^3; one close to that of the hull
-        needs no decomposition.
+      volume: volume that the approximated surface encloses if the mesh is closed (`fidelity.enclosed`), m^3; one close
+        to that of the hull needs no decomposition.
       time_limit: processor time for CoACD, s; V-HACD gets half a minute after it.
       max_pieces: most pieces.
+      shown: (T, 3, 3) corners of the surface to approximate, m, such as the mesh's without its hollows; by default the
+        mesh's.
 
     Raises:
       CongraspError: the machine is too busy for the child to reach its limit.
     """
+    shown = vertices[faces] if shown is None else shown
     hull = shapes.hull_of(vertices)
     whole = [hull.points[hull.vertices]]
     if volume is not None and _convex(hull, shown, volume):

@@ -185,23 +185,18 @@ def test_pieces_are_kept_if_a_cut_is_no_closer(tmp_path, options, hull_alone):
 
 
 def decomposed(mesh, time_limit):
-    shown = np.asarray(mesh.triangles)
-    return decompose.decompose(mesh.vertices, mesh.faces, shown=shown, volume=mesh.volume, time_limit=time_limit)
+    return decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=time_limit)
 
 
 def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
     mesh = ell()
-    result = decompose.decompose(
-        mesh.vertices, mesh.faces, shown=np.asarray(mesh.triangles), volume=mesh.volume, time_limit=0.01
-    )
+    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert result.method == "vhacd"
     assert result.notes == ["coacd took longer than 0.01 s of processor time"]
     volume = sum(shapes.hull_of(piece).volume for piece in result.pieces)
     assert 0.8 * mesh.volume < volume < 1.2 * mesh.volume
     monkeypatch.setattr(decompose, "FALLBACK_LIMIT", 0.01)
-    result = decompose.decompose(
-        mesh.vertices, mesh.faces, shown=np.asarray(mesh.triangles), volume=mesh.volume, time_limit=0.01
-    )
+    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)
     assert (result.method, len(result.pieces)) == ("hull", 1)
     np.testing.assert_allclose(shapes.hull_of(result.pieces[0]).volume, 0.08**2 * 0.02 - 0.06**2 / 2 * 0.02, rtol=1e-6)
     assert "hull" in result.notes[-1]
@@ -221,9 +216,7 @@ def test_a_busy_machine_changes_no_shape(monkeypatch):
     monkeypatch.setattr(decompose, "STARVED", 0.001)
     mesh = ell()
     with pytest.raises(CongraspError, match=r"The machine is too busy: coacd .* Stop other programs and try again"):
-        decompose.decompose(
-            mesh.vertices, mesh.faces, shown=np.asarray(mesh.triangles), volume=mesh.volume, time_limit=60
-        )
+        decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
 
 
 def test_a_decomposer_that_dies_is_reported(monkeypatch):
@@ -282,9 +275,7 @@ def test_given_convex_pieces_are_used(tmp_path, options, quick_import):
 
 def test_coacd_cuts_an_ell_in_two():
     mesh = ell()
-    result = decompose.decompose(
-        mesh.vertices, mesh.faces, shown=np.asarray(mesh.triangles), volume=mesh.volume, time_limit=60
-    )
+    result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=60)
     assert result.method == "coacd"
     assert 2 <= len(result.pieces) <= 3
     np.testing.assert_allclose(sum(shapes.hull_of(piece).volume for piece in result.pieces), mesh.volume, rtol=0.05)
