@@ -79,7 +79,7 @@ class Evaluate:
     seed: int = 0
     """Seed of constraints and episodes."""
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None
-    """Also write the rows to this file."""
+    """Also write the rows to this file. A stopped evaluation resumes from the rows in FILE.parts."""
     pictures: pathlib.Path | None = None
     """Also draw failures, with their causes, and successes of every constraint into this folder."""
     hand: str = "human"
@@ -103,7 +103,7 @@ class Evaluate:
         if self.constraints is not None and not self.objects:
             raise CongraspError("--constraints needs the sets' objects.", "Pass their folder with --objects.")
         engine = resolve_physics(self.physics)
-        kept = self.json and self.json.with_name(f"{self.json.name}.pools")
+        kept = self.json and self.json.with_name(f"{self.json.name}.parts")
         divided = None
         if {"objects", "all"} & set(self.table):
             many = self.pool or min(self.episodes, pools.MANY)

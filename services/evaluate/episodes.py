@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -33,6 +33,7 @@ from congrasp.services.evaluate.plan import two_seconds
 
 PROBED_EPISODES = 2000
 """Most episodes of a row from which forces are read."""
+_FORCES = ("sample/link_force", "sample/torque")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +47,16 @@ class Sample:
     """(E', W, L) net contact force of each link in the paper's window, N, for the first E' episodes."""
     torque: np.ndarray
     """(E', W, F) finger torques in that window, as shares of their limits."""
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> "Sample":
+        """Returns the sample of its `arrays`."""
+        values = {name: array for name, array in arrays.items() if name not in _FORCES}
+        return cls(values, *(arrays[name] for name in _FORCES))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns all arrays for a file."""
+        return {**self.values, **dict(zip(_FORCES, (self.link_force, self.torque), strict=True))}
 
     def where(self, chosen: np.ndarray) -> "Sample":
         """Selects episodes by `chosen` (E,)."""

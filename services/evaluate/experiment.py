@@ -2,23 +2,32 @@
 
 import dataclasses
 import functools
+import hashlib
 import itertools
+import pathlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+import jax
+import numpy as np
+
+import congrasp.actors
+import congrasp.common
 from congrasp.actors.initial import InitialConditions
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
+from congrasp.common.io import files
+from congrasp.common.objects import store
 from congrasp.common.objects.distance import DistanceField, distance_field
 from congrasp.common.objects.pool import scale_objects
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.policy.bundle import PolicyBundle
+from congrasp.common.policy.bundle import PolicyBundle, content_hash
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank, with_columns
-from congrasp.common.wire.codec import Message
+from congrasp.common.wire.codec import Message, encode
 from congrasp.services.evaluate import references
 from congrasp.services.evaluate.episodes import Batch, Episodes, Sample, joined
 from congrasp.services.evaluate.plan import (
@@ -211,27 +220,45 @@ class Experiment:
             raise errors[0]
         return allowed, errors
 
-    def run(self, variations: Sequence[Variation], *, keep: bool = False) -> list[Result]:
+    def digest(self, *about: object) -> str:
+        """Returns sixteen hex digits that identify the code, the policy, the settings, and what else is given."""
+        code = [files.source_digest(package) for package in (congrasp.common, congrasp.actors)]
+        settings = (self.task, self.steps, self.episodes, self.worlds, self.physics, self.seed, self.pool)
+        return content_hash(repr((code, *settings, self.measured, about)).encode() + encode(self.policy.to_message()))
+
+    def run(
+        self, variations: Sequence[Variation], *, keep: bool = False, stored: pathlib.Path | None = None
+    ) -> list[Result]:
         """Simulates rows; one does not depend on the others.
 
         Args:
           variations: the rows. Those of one task in a sequence share a simulator.
           keep: keeps some episodes of each row; every step of all worlds is then in memory.
+          stored: folder for the rows, without kept episodes; a run with the same arguments resumes from it.
 
         Raises:
           CongraspError: no object allows a row's constraints, or the policy does not support them.
         """
         plans = [self.plan(variation) for variation in variations]
         advance = self.track("Episodes", sum(plan.total for plan in plans))
-        results: list[Result] = []
-        rows = zip(variations, plans, strict=True)
-        for task, group in itertools.groupby(rows, lambda row: row[0].task(self.task)):
+        paths = [stored / f"{self._name(variation)}.safetensors" for variation in variations] if stored else []
+        samples = {n: Sample.of(message.arrays) for n, path in enumerate(paths) if (message := files.read_kept(path))}
+        found = {n: Result(variations[n], one, self.row(variations[n], one), [], []) for n, one in samples.items()}
+        todo = [n for n in range(len(plans)) if n not in found]
+        for task, group in itertools.groupby(todo, lambda n: variations[n].task(self.task)):
             with self.simulator(task, traced=keep) as running:
-                for variation, plan in group:
-                    done = sum(result.row.episodes for result in results)
+                for n in group:
+                    done = sum(result.row.episodes for result in found.values())
                     progress = functools.partial(lambda before, n: advance(before + n), done)
-                    results.append(self._run(running, variation, plan, progress, keep))
-        return results
+                    found[n] = self._run(running, variations[n], plans[n], progress, keep)
+                    for path in paths[n:][:1]:
+                        files.keep(path, Message(found[n].sample.arrays()), len(paths))
+        return [found[n] for n in range(len(plans))]
+
+    def _name(self, variation: Variation) -> str:
+        """File name of a row, from everything that it depends on."""
+        bank = hashlib.sha256(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(variation.bank(self))))
+        return self.digest(variation, bank.hexdigest(), [store.digest(obj) for obj in self.objects])
 
     def simulator(self, task: TaskConfig | None = None, *, traced: bool = False) -> Episodes:
         """Returns a simulator of the objects, by default of the experiment's task; its batch depends on `episodes`."""

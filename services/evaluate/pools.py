@@ -25,12 +25,11 @@ from congrasp.common.io.files import keep, read_kept
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import FIGURES_SEED, HELD_OUT_SEED, load_pool, object_scale
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.policy.bundle import content_hash
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.build import headings_of
-from congrasp.common.wire.codec import Message, encode
+from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.evaluate.episodes import Episodes, Sample, joined
@@ -54,7 +53,6 @@ _MOST = {True: 4096, False: 128}
 """Objects of a pool, for engines on a device and for others; each has a compiled scene in the latter."""
 _MESHES = 512
 """Objects of a pool of a folder, whose surfaces may be large."""
-_FORCE, _TORQUE = "sample/link_force", "sample/torque"
 _UNCHANGED = ImportOptions()
 _log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
@@ -230,8 +228,7 @@ class _Result(NamedTuple):
 
     def message(self) -> Message:
         """Returns the result for a file."""
-        arrays = {**self.sample.values, _FORCE: self.sample.link_force, _TORQUE: self.sample.torque}
-        return Message(arrays, {"objects": self.objects, "left_out": self.left_out})
+        return Message(self.sample.arrays(), {"objects": self.objects, "left_out": self.left_out})
 
 
 def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | None = None) -> list[Row]:
@@ -245,7 +242,7 @@ def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | No
     Raises:
       CongraspError: the hand can approach none of the objects.
     """
-    policy, number = experiment.policy, len(pools.make)
+    number = len(pools.make)
     each = -(-experiment.episodes // (pools.size * number))
     advance = experiment.track("Episodes on many objects", experiment.episodes)
     experiment = dataclasses.replace(
@@ -254,9 +251,7 @@ def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | No
         episodes=each * pools.size,
         measured=pools.size * number <= MEASURED,
     )
-    made_by = content_hash(encode(policy.to_message()))
-    about = (made_by, experiment.task, pools.source, pools.size, each, experiment.physics, experiment.seed)
-    name = content_hash(repr(about).encode())
+    name = experiment.digest(pools.source, pools.size)
     files = [kept / f"{name}-{n:05d}.safetensors" for n in range(number)] if kept else []
     found = {n: _stored(message) for n, file in enumerate(files) if (message := read_kept(file))}
     todo = sorted(set(range(number)) - set(found))
@@ -320,6 +315,5 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
 
 def _stored(message: Message) -> _Result:
     """Returns the result of its `message`."""
-    values = dict(message.arrays)
-    sample = Sample(link_force=values.pop(_FORCE), torque=values.pop(_TORQUE), values=values)
-    return _Result(sample, [tuple(facts) for facts in message.meta["objects"]], message.meta["left_out"])
+    facts = [tuple(facts) for facts in message.meta["objects"]]
+    return _Result(Sample.of(message.arrays), facts, message.meta["left_out"])

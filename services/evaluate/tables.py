@@ -322,7 +322,7 @@ def evaluate_tables(
         as many episodes in total, on objects of its own.
       tables: keys of `TABLES`, `objects`, `noise`, `sensing`, `payload`, `peers`, or `all` for all of these.
       pools: pools of the table `objects`, if it is wanted.
-      kept: folder for the results of these pools, to resume from.
+      kept: folder for the results of rows and pools, to resume from; rows with kept episodes are not stored.
       keep: keeps episodes for pictures.
 
     Raises:
@@ -336,13 +336,15 @@ def evaluate_tables(
         raise CongraspError(f"The method '{task.method}' has no row in these tables.", "Pass another --table.")
     found = Found(experiment, [], [], [], "")
     if names or wanted & _OTHERS - {"objects"}:
-        found = _rows(experiment, names, wanted, keep)
+        found = _rows(experiment, names, wanted, keep, kept and kept / "rows")
     if "objects" in wanted and pools:
-        found.rows.extend(evaluate_pools(experiment, pools, kept))
+        found.rows.extend(evaluate_pools(experiment, pools, kept and kept / "pools"))
     return found
 
 
-def _rows(experiment: Experiment, names: Sequence[str], wanted: Set[str], keep: bool) -> Found:
+def _rows(
+    experiment: Experiment, names: Sequence[str], wanted: Set[str], keep: bool, stored: pathlib.Path | None
+) -> Found:
     """Evaluates constraints of these names, and the rows at levels of some tables."""
     experiment.track("Generating constraints", None)
     source, task = "", experiment.policy.task
@@ -362,7 +364,7 @@ def _rows(experiment: Experiment, names: Sequence[str], wanted: Set[str], keep: 
         "peers": PEERS,
     }
     variations += [variation for table in levels if table in wanted for variation in levels[table]]
-    results = experiment.run(variations, keep=keep)
+    results = experiment.run(variations, keep=keep, stored=None if keep else stored)
     return Found(experiment, results, [result.row for result in results], left_out, source, rules)
 
 

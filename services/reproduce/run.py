@@ -41,7 +41,7 @@ _LARGEST = 1 << 28
 _CAPTURED_TABLES = {"cross": ("cross",), "captured": ("single", "composed"), "": ("single", "composed")}
 _SOURCES = {"objects": "objects", "noise": ""}
 _PICTURED = 2
-_POOLS = ".pools"
+_PARTS = ".parts"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,7 +169,7 @@ def evaluate_part(part: Part, entrant: Entrant, request: Request, track: Track) 
     experiment, data = _experiment(part, entrant, request, track)
     tables = _CAPTURED_TABLES[data.paper] if data else (part.table,)
     pools = procedural_pools(min(request.many, MANY), request.physics, "figures") if part.table == "objects" else None
-    found = evaluate_tables(experiment, tables, pools, file.with_suffix(_POOLS), keep=part.pictured)
+    found = evaluate_tables(experiment, tables, pools, file.with_suffix(_PARTS), keep=part.pictured)
     about: dict[str, Any] = {
         "policy": facts(entrant),
         "settings": settings,
@@ -181,7 +181,7 @@ def evaluate_part(part: Part, entrant: Entrant, request: Request, track: Track) 
         "seconds": round(time.monotonic() - began, 1),
     }
     write_json(found.rows, file, about)
-    shutil.rmtree(file.with_suffix(_POOLS), ignore_errors=True)
+    shutil.rmtree(file.with_suffix(_PARTS), ignore_errors=True)
     jax.clear_caches()  # no other part uses its compiled programs
     gc.collect()
     return Result(part, about["source"], found.rows, about, True)

@@ -136,6 +136,25 @@ def test_rows_are_independent_and_kept_episodes_are_drawn(experiment):
     assert sheet.shape[0] > 2 * 225 and sheet.shape[1] > 5 * 300
 
 
+def test_a_stopped_evaluation_resumes_at_its_current_row(experiment, tmp_path, monkeypatch):
+    variations, simulated, run = [Variation("affordance"), Variation()], [], Experiment._run
+
+    def stopping(own, running, variation, *arguments):
+        simulated.append(variation.constraint)
+        if simulated == ["affordance", "heading"]:
+            raise KeyboardInterrupt
+        return run(own, running, variation, *arguments)
+
+    monkeypatch.setattr(Experiment, "_run", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        experiment.run(variations, stored=tmp_path)
+    rows = [result.row.to_json() for result in experiment.run(variations, stored=tmp_path)]
+    assert simulated == ["affordance", "heading", "heading"]
+    assert rows == [result.row.to_json() for result in experiment.run(variations)]
+    dataclasses.replace(experiment, seed=1).run(variations[:1], stored=tmp_path)
+    assert simulated[-3:] == ["affordance", "heading", "affordance"]  # other settings: anew
+
+
 def test_rows_of_fingers_and_of_a_force_limit(experiment):
     for result, mask in zip(
         experiment.run([Variation("fingers"), Variation("force")]), ("mask_fingers", "mask_force_limit"), strict=True

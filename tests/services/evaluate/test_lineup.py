@@ -114,7 +114,7 @@ def test_the_command_prints_and_writes_all_of_them(saved, tmp_path, capsys, monk
     assert [one["method"] for one in read["policies"]] == ["ours", "no-feedforward"]
     missing = [(one["method"], one["reason"]) for one in read["missing"]]
     assert missing == [(name, "not trained") for name in ("no-dynamic-center", "single-stage", "two-phase")]
-    assert not (tmp_path / "rows.json.pools").exists()
+    assert not (tmp_path / "rows.json.parts").exists()
 
 
 def test_captured_sets_of_one_hand_are_not_evaluated_with_another(monkeypatch, tmp_path):

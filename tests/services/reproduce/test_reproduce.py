@@ -62,7 +62,7 @@ def test_a_few_episodes_make_page_json_and_latex_and_are_not_made_again(policy, 
         and failed in html.unescape(text)
     )
     assert (tmp_path / "tables.tex").read_text().count(r"\begin{tabular}") == 6
-    assert not list((tmp_path / "tables").glob("*.pools"))
+    assert not list((tmp_path / "tables").glob("*.parts"))
 
     def never(*arguments, **options):
         raise CongraspError("This must not be evaluated.")
