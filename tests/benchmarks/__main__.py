@@ -7,7 +7,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.services.cli.parser import of_group
 
 NAMES = (
-    *("pieces", "gallery", "speeds", "measures", "dexgraspbench"),
+    *("pieces", "gallery", "screens", "speeds", "measures", "dexgraspbench"),
     *("robot", "sensors", "attacks", "transport", "faults"),
 )
 """Each is a module of this folder with a function of its name."""

@@ -1,5 +1,6 @@
 """A headless browser for the tests of the page; the trace of a failed test is kept in test-results/."""
 
+import contextlib
 import os
 import pathlib
 import re
@@ -16,9 +17,9 @@ BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-c
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
 
 
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    """Chromium, drawing without a graphics card."""
+@contextlib.contextmanager
+def chromium() -> Iterator[Any]:
+    """Chromium, drawing without a graphics card; the test skips without one."""
     playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
     with playwright.sync_playwright() as running:
         own = pathlib.Path(running.chromium.executable_path)
@@ -28,6 +29,13 @@ def browser() -> Iterator[Any]:
         started = running.chromium.launch(executable_path=found, args=ARGUMENTS)
         yield started
         started.close()
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """`chromium`, once for all tests."""
+    with chromium() as started:
+        yield started
 
 
 @pytest.fixture
