@@ -224,7 +224,7 @@ def _one_builder() -> Iterator[None]:
     """Context that one process of this machine enters first: the others then read from Warp's cache what it built."""
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # a folder without locks
-            file = stack.enter_context(pathlib.Path(wp.config.kernel_cache_dir, "builder").open("a+"))
+            file = stack.enter_context(pathlib.Path(str(wp.config.kernel_cache_dir), "builder").open("a+"))
             try:
                 fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
