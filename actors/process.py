@@ -15,7 +15,7 @@ from congrasp.actors.env import EnvState, episode_fields
 from congrasp.actors.episode import episode_message
 from congrasp.actors.harvest import save_references, with_kept_references
 from congrasp.actors.link import ActorLink, RunFinished, RunInfo, RunRestarted, Ticket
-from congrasp.actors.physics import make_physics
+from congrasp.actors.physics import make_physics, prepare_physics
 from congrasp.actors.rollout import Rollout, Trace, finished_episodes
 from congrasp.actors.training_set import FailureWeights, TrainingSet, training_set
 from congrasp.actors.worker import RolloutWorker
@@ -176,6 +176,7 @@ class _Actor:
         if self._spec.schema != info.schema:
             what = f"The learner's policies have the schema {info.schema}; this actor's have {self._spec.schema}."
             raise CongraspError(what, remedy)
+        prepare_physics(physics, self._hand, config.task)
         self._number = zlib.crc32(link.actor.encode())
         self._own_references = config.task.own_references and draws_references(config.task)
         self._references = references if self._own_references else None

@@ -1,5 +1,7 @@
 """Physics engines behind one interface: registers those of the project; `make_physics` builds one by name."""
 
+import concurrent.futures
+import functools
 import importlib.util
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +13,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import ENGINES, Engine, PhysicsName
+from congrasp.common.runtime.stages import stage
 from congrasp.common.task.config import TaskConfig
 
 _NVIDIA = ("gpu", "cuda")
@@ -21,6 +24,14 @@ def _make_warp(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], thr
     from congrasp.actors.physics.warp import WarpPhysics
 
     return WarpPhysics(hand, task, objects)
+
+
+def _prepare_warp(hand: Hand, task: TaskConfig) -> None:
+    """Begins to build Warp's kernels."""
+    with stage("import of Warp"):
+        from congrasp.actors.physics.warp import begin_kernels
+
+    begin_kernels(hand, task)
 
 
 def _make_jax(hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int) -> Physics:
@@ -50,7 +61,7 @@ def _missing_warp(backend: str) -> CongraspError | None:
 
 
 ENGINES["warp"] = Engine(
-    _make_warp, 4096, lambda backend: backend in _NVIDIA, _missing_warp, on_device=True, title="MJX-Warp"
+    _make_warp, 4096, lambda backend: backend in _NVIDIA, _missing_warp, _prepare_warp, on_device=True, title="MJX-Warp"
 )
 ENGINES["jax"] = Engine(_make_jax, 256, lambda backend: backend not in ("cpu", *_NVIDIA), title="MJX-JAX")
 ENGINES["native"] = Engine(_make_native, 64, lambda backend: backend == "cpu", title="MuJoCo C (CPU)")
@@ -74,6 +85,19 @@ def resolve_physics(name: PhysicsName, backend: str = "") -> PhysicsName:
     if missing := ENGINES[name].missing(backend):
         raise missing
     return name
+
+
+@functools.cache
+def prepare_physics(name: PhysicsName, hand: Hand, task: TaskConfig) -> None:
+    """Begins, once in a process, what an engine can build in the background before it has objects.
+
+    `make_physics` then raises the errors of this.
+
+    Raises:
+      CongraspError: see `resolve_physics`.
+    """
+    if prepare := ENGINES[resolve_physics(name)].prepare:
+        concurrent.futures.ThreadPoolExecutor(1, "prepare").submit(prepare, hand, task)
 
 
 def make_physics(

@@ -9,12 +9,15 @@ wherever JAX places its arrays.
 """
 
 import concurrent.futures
+import contextlib
 import dataclasses
+import fcntl
 import functools
 import itertools
+import pathlib
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -38,6 +41,7 @@ from congrasp.actors.physics.scene import SENSOR_WIDTH, TABLE_AWAY, Addresses, a
 from congrasp.actors.physics.slots import Catalogue
 from congrasp.actors.physics.warp_kernels import DATA_LEAVES, MODEL_LEAVES, OBJECT_FIELDS, Leaves, Objects, count, place
 from congrasp.common.hands.spec import Hand
+from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.runtime.stages import stage
@@ -50,8 +54,9 @@ CONSTRAINTS_PER_ENVIRONMENT = 320
 """Capacity of constraint rows for each environment."""
 
 
-_listing = threading.Lock()
-"""Held while Warp's launches are only listed (`WarpBuffers._variants`), which one thread does at a time."""
+_BLOCK = 256  # Warp's block size of a launch without one; on a CPU all are 1
+_building = threading.Lock()
+"""Held while one of the `WarpBuffers` lists and builds its kernels; the next then finds those they share."""
 
 
 class WarpBuffers:
@@ -149,36 +154,45 @@ class WarpBuffers:
 
         Launches would do this one after another. Warp compiles without Python's lock.
         """
-        # Warp names a kernel by its code, and so compiles the factorisations already here.
-        with stage("list of the kernels"), _listing:
-            variants = self._variants()
-        with stage("kernels"), concurrent.futures.ThreadPoolExecutor(cores()) as threads:
-            list(threads.map(lambda variant: wp.force_load(self._device, [variant[0]], variant[1]), variants))
+        with _building:
+            with stage("list of the kernels"):
+                variants = self._variants()
+            with stage("kernels"), _one_builder(), concurrent.futures.ThreadPoolExecutor(cores()) as threads:
+                list(threads.map(lambda variant: wp.force_load(self._device, [variant[0]], variant[1]), variants))
 
-    def _variants(self) -> set[tuple[wp.Module, int | None]]:
-        """Modules with the kernels of a control step, and their block sizes.
+    def _variants(self) -> list[tuple[wp.Module, int]]:
+        """Modules with the kernels of a control step, and their block sizes, the largest modules first.
 
-        Only `mujoco_warp.step` knows which kernels a model needs: here its launches are listed and not made.
+        Only `mujoco_warp.step` knows which kernels a model needs: here its launches are listed and not made. It also
+        queries the occupancy of its largest kernels, each of which Warp would build for the answer.
         """
-        found: set[tuple[wp.Module, int | None]] = {(place.module, None)}
-        me, launches, options = threading.get_ident(), (wp.launch, wp.launch_tiled), self._model.opt
+        queried, launched = list[tuple[wp.Module, int]](), [(place.module, _BLOCK)]
+        me, options, conditional = threading.get_ident(), self._model.opt, self._model.opt.graph_conditional
+        *launches, query = replaced = wp.launch, wp.launch_tiled, wp.get_suggested_block_size
 
         def listed(launch: Callable[..., None], kernel: wp.Kernel, *given: Any, **named: Any) -> None:
             if threading.get_ident() == me:
-                found.add((kernel.module, named.get("block_dim")))
+                launched.append((kernel.module, named.get("block_dim") or _BLOCK))
             else:
                 launch(kernel, *given, **named)
 
-        conditional = options.graph_conditional
+        def suggested(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
+            if threading.get_ident() != me:
+                return query(kernel, device)
+            queried.append((kernel.module, kernel.module.options["block_dim"]))
+            return 1, 1
+
         options.graph_conditional = False  # a loop until the solver's kernels have converged would not end
         wp.launch, wp.launch_tiled = (functools.partial(listed, launch) for launch in launches)
+        wp.get_suggested_block_size = suggested
         try:
             with wp.ScopedDevice(self._device):
                 self._substep_all()
         finally:
-            wp.launch, wp.launch_tiled = launches
+            wp.launch, wp.launch_tiled, wp.get_suggested_block_size = replaced
             options.graph_conditional, options.disableflags = conditional, self._sensing
-        return found
+        gpu = self._device.is_cuda
+        return list(dict.fromkeys((module, size if gpu else 1) for module, size in (*queried, *launched)))
 
     def _launch(self) -> None:
         """Launches the kernels of one control step."""
@@ -203,6 +217,19 @@ class WarpBuffers:
             mujoco_warp.step(model, data)
             counts = [data.ncollision, data.nacon, data.nefc, data.solver_niter, model.opt.iterations, self._occupancy]
             wp.launch(count, data.nworld, counts, device=self._device)
+
+
+@contextlib.contextmanager
+def _one_builder() -> Iterator[None]:
+    """Context that one process of this machine enters first: the others then read from Warp's cache what it built."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # a folder without locks
+            file = stack.enter_context(pathlib.Path(str(wp.config.kernel_cache_dir), "builder").open("a+"))
+            try:
+                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                fcntl.lockf(file, fcntl.LOCK_SH)  # together, once the first is done
+        yield
 
 
 def objects_on(device: wp.Device, rows: dict[str, np.ndarray]) -> Objects:
@@ -335,8 +362,7 @@ class WarpPhysics:
         """Starts environments; see `Physics.start`."""
         batch = reset_state.object_index.shape[0]
         if batch not in self._buffers:
-            model, geoms = self._catalogue.model, self._catalogue.geoms
-            buffers = WarpBuffers(model, self._where, geoms, self._task.substeps, batch, self._device)
+            buffers = self._allocated(batch)
             buffers.fill(*self._loaded)
             self._buffers[batch] = register(buffers), buffers
         return self._fresh(reset_state)
@@ -415,6 +441,11 @@ class WarpPhysics:
         """Releases the memory of the environments."""
         self._buffers.clear()
 
+    def _allocated(self, batch: int) -> WarpBuffers:
+        """Returns buffers of a batch, without objects, and begins to build their kernels."""
+        model, geoms = self._catalogue.model, self._catalogue.geoms
+        return WarpBuffers(model, self._where, geoms, self._task.substeps, batch, self._device)
+
     def _load(self, objects: Sequence[GraspObject]) -> None:
         """Transfers objects to the device, and points every batch's buffers to them."""
         rows, meshes = self._catalogue.rows(objects)
@@ -435,3 +466,11 @@ class WarpPhysics:
             initial_qvel(self._where, model.nv, reset_state),
         )
         return WarpState(qpos, qvel, jnp.zeros_like(qvel), reset_state)
+
+
+def begin_kernels(hand: Hand, task: TaskConfig) -> None:
+    """Begins to build the kernels of a hand and a task in the background.
+
+    Objects do not change them, and the number of environments only changes the broadphase.
+    """
+    WarpPhysics(hand, task, [procedural.generate(0, "box")])._allocated(1)

@@ -22,6 +22,8 @@ class Engine(NamedTuple):
     """JAX backend -> True if `auto` may select this engine there; the first such engine is used."""
     missing: Callable[[str], CongraspError | None] = lambda backend: None
     """JAX backend -> error that names what this machine lacks for the engine; None if it lacks nothing."""
+    prepare: Callable[..., None] | None = None
+    """(hand, task): begins in the background what the engine can build before there are objects, if there is any."""
     on_device: bool = False
     """True if rollouts stay on the learner's device, so that by default one actor runs in the learner's process."""
     title: str = ""

@@ -9,8 +9,10 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 
 from congrasp.actors.harvest import references_file
+from congrasp.actors.physics import prepare_physics
 from congrasp.actors.process import run_actor
 from congrasp.common.config import MetricWriter, RunConfig
+from congrasp.common.hands import get_hand
 from congrasp.common.policy.bundle import policy_spec
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.parallel import cores, prepare_workers
@@ -65,6 +67,7 @@ def learn(
     with contextlib.ExitStack() as stack:
         if inside is not None:
             prepare_workers(config.objects.count)
+            prepare_physics(inside, get_hand(config.task.hand), config.task)
             config = dataclasses.replace(config, max_staleness=0)
             memory = stack.enter_context(urls.listen(url := f"memory/{run_dir}", "learner"))
             transport = memory if wire is None else PairTransport(memory, wire)

@@ -1,12 +1,14 @@
 """An engine that only this file knows: it is registered here, and episodes and tables are made on it."""
 
+import queue
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
 
-from congrasp.actors.physics import ENGINES, Engine, make_physics, resolve_physics
+from congrasp.actors.physics import ENGINES, Engine, make_physics, prepare_physics, resolve_physics
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.common.config import RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
@@ -37,6 +39,22 @@ def test_rollouts_are_made_on_it():
     rollout = suite.worker(physics=physics).collect(suite.command(noise=0.3), 3)
     assert CountingPhysics.steps == 3 * BATCH and np.all(np.isfinite(rollout.reward))
     physics.close()
+
+
+def test_it_is_prepared_once_and_in_the_background(monkeypatch):
+    begun, done = queue.SimpleQueue(), threading.Event()
+
+    def prepare(hand, task):
+        begun.put((hand, task))
+        assert done.wait(30.0)
+
+    monkeypatch.setitem(ENGINES, "counting", ENGINES["counting"]._replace(prepare=prepare))
+    prepare_physics.cache_clear()
+    for _ in range(2):
+        prepare_physics("counting", HAND, TASK)
+    assert begun.get(timeout=30.0) == (HAND, TASK), "although it is not done"
+    done.set()
+    assert begun.empty()
 
 
 @pytest.mark.slow

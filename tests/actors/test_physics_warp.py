@@ -5,6 +5,7 @@ import os
 import pathlib
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 
 import jax
@@ -157,6 +158,48 @@ def test_a_control_step_needs_no_kernel_that_was_not_loaded_ahead(start, monkeyp
     assert len(ahead) > 40
     assert loaded - ahead == {("congrasp.actors.physics.warp", 1)}
     physics.close()
+
+
+def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends_on_the_environments(monkeypatch):
+    import warp as wp  # takes seconds in every worker
+
+    from congrasp.actors.physics.warp import WarpBuffers
+
+    monkeypatch.setattr(WarpBuffers, "_load_kernels", lambda buffers: None)
+    monkeypatch.setattr(wp, "get_suggested_block_size", lambda *query: pytest.fail("this would build a kernel"))
+    monkeypatch.setattr(wp._src.context.Module, "load", lambda *module: pytest.fail("this builds a module"))
+    engines = warp_engine(OBJECTS), warp_engine(OBJECTS[:1], mesh_slots=9)
+    few, many = ([module.name for module, _ in engines[n]._allocated(n + 1)._variants()] for n in (0, 1))
+    assert len(many) > 40 and many[0].startswith("_nxn_broadphase"), "the first are those that are queried"
+    assert all(name.startswith("_nxn_broadphase") for name in {*few} ^ {*many})
+
+
+def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monkeypatch):
+    import warp as wp  # takes seconds in every worker
+
+    from congrasp.actors.physics.warp import _one_builder
+
+    program = "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.lockf(f, fcntl.LOCK_EX); print(flush=True); input()"
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    entered = threading.Event()
+
+    def build():
+        with _one_builder():
+            entered.set()
+
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path / "builder")], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
+        thread = threading.Thread(target=build)
+        thread.start()
+        assert not entered.wait(0.5)
+        other.communicate(b"\n", timeout=30.0)
+        thread.join(30.0)
+    assert entered.is_set()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "missing"))
+    with _one_builder():
+        pass  # without a folder nothing is shared
 
 
 def test_rows_are_what_mujoco_compiles():

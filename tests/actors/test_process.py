@@ -122,7 +122,8 @@ def heard(monkeypatch):
         monkeypatch.setattr(process, "RolloutWorker", InventedWorker)
         invented = types.SimpleNamespace(weight=np.ones(len(objects)))
         found = TrainingSet(objects, lambda: pytest.fail("nothing is compiled"), lambda: invented)
-        numbers = []
+        numbers, prepared = [], []
+        monkeypatch.setattr(process, "prepare_physics", lambda *engine: prepared.append(len(numbers)))
         monkeypatch.setattr(process, "training_set", lambda hand, config, number: numbers.append(number) or found)
         broker, stop = MemoryHub(), threading.Event()
         with MemoryTransport(broker) as server, MemoryTransport(broker) as peer:
@@ -145,6 +146,7 @@ def heard(monkeypatch):
             stop.set()
             actor.join(30.0)
             received = list(iter(lambda: logs.receive(0.0), None))
+        assert prepared == [0], "the engine is prepared before there are objects"
         assert list(np.diff(numbers)) == [1] * len(InventedWorker.pools)  # the next objects by their seeds
         return batch, {key.split("/")[3]: message for key, message in received if "/actor/" in key}
 

@@ -10,6 +10,7 @@ import pytest
 
 from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
 from congrasp.services.cli import warmup
 from congrasp.services.train import learn as training
 
@@ -42,6 +43,14 @@ def test_nothing_is_reported_of_a_start_that_was_stopped(monkeypatch):
     monkeypatch.setattr(training, "learn", learn)
     training.until_first_update(RunConfig(), "native", threading.Event(), lambda: reported.append(1))
     assert not reported
+
+
+def test_an_engine_in_this_process_is_prepared_before_the_learner(monkeypatch, tmp_path):
+    begun, config = [], RunConfig()
+    monkeypatch.setattr(training, "prepare_physics", lambda *engine: begun.append(engine))
+    monkeypatch.setattr(training, "run_learner", lambda *run, **options: begun.append("learner"))
+    training.learn(tmp_path, config, wire=None, inside="native", stop=threading.Event())
+    assert begun == [("native", get_hand(config.task.hand), config.task), "learner"]
 
 
 @pytest.fixture
