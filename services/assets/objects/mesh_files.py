@@ -127,6 +127,8 @@ def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: li
         raise CongraspError(f"{path} {error}") from None
     except Exception as error:  # the readers raise whatever they stumble over
         reason = (str(error) or type(error).__name__).splitlines()[0][:200].rstrip(" .!")
+        if kind == "obj" and isinstance(error, IndexError):
+            reason = "a face refers to a point that is not in the file"
         raise CongraspError(f"{path} cannot be read as {kind.upper()}: {reason}.", remedy) from None
     found.metadata["kind"] = kind
     return found
@@ -318,16 +320,19 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
         if words and words[0] in counts:
             counts[words[0]] += 1
         elif words and words[0] == b"f":
-            line = b" ".join([b"f", *(_absolute(word, list(counts.values())) for word in words[1:])])
+            corners = (word.split(b"/") for word in words[1:])
+            line = b" ".join([b"f", *(b"/".join(map(_absolute, corner, counts.values())) for corner in corners)])
         lines.append(line)
     return b"\n".join(lines)
 
 
-def _absolute(corner: bytes, counts: list[int]) -> bytes:
-    """A corner of a face, such as -1//-1, by absolute indices into so many points, texture coordinates and normals."""
-    indices = corner.split(b"/")
-    pairs = zip(indices, counts, strict=False)
-    return b"/".join(b"%d" % (int(index) + 1 + count) if index.startswith(b"-") else index for index, count in pairs)
+def _absolute(index: bytes, count: int) -> bytes:
+    """An index of a face, such as -1, by the absolute index among so many points, texture coordinates or normals."""
+    if not index.startswith(b"-"):
+        return index
+    if int(index) < -count:
+        raise IndexError
+    return b"%d" % (int(index) + 1 + count)
 
 
 def _checked_ply(data: bytes, notes: list[str]) -> bytes:
@@ -338,6 +343,8 @@ def _checked_ply(data: bytes, notes: list[str]) -> bytes:
     is_text, elements = b"ascii" in header, list[tuple[int, int]]()
     for line in header.decode("latin-1").splitlines():
         match line.split():
+            case ["element", "tristrips", _]:
+                raise ValueError("its triangles are strips, which MeshLab opens and exports as faces")
             case ["element", _, count]:
                 elements.append((int(count), 0))
             case ["property", *words]:
