@@ -170,10 +170,15 @@ def _check_files(arguments: Sequence[str]) -> None:
 
 
 def _check_outputs(call: Callable[[], Any]) -> None:
-    """Raises a CongraspError for an output that cannot be written, before the work for it."""
+    """Raises a CongraspError for an output that cannot be written, before the work for it.
+
+    An output is a folder if its default has no suffix; one without a default may be either.
+    """
     for name, path in getattr(call, "keywords", {}).items():
         if name in _OUTPUTS and isinstance(path, pathlib.Path):
-            check_output(f"--{name.replace('_', '-')}", path)
+            default = inspect.signature(call.args[0]).parameters[name].default
+            is_folder = not default.suffix if default else None if name == "out" else name == "pictures"
+            check_output(f"--{name}", path, is_folder)
 
 
 def _is_there(path: pathlib.Path) -> bool:
