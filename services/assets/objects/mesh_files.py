@@ -38,7 +38,7 @@ _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", 
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _RELATIVE = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t/]-\d")
 _ZERO = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t]0+(?=[/\s]|$)")
-_COMMA = re.compile(rb"(?m)^[ \t]*v[ \t]+-?\d+,\d")
+_COMMA = re.compile(rb"(?mi)^[ \t]*(?:v[ \t]+|vertex[ \t]+)?-?\d+,\d+[ \t]")
 _START = 4096
 _MARK = b"\xef\xbb\xbf"  # of UTF-8
 _FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and products are finite
@@ -117,6 +117,8 @@ def load_geometry(path: pathlib.Path, remedy: str, *, notes: list[str] | None = 
 def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: list[str], **options: Any) -> Any:
     """The geometry of a file with this content; see `load_geometry`."""
     try:
+        if b"\0" not in data[:_START] and _COMMA.search(data):
+            raise ValueError("its numbers have commas for decimal points")
         if kind == "stl":
             found: Any = _stl(data, notes)
         else:
@@ -271,7 +273,7 @@ def _number(word: bytes) -> float:
     try:
         return float(word)
     except ValueError:
-        raise ValueError(f"'{ascii(word.decode(errors='replace'))[1:31]}' is not a number") from None
+        raise ValueError(f"{ascii(word.decode(errors='replace'))[:30]} is not a number") from None
 
 
 def _binary_stl(data: bytes, notes: list[str]) -> np.ndarray:
@@ -303,15 +305,13 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
     """Text with absolute indices: negative ones count back from the points so far.
 
     Raises:
-      ValueError: an index is 0, or the numbers have decimal commas.
+      ValueError: an index is 0.
     """
     data = data.removeprefix(_MARK)
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
     if _ZERO.search(data):
         raise ValueError("a face has the index 0, but OBJ counts from 1")
-    if _COMMA.search(data):
-        raise ValueError("its numbers have commas for decimal points")
     if not _RELATIVE.search(data):
         return data
     counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
