@@ -124,6 +124,8 @@ def _unread(path: pathlib.Path, error: Exception) -> str:
     remedy = f" {_REMEDY}" if not isinstance(error, _Known) else ""
     if "plugin" in reason:
         remedy = f" Correct the plugin, or delete it and what uses it: MuJoCo {mujoco.__version__} has only its own."
+    elif "unknown default class" in reason:
+        remedy = " If another file includes this one, import that."
     elif "unrecognized attribute" in reason or "unrecognized element" in reason:
         remedy = f" MuJoCo {mujoco.__version__} has none of that name: delete it."
     elif re.search("unknown exception|allocate memory|no reason", reason):  # as it words an exception of C++
@@ -279,6 +281,7 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     """Returns the model of a URDF file; searches its meshes as ROS does, and converts formats that MuJoCo lacks."""
     tree, parser = ET.TreeBuilder(), xml.parsers.expat.ParserCreate()  # which, as ROS, declares no prefixes
     parser.StartElementHandler, parser.EndElementHandler = tree.start, tree.end
+    parser.CharacterDataHandler = tree.data  # MuJoCo counts lines
     try:
         parser.Parse(text, True)
     except xml.parsers.expat.ExpatError as error:
