@@ -169,7 +169,7 @@ def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
 
 
 def _check_units(path: pathlib.Path, links: list[Link]) -> None:
-    """Raises a CongraspError for distances, angles and masses that no hand has, with the unit that they seem to have."""
+    """Raises a CongraspError for distances, angles and masses that no hand has; the remedy is the likely unit."""
     for link in links:
         away = max((float(np.linalg.norm(joint.anchor)) for joint in link.joints), default=0.0)
         turn = max(((max(-joint.lower, joint.upper), joint.name) for joint in link.joints), default=(0.0, ""))
