@@ -169,12 +169,12 @@ def _check_files(arguments: Sequence[str]) -> None:
         raise CongraspError(f"{named} is no file {path}.", remedy)
 
 
-def _check_outputs(call: Callable[[], Any]) -> None:
+def _check_outputs(call: Any) -> None:
     """Raises a CongraspError for an output that cannot be written, before the work for it.
 
     An output is a folder if its default has no suffix; one without a default may be either.
     """
-    for name, path in getattr(call, "keywords", {}).items():
+    for name, path in call.keywords.items():
         if name in _OUTPUTS and isinstance(path, pathlib.Path):
             default = inspect.signature(call.args[0]).parameters[name].default
             is_folder = not default.suffix if default else None if name == "out" else name == "pictures"

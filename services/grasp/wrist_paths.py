@@ -160,7 +160,7 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     Raises:
       CongraspError: the file has more than `largest` bytes or cannot be read, or a line is not seven finite numbers.
     """
-    columns, width = range(7), 7
+    columns, width = list(range(7)), 7
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()

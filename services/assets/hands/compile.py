@@ -300,7 +300,7 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     if robot.find("link") is not None and all(link.get("name") in children for link in robot.findall("link")):
         raise _Known("its links form a loop, and none is the root. Remove the joint that closes it")
     _check_joints(robot, notes)
-    assets, names, lacking = dict[str, bytes](), dict[tuple[pathlib.Path | None, str], str](), dict[str, None]()
+    assets, shared, lacking = dict[str, bytes](), dict[tuple[pathlib.Path | None, str], str](), dict[str, None]()
     for link in robot.iter("link"):
         for again in link.findall("inertial")[1:]:
             link.remove(again)
@@ -308,15 +308,15 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
             for mesh in shape.iter("mesh"):
                 file = _mesh_file(path, mesh.get("filename", ""))
                 used = file, mesh.get("scale", "")  # MuJoCo shares a mesh among shapes of one name and scale
-                if used not in names:
+                if used not in shared:
                     content, kind = _readable(file) if file else (b"", "")
-                    names[used] = f"{len(assets)}.{kind}" if content else ""
-                    assets |= {names[used]: content} if content else {}
-                if not names[used]:
+                    shared[used] = f"{len(assets)}.{kind}" if content else ""
+                    assets |= {shared[used]: content} if content else {}
+                if not shared[used]:
                     lacking[mesh.get("filename", "")] = None
                     link.remove(shape)
                     break
-                mesh.set("filename", names[used])
+                mesh.set("filename", shared[used])
     if lacking:
         notes.append(_missing(list(lacking)))
     return mujoco.MjSpec.from_string(ET.tostring(robot, "unicode"), assets=assets)

@@ -105,7 +105,8 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
             fault = "large" if longest * METRES[taken] > high else "small"
             remedy = f"Set '--scale {0.1 / (max(sides) * METRES[taken]):.3g}' for an object of 10 cm."
             if options:
-                remedy = f"If they are {'; if '.join(options)}; or set --scale."
+                where = "options of 'objects import' and 'grasp'"
+                remedy = f"If they are {'; if '.join(options)}; or set --scale ({where})."
             elif fault == "large":
                 remedy = f"If the file also shows a table or other things, delete them there. {remedy}"
             raise CongraspError(
