@@ -116,13 +116,7 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
         said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"
         notes.append(f"{said}: {', '.join(doubtful)}")
-    points = {x: [p for mesh in placed(tree, x, colliding=True) for p in mesh.vertices] for x in tree.groups}
-    for link, some in points.items():  # before capsules are fitted to whole robots
-        size = float(np.ptp(some, axis=0).max()) if some else _LINK[1]
-        if not _LINK[0] <= size <= _LINK[1]:
-            remedy = _smaller_unit(size) if size > _LINK[1] else _TWICE
-            raise CongraspError(f"{path}: the link '{tree.name(link)}' is {length(size)} long{_NO_HAND}", remedy)
-    links, drive = _links(tree, points, notes)
+    links, drive = _links(tree, _points(path, tree), notes)
     _check_units(path, links)
     if choices.own_collision:
         links = [dataclasses.replace(x, solids=solids_of(tree, i)) for x, i in zip(links, tree.groups, strict=True)]
@@ -166,6 +160,17 @@ def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
             raise CongraspError(
                 f"{path}: {fault}.", "Correct the file, or write a hand file by hand (docs/add-a-hand.md)."
             )
+
+
+def _points(path: pathlib.Path, tree: Tree) -> dict[int, list[np.ndarray]]:
+    """Points of each link's geometry, m; raises a CongraspError for a link of a size that no hand has."""
+    points = {x: [p for mesh in placed(tree, x, colliding=True) for p in mesh.vertices] for x in tree.groups}
+    for link, some in points.items():
+        size = float(np.ptp(some, axis=0).max()) if some else _LINK[1]
+        if not _LINK[0] <= size <= _LINK[1]:
+            remedy = _smaller_unit(size) if size > _LINK[1] else _TWICE
+            raise CongraspError(f"{path}: the link '{tree.name(link)}' is {length(size)} long{_NO_HAND}", remedy)
+    return points
 
 
 def _check_units(path: pathlib.Path, links: list[Link]) -> None:
