@@ -47,8 +47,11 @@ def check_free(path: pathlib.Path, *, force: bool = False) -> None:
         raise CongraspError(f"{path} exists already.", "Pass another path with --out, or --force to replace it.")
 
 
-def check_output(option: str, path: pathlib.Path) -> None:
-    """Raises a CongraspError if neither a file nor a folder can be created at a path, before the work for it."""
+def check_output(option: str, path: pathlib.Path, is_folder: bool | None = None) -> None:
+    """Raises a CongraspError if a path can be neither a new file nor a new folder, or is the other one of these."""
+    if is_folder is not None and path.exists() and path.is_dir() != is_folder:
+        found, remedy = ("file", "Pass a folder; it need not exist.") if is_folder else ("folder", "Pass a file in it.")
+        raise CongraspError(f"{option} is the {found} {path}.", remedy)
     parent = path if path.is_dir() else next(folder for folder in path.absolute().parents if folder.exists())
     if not parent.is_dir():
         raise CongraspError(f"{option} is {path}, but {parent} is a file.", "Pass another path.")

@@ -272,11 +272,12 @@ def save(bundle: PolicyBundle, path: pathlib.Path) -> None:
 
 def load(path: pathlib.Path) -> PolicyBundle:
     """Reads a bundle from a file; errors name it."""
-    data = read_file(path, MAX_MESSAGE, "Pass a policy file (policy.safetensors in a run's folder).")
+    remedy = "Pass a policy file (policy.safetensors in a run's folder)."
+    data = read_file(path, MAX_MESSAGE, remedy)
     try:
         message = decode(data)
     except CongraspError as error:
-        raise CongraspError(f"The policy {path} is damaged, or not a policy: {error}") from None
+        raise CongraspError(f"The policy {path} is damaged, or not a policy: {error}", remedy) from None
     return PolicyBundle.from_message(message, str(path))
 
 

@@ -109,8 +109,6 @@ class Grasp:
         in_range(0.0, 10.0, "seconds", approach=self.approach)
         in_range(0.0, 0.5, "metres", lift=self.lift)
         in_range(1.0, 120.0, "frames a second", fps=self.fps)
-        if self.out.exists() and not self.out.is_dir():
-            raise CongraspError(f"--out is the file {self.out}.", "Pass a folder; it is created if it does not exist.")
         phases = Phases(self.approach, self.lift)
         grasper = open_grasper(self.policy, self.hand, self.attempts, self.seed, phases, self.arm)
         found, results = find_objects(self.objects, self.folder)

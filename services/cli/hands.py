@@ -13,9 +13,10 @@ from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder, own_han
 from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.meshes import load_meshes, save_meshes
 from congrasp.common.hands.skin import skin_of_meshes
-from congrasp.common.io.files import write_atomically
+from congrasp.common.io.files import check_output, write_atomically
 from congrasp.common.runtime.parallel import cores
 from congrasp.services.cli.console import in_range, say, show_table
+from congrasp.services.ops.logs import announced
 
 if TYPE_CHECKING:
     from congrasp.services.assets.hands.model_files import Choices, Proposal
@@ -112,9 +113,13 @@ def import_hand(
     """
     from congrasp.services.assets.hands import model_files
 
-    proposal = model_files.import_hand(file, model_files.Choices(name, palm, thumb, object_scale, collision == "own"))
-    if out is not None and out.suffix != SUFFIX:
-        raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
+    if out is not None:
+        check_output("--out", out, is_folder=False)
+        if out.suffix != SUFFIX:
+            raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
+    choices = model_files.Choices(name, palm, thumb, object_scale, collision == "own")
+    with announced(f"Reading {file}"):
+        proposal = model_files.import_hand(file, choices)
     _keep(proposal, out, png)
     called = proposal.hand.name if out is None else out
     print(f"Try: congrasp hands train {called}, or congrasp train --hand {called} --physics native")

@@ -169,11 +169,16 @@ def _check_files(arguments: Sequence[str]) -> None:
         raise CongraspError(f"{named} is no file {path}.", remedy)
 
 
-def _check_outputs(call: Callable[[], Any]) -> None:
-    """Raises a CongraspError for an output that cannot be written, before the work for it."""
-    for name, path in getattr(call, "keywords", {}).items():
+def _check_outputs(call: Any) -> None:
+    """Raises a CongraspError for an output that cannot be written, before the work for it.
+
+    An output is a folder if its default has no suffix; one without a default may be either.
+    """
+    for name, path in call.keywords.items():
         if name in _OUTPUTS and isinstance(path, pathlib.Path):
-            check_output(f"--{name.replace('_', '-')}", path)
+            default = inspect.signature(call.args[0]).parameters[name].default
+            is_folder = not default.suffix if default else None if name == "out" else name == "pictures"
+            check_output(f"--{name}", path, is_folder)
 
 
 def _is_there(path: pathlib.Path) -> bool:

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 _COLOURS = {"red": (255, 0, 0), "green": (0, 255, 0), "blue": (0, 0, 255), "yellow": (255, 255, 0)}
 
 
-def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tuple[str, ...] = ()) -> int:
+def generate(
+    out: pathlib.Path = pathlib.Path("objects"), count: int = 24, seed: int = 0, families: tuple[str, ...] = ()
+) -> int:
     """Make procedural objects and store them in a folder.
 
     Args:
@@ -47,7 +49,7 @@ def generate(out: str = "objects", count: int = 24, seed: int = 0, families: tup
 
 def import_meshes(
     paths: Annotated[tuple[str, ...], tyro.conf.Positional],
-    out: str = "objects",
+    out: pathlib.Path = pathlib.Path("objects"),
     mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(),  # noqa: B008
 ) -> int:
     """Import objects from meshes: decompose and weigh them, find their resting poses, and store them in a folder.

@@ -61,10 +61,6 @@ class Report:
         from congrasp.services.evaluate.scores import write_json
 
         in_range(1, episodes=self.episodes, pool=self.pool)
-        if self.out.is_dir():
-            raise CongraspError(
-                f"--out is the folder {self.out}.", f"Pass a file in it: --out {self.out / 'report.html'}"
-            )
         run_dir = self.source if self.source is not None and self.source.is_dir() else None
         file = _policy_of_run(run_dir) if run_dir else policy_file(self.source, self.hand)
         checked = None if self.check is None else _checked(self.check)

@@ -71,8 +71,6 @@ class Reproduce:
 
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
-        if self.out.exists() and not self.out.is_dir():
-            raise CongraspError(f"--out is the file {self.out}.", "Pass a folder.")
         chosen, compared = tuple(dict.fromkeys(self.hands)) or tuple(pretrained_hands()), self.methods or BASELINES
         _check_names(chosen, compared)
         usual_episodes, usual_pool = _QUICK if self.quick else _FULL

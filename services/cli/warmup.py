@@ -70,9 +70,7 @@ def warmup(
         console.print(f"{import_caches(source)} files of {source} are in the caches.", markup=False)
         return 0
     if export is not None:
-        check_output("--export", export)
-        if export.is_dir():
-            raise CongraspError(f"--export is {export}, which is a folder.", "Pass a file in it.")
+        check_output("--export", export, is_folder=False)
         export.absolute().parent.mkdir(parents=True, exist_ok=True)
     config = get_preset(preset, hand, environments=environments, rollout_steps=rollout_steps)
     with on_signal() as stop, console.status("compiling"):

@@ -272,7 +272,8 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
         arm = arm_of(str(meta["arm"]), arrays, len(arrays["time"])) if "arm" in meta else None
         return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal, arm=arm)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise CongraspError(f"{path} is not a grasp motion ({str(error)[:200]}).", remedy) from None
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise CongraspError(f"{path} is not a grasp motion ({reason[:200]}).", remedy) from None
 
 
 def _check_facts(facts: dict[str, Any]) -> None:

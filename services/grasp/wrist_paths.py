@@ -18,6 +18,8 @@ _LARGEST, _DEEPEST = 32 << 20, 200
 """Bytes of a BVH or CSV file, and joints of a BVH chain."""
 HUGE = 1e9
 """Bound on angles, positions and quaternion components."""
+_ORDERS = {"xyzwxyz": (0, 1, 2, 3, 4, 5, 6), "xyzxyzw": (0, 1, 2, 6, 3, 4, 5)}
+"""Last letters of a CSV header's names, and the places of x, y, z and the quaternion w, x, y, z among them."""
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
     f"{sign}{axis}": s * row for axis, row in zip("xyz", np.eye(3), strict=True) for sign, s in (("+", 1), ("-", -1))
@@ -150,11 +152,15 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
 
 
 def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines; a header is skipped.
+    """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines.
+
+    A header whose names end in these letters may put w last, as ROS does, and have other columns: t, x, y, z, qx, qy,
+    qz, qw.
 
     Raises:
       CongraspError: the file has more than `largest` bytes or cannot be read, or a line is not seven finite numbers.
     """
+    columns, width = list(range(7)), 7
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
@@ -164,10 +170,14 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     for number, line in enumerate(lines, 1):
         words = re.sub(r"[,;]", " ", line.partition("#")[0]).split()
         if not words or (not rows and not any(map(_is_number, words))):
+            ends = "".join(word[-1] for word in words).lower()
+            for order, places in _ORDERS.items():
+                if (first := ends.find(order)) >= 0:
+                    columns, width = [first + place for place in places], len(words)
             continue
-        if len(words) != 7 or not all(map(_is_number, words)):
-            raise CongraspError(f"line {number} of {path} is not 7 finite numbers.", remedy)
-        rows.append([float(word) for word in words])
+        if len(words) != width or not all(_is_number(words[column]) for column in columns):
+            raise CongraspError(f"line {number} of {path} is not {width} finite numbers.", remedy)
+        rows.append([float(words[column]) for column in columns])
     if not rows:
         raise CongraspError(f"{path} has no numbers.", remedy)
     table = np.array(rows)

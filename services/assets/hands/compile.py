@@ -8,6 +8,7 @@ import stat
 import tempfile
 import urllib.parse
 import xml.etree.ElementTree as ET
+import xml.parsers.expat
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -46,7 +47,7 @@ _FINITE = (
     "actuator_forcerange",
 )
 _NATIVE = (".stl", ".obj", ".msh")
-_FACES = 200_000  # most triangles of a mesh in MuJoCo
+_FACES = 50_000  # most triangles of a mesh; MuJoCo's limit is 200,000, but two arms must fit into the memory
 _REMEDY = "MuJoCo must be able to load it."
 
 
@@ -111,7 +112,7 @@ def robot_spec(path: pathlib.Path, notes: list[str]) -> tuple[mujoco.MjSpec, muj
         for name in ("body_mass", "body_inertia"):
             if (getattr(model, name) < 0).any():
                 raise ValueError(f"its {name} holds numbers below zero")
-    except (ValueError, OSError, mujoco.FatalError) as error:
+    except (ValueError, OSError, MemoryError, RuntimeError, mujoco.FatalError) as error:
         raise CongraspError(_unread(path, error)) from None
     return spec, model
 
@@ -121,8 +122,15 @@ def _unread(path: pathlib.Path, error: Exception) -> str:
     lines = [line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()]
     reason = re.sub(r"^(?:(?:XML )?Error: )+", "", ", ".join(lines)) or "MuJoCo gives no reason"
     remedy = f" {_REMEDY}" if not isinstance(error, _Known) else ""
-    if "unrecognized attribute" in reason or "unrecognized element" in reason:
+    if "plugin" in reason:
+        remedy = f" Correct the plugin, or delete it and what uses it: MuJoCo {mujoco.__version__} has only its own."
+    elif "unknown default class" in reason:
+        remedy = " If another file includes this one, import that."
+    elif "unrecognized attribute" in reason or "unrecognized element" in reason:
         remedy = f" MuJoCo {mujoco.__version__} has none of that name: delete it."
+    elif re.search("unknown exception|allocate memory|no reason", reason):  # as it words an exception of C++
+        reason = f"MuJoCo gives no reason; its meshes, pictures or height fields may need more than {MEMORY >> 30} GB"
+        remedy = " Cut the hand out of the file, or name meshes of fewer triangles."
     return f"{path} cannot be read: {reason[:400]}.{remedy}"
 
 
@@ -212,7 +220,10 @@ def robot_text(path: pathlib.Path) -> str:
         raise ValueError(f"{path.name} has the unknown encoding '{encoding[:30]}'") from None
     text = re.sub(r"<\?xml.*?\?>", "", text, count=1, flags=re.DOTALL).lstrip("\ufeff \t\r\n")
     while text.startswith(("<!--", "<!DOCTYPE", "<?")):
-        _, _, text = text.partition("-->" if text.startswith("<!--") else ">")
+        before, _, text = text.partition("-->" if text.startswith("<!--") else ">")
+        if before.startswith("<!DOCTYPE") and "[" in before:
+            plain = f"plain_{path.name}"
+            raise _Known(f"{path.name} declares entities. Run 'xmllint --noent {path.name} > {plain}' and name that")
         text = text.lstrip()
     return text
 
@@ -268,10 +279,14 @@ def _left_out(spec: mujoco.MjSpec, file: str) -> bool:
 
 def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     """Returns the model of a URDF file; searches its meshes as ROS does, and converts formats that MuJoCo lacks."""
+    tree, parser = ET.TreeBuilder(), xml.parsers.expat.ParserCreate()  # which, as ROS, declares no prefixes
+    parser.StartElementHandler, parser.EndElementHandler = tree.start, tree.end
+    parser.CharacterDataHandler = tree.data  # MuJoCo counts lines
     try:
-        robot = ET.fromstring(text)
-    except ET.ParseError as error:
+        parser.Parse(text, True)
+    except xml.parsers.expat.ExpatError as error:
         raise ValueError(f"XML Error: {error}") from None
+    robot = tree.close()
     extension = robot.find("mujoco")
     extension = ET.SubElement(robot, "mujoco") if extension is None else extension
     compiler = extension.find("compiler")
@@ -285,21 +300,23 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     if robot.find("link") is not None and all(link.get("name") in children for link in robot.findall("link")):
         raise _Known("its links form a loop, and none is the root. Remove the joint that closes it")
     _check_joints(robot, notes)
-    assets, lacking = dict[str, bytes](), dict[str, None]()
+    assets, shared, lacking = dict[str, bytes](), dict[tuple[pathlib.Path | None, str], str](), dict[str, None]()
     for link in robot.iter("link"):
         for again in link.findall("inertial")[1:]:
             link.remove(again)
         for shape in (*link.findall("visual"), *link.findall("collision")):
             for mesh in shape.iter("mesh"):
                 file = _mesh_file(path, mesh.get("filename", ""))
-                content, kind = _readable(file) if file else (b"", "")
-                if not content:
+                used = file, mesh.get("scale", "")  # MuJoCo shares a mesh among shapes of one name and scale
+                if used not in shared:
+                    content, kind = _readable(file) if file else (b"", "")
+                    shared[used] = f"{len(assets)}.{kind}" if content else ""
+                    assets |= {shared[used]: content} if content else {}
+                if not shared[used]:
                     lacking[mesh.get("filename", "")] = None
                     link.remove(shape)
                     break
-                name = f"{len(assets)}.{kind}"
-                assets[name] = content
-                mesh.set("filename", name)
+                mesh.set("filename", shared[used])
     if lacking:
         notes.append(_missing(list(lacking)))
     return mujoco.MjSpec.from_string(ET.tostring(robot, "unicode"), assets=assets)

@@ -44,6 +44,7 @@ _HEAVY = 5.0  # kg, mass of a link
 _HAND = "hand.json"
 
 
+_NO_HAND = ", which is no hand's."
 _TWICE = "Has a scale such as 0.001 been applied twice? Lengths are in metres."
 _DEGREES = 'Are its limits in degrees? A URDF has radians; an MJCF has degrees, unless <compiler angle="radian"/>.'
 _GRAMS = "Is its mass in grams? Masses are in kg."
@@ -115,9 +116,8 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
         said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"
         notes.append(f"{said}: {', '.join(doubtful)}")
-    sizes: dict[str, float] = {}
-    links, drive = _links(tree, sizes, notes)
-    _check_units(path, links, sizes)
+    links, drive = _links(tree, _points(path, tree), notes)
+    _check_units(path, links)
     if choices.own_collision:
         links = [dataclasses.replace(x, solids=solids_of(tree, i)) for x, i in zip(links, tree.groups, strict=True)]
         if kept := [link.name for link in links if not link.solids]:
@@ -162,34 +162,36 @@ def _check(path: pathlib.Path, hand: Hand, but: str = "") -> None:
             )
 
 
-def _check_units(path: pathlib.Path, links: list[Link], sizes: dict[str, float]) -> None:
-    """Raises a CongraspError for lengths, angles and masses that no hand has, with the unit that they seem to have.
+def _points(path: pathlib.Path, tree: Tree) -> dict[int, list[np.ndarray]]:
+    """Points of each link's geometry, m; raises a CongraspError for a link of a size that no hand has."""
+    points = {x: [p for mesh in placed(tree, x, colliding=True) for p in mesh.vertices] for x in tree.groups}
+    for link, some in points.items():
+        size = float(np.ptp(some, axis=0).max()) if some else _LINK[1]
+        if not _LINK[0] <= size <= _LINK[1]:
+            remedy = _smaller_unit(size) if size > _LINK[1] else _TWICE
+            raise CongraspError(f"{path}: the link '{tree.name(link)}' is {length(size)} long{_NO_HAND}", remedy)
+    return points
 
-    Args:
-      path: the file.
-      links: the links.
-      sizes: sides of those with geometry in the file, m.
-    """
+
+def _check_units(path: pathlib.Path, links: list[Link]) -> None:
+    """Raises a CongraspError for distances, angles and masses that no hand has; the remedy is the likely unit."""
     for link in links:
-        size = sizes.get(link.name, _LINK[1])
         away = max((float(np.linalg.norm(joint.anchor)) for joint in link.joints), default=0.0)
         turn = max(((max(-joint.lower, joint.upper), joint.name) for joint in link.joints), default=(0.0, ""))
         for wrong, what, remedy in (
-            (size > _LINK[1], f"the link '{link.name}' is {length(size)} long", _smaller_unit(size)),
-            (size < _LINK[0], f"the link '{link.name}' is {length(size)} long", _TWICE),
             (away > _FAR, f"the link '{link.name}' turns {length(away)} from the palm", _smaller_unit(away)),
             (turn[0] > _RANGE, f"the joint '{turn[1]}' turns to {turn[0]:.4g} rad", _DEGREES),
             (link.mass > _HEAVY, f"the link '{link.name}' weighs {link.mass:.4g} kg", _GRAMS),
         ):
             if wrong:
-                raise CongraspError(f"{path}: {what}, which is no hand's.", remedy)
+                raise CongraspError(f"{path}: {what}{_NO_HAND}", remedy)
 
 
 def _smaller_unit(size: float) -> str:
     """Remedy for a length of a hand, in what should be m, that is too large."""
     units = [f"{unit} ({length(size * factor)})" for unit, factor in METRES.items() if size * factor < _LINK[1]]
     question = f"Are its lengths in {' or '.join(units)}? " if units else ""
-    return f'{question}Give meshes a scale such as "0.001 0.001 0.001", and offsets in metres.'
+    return f'{question}Give meshes a scale such as "0.001 0.001 0.001", and offsets in metres; or pass another --palm.'
 
 
 def describe(proposal: Proposal) -> list[str]:
@@ -227,21 +229,18 @@ def _text(vector: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.3f}" for x in vector) + ")"
 
 
-def _links(tree: Tree, sizes: dict[str, float], notes: list[str]) -> tuple[list[Link], Drive]:
-    """Returns the links and their drive; sides of their geometry (m) are added to `sizes`, proposals to `notes`."""
+def _links(tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]) -> tuple[list[Link], Drive]:
+    """Returns the links and their drive from points of their geometry (m); proposals are appended to `notes`."""
     at = {x: tree.data.xanchor[tree.joints(x)[0]] if tree.joints(x) else np.zeros(3) for x in tree.groups}
     shapes = {}
     boxed: list[str] = []
     empty: list[str] = []
     for link in tree.groups:
-        points = [p for mesh in placed(tree, link, colliding=True) for p in mesh.vertices]
-        if points:
-            sizes[tree.name(link)] = float(np.ptp(points, axis=0).max())
-        else:
-            points = inertia_boxes(tree, link)
-            (boxed if points else empty).append(tree.name(link))
+        found = points[link] or inertia_boxes(tree, link)
+        if not points[link]:
+            (boxed if found else empty).append(tree.name(link))
         carried = [at[x] for x in tree.groups if x != tree.palm and tree.above(x) == link]
-        shapes[link] = fit_capsules(np.array(points or bare(at[link], *carried)))
+        shapes[link] = fit_capsules(np.array(found or bare(at[link], *carried)))
     tips = {link: far_end(shapes[link], at[link]) for link in tree.ends}
     joints = _joint_names(tree)
     drive = Drive(tree.model, tree.data, joints, _levers(tree, tips))

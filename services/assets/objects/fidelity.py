@@ -302,6 +302,8 @@ def _intervals(found: _Rays, seam: float) -> tuple[np.ndarray, np.ndarray, np.nd
     inside = np.cumsum(found.change[order]) > 0.5
     before = np.r_[False, inside[:-1]]
     entries, exits = np.flatnonzero(inside & ~before), np.flatnonzero(~inside & before)
+    if not len(entries):  # the body is thinner than the rays' distance
+        return entries, exits, entries
     same = (rays[entries[1:]] == rays[exits[:-1]]).all(-1)
     wide = ~same | (place[entries[1:]] - place[exits[:-1]] >= seam)
     closed = np.r_[entries[1:][~wide], exits[:-1][~wide]]

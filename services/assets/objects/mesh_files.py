@@ -38,7 +38,7 @@ _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", 
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _RELATIVE = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t/]-\d")
 _ZERO = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t]0+(?=[/\s]|$)")
-_COMMA = re.compile(rb"(?m)^[ \t]*v[ \t]+-?\d+,\d")
+_COMMA = re.compile(rb"(?mi)^[ \t]*(?:v[ \t]+|vertex[ \t]+)?-?\d+,\d+[ \t]")
 _START = 4096
 _MARK = b"\xef\xbb\xbf"  # of UTF-8
 _FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and products are finite
@@ -117,6 +117,8 @@ def load_geometry(path: pathlib.Path, remedy: str, *, notes: list[str] | None = 
 def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: list[str], **options: Any) -> Any:
     """The geometry of a file with this content; see `load_geometry`."""
     try:
+        if b"\0" not in data[:_START] and _COMMA.search(data):
+            raise ValueError("its numbers have commas for decimal points")
         if kind == "stl":
             found: Any = _stl(data, notes)
         else:
@@ -127,6 +129,8 @@ def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: li
         raise CongraspError(f"{path} {error}") from None
     except Exception as error:  # the readers raise whatever they stumble over
         reason = (str(error) or type(error).__name__).splitlines()[0][:200].rstrip(" .!")
+        if kind == "obj" and isinstance(error, IndexError):
+            reason = "a face refers to a point that is not in the file"
         raise CongraspError(f"{path} cannot be read as {kind.upper()}: {reason}.", remedy) from None
     found.metadata["kind"] = kind
     return found
@@ -269,7 +273,7 @@ def _number(word: bytes) -> float:
     try:
         return float(word)
     except ValueError:
-        raise ValueError(f"'{ascii(word.decode(errors='replace'))[1:31]}' is not a number") from None
+        raise ValueError(f"{ascii(word.decode(errors='replace'))[:30]} is not a number") from None
 
 
 def _binary_stl(data: bytes, notes: list[str]) -> np.ndarray:
@@ -301,15 +305,13 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
     """Text with absolute indices: negative ones count back from the points so far.
 
     Raises:
-      ValueError: an index is 0, or the numbers have decimal commas.
+      ValueError: an index is 0.
     """
     data = data.removeprefix(_MARK)
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
     if _ZERO.search(data):
         raise ValueError("a face has the index 0, but OBJ counts from 1")
-    if _COMMA.search(data):
-        raise ValueError("its numbers have commas for decimal points")
     if not _RELATIVE.search(data):
         return data
     counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
@@ -318,16 +320,19 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
         if words and words[0] in counts:
             counts[words[0]] += 1
         elif words and words[0] == b"f":
-            line = b" ".join([b"f", *(_absolute(word, list(counts.values())) for word in words[1:])])
+            corners = (word.split(b"/") for word in words[1:])
+            line = b" ".join([b"f", *(b"/".join(map(_absolute, corner, counts.values())) for corner in corners)])
         lines.append(line)
     return b"\n".join(lines)
 
 
-def _absolute(corner: bytes, counts: list[int]) -> bytes:
-    """A corner of a face, such as -1//-1, by absolute indices into so many points, texture coordinates and normals."""
-    indices = corner.split(b"/")
-    pairs = zip(indices, counts, strict=False)
-    return b"/".join(b"%d" % (int(index) + 1 + count) if index.startswith(b"-") else index for index, count in pairs)
+def _absolute(index: bytes, count: int) -> bytes:
+    """An index of a face, such as -1, by the absolute index among so many points, texture coordinates or normals."""
+    if not index.startswith(b"-"):
+        return index
+    if int(index) < -count:
+        raise IndexError
+    return b"%d" % (int(index) + 1 + count)
 
 
 def _checked_ply(data: bytes, notes: list[str]) -> bytes:
@@ -338,6 +343,8 @@ def _checked_ply(data: bytes, notes: list[str]) -> bytes:
     is_text, elements = b"ascii" in header, list[tuple[int, int]]()
     for line in header.decode("latin-1").splitlines():
         match line.split():
+            case ["element", "tristrips", _]:
+                raise ValueError("its triangles are strips, which MeshLab opens and exports as faces")
             case ["element", _, count]:
                 elements.append((int(count), 0))
             case ["property", *words]:

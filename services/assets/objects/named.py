@@ -160,7 +160,7 @@ def find_object(text: str, folder: str = "objects") -> GraspObject:
       CongraspError: there is no such object.
     """
     path = pathlib.Path(text)
-    if path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or path.is_dir() or _generated(path):
+    if path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or path.exists() or _generated(path):
         return one_object(path)
     catalogue = store.Catalogue(folder)
     if not catalogue.path(text).is_file():

@@ -102,10 +102,13 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
         size = length(longest * METRES[taken])
         if unit != "guess" or len(fitting) != 1:
             options = [f"{UNIT_NAMES[u]}, add '--unit {u}' ({length(longest * METRES[u])})" for u in fitting]
+            fault = "large" if longest * METRES[taken] > high else "small"
             remedy = f"Set '--scale {0.1 / (max(sides) * METRES[taken]):.3g}' for an object of 10 cm."
             if options:
-                remedy = f"If they are {'; if '.join(options)}; or set --scale."
-            fault = "large" if longest * METRES[taken] > high else "small"
+                where = "options of 'objects import' and 'grasp'"
+                remedy = f"If they are {'; if '.join(options)}; or set --scale ({where})."
+            elif fault == "large":
+                remedy = f"If the file also shows a table or other things, delete them there. {remedy}"
             raise CongraspError(
                 f"{path} is {size} long if its numbers are {UNIT_NAMES[taken]}: too {fault} for a hand.", remedy
             )

@@ -132,6 +132,10 @@ def test_a_description_that_takes_all_time_or_memory_is_refused(tmp_path, monkey
     for read in (import_hand, load_arm):
         with pytest.raises(CongraspError, match=r"a\.xml cannot be read: .* the limits are 2 s and 3 GB"):
             read(tmp_path / "a.xml")
+    large = '<mujoco><asset><hfield name="a" nrow="40000" ncol="40000" size="1 1 1 1"/></asset></mujoco>'
+    (tmp_path / "a.xml").write_text(large)
+    with pytest.raises(CongraspError, match=r"a\.xml cannot be read: .* more than 3 GB\. Cut the hand out"):
+        import_hand(tmp_path / "a.xml")
 
 
 def test_a_pipe_among_the_files_of_a_description_is_not_opened(tmp_path):

@@ -78,7 +78,10 @@ def test_csv_and_npz_give_the_same_path(tmp_path):
     np.savez(tmp_path / "b.npz", wrist_position=POSITION, wrist_quaternion=quaternion)
     rows = np.concatenate([POSITION, quaternion], 1)
     np.savetxt(tmp_path / "c.csv", rows, delimiter=",", header="x,y,z,w,x,y,z", comments="")
-    for name in ("a.npz", "b.npz", "c.csv"):
+    rows = np.c_[T, POSITION, ROTATION.as_quat()]
+    header = "t,pose.x,pose.y,pose.z,orientation.x,orientation.y,orientation.z,orientation.w"
+    np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header=header, comments="")
+    for name in ("a.npz", "b.npz", "c.csv", "d.csv"):
         check(read_wrist_path(tmp_path / name))
 
 

@@ -118,7 +118,6 @@ def test_policies_come_from_the_user_from_trainings_or_from_the_package(policy, 
         (["--quick", "--hands", "allegro", "--policy", "{policy}"], "is of the hand 'human' and the method 'ours'"),
         (["--hands", "human", "--methods", "pd"], "human-ours must be trained first, and this machine has no GPU"),
         (["--quick", "--hands", "paw"], "no hand 'paw'"),
-        (["--out", "{policy}"], "is the file"),
         (["--patience", "0"], "--patience is 0"),
     ],
 )

@@ -78,7 +78,7 @@ def test_caches_travel_with_a_file(machine, tmp_path, monkeypatch):
 
     monkeypatch.setattr(training, "until_first_update", first_update)
     for path in (tmp_path, pathlib.Path()):
-        with pytest.raises(CongraspError, match="is a folder"):
+        with pytest.raises(CongraspError, match="is the folder"):
             warmup.warmup(export=path)
     with pytest.raises(CongraspError, match="given together"):
         warmup.warmup(export=file, source=file)
