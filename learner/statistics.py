@@ -57,7 +57,7 @@ def _episode_sums(messages: Sequence[Message]) -> tuple[dict[str, list[float]], 
         columns = {
             name: np.asarray(values, np.float64).ravel()
             for name, values in message.arrays.items()
-            if name.startswith(_EPISODE)
+            if name.startswith(_EPISODE) and name != "episode/object_index"
         }
         count = max((len(values) for values in columns.values()), default=0)
         episodes += count
