@@ -13,9 +13,12 @@ import contextlib
 import dataclasses
 import fcntl
 import functools
+import hashlib
 import itertools
+import logging
 import pathlib
 import threading
+import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -54,7 +57,9 @@ CONSTRAINTS_PER_ENVIRONMENT = 320
 """Capacity of constraint rows for each environment."""
 
 
+_PATIENCE, _WORD = 300.0, 2.0  # seconds until a process builds what another one builds, and until it says so
 _BLOCK = 256  # Warp's block size of a launch without one; on a CPU all are 1
+_log = logging.getLogger(__name__)
 _building = threading.Lock()
 """Held while one of the `WarpBuffers` lists and builds its kernels; the next then finds those they share."""
 
@@ -157,7 +162,7 @@ class WarpBuffers:
         with _building:
             with stage("list of the kernels"):
                 variants = self._variants()
-            with stage("kernels"), _one_builder(), concurrent.futures.ThreadPoolExecutor(cores()) as threads:
+            with stage("kernels"), _one_builder(variants), concurrent.futures.ThreadPoolExecutor(cores()) as threads:
                 list(threads.map(lambda variant: wp.force_load(self._device, [variant[0]], variant[1]), variants))
 
     def _variants(self) -> list[tuple[wp.Module, int]]:
@@ -220,15 +225,27 @@ class WarpBuffers:
 
 
 @contextlib.contextmanager
-def _one_builder() -> Iterator[None]:
-    """Context that one process of this machine enters first: the others then read from Warp's cache what it built."""
+def _one_builder(variants: Sequence[tuple[wp.Module, int]]) -> Iterator[None]:
+    """Context that one process of this machine enters first: the others then read from Warp's cache what it built.
+
+    They wait for `_PATIENCE` seconds at most, and then build, too.
+    """
+    names = ",".join(sorted(f"{module.name} {size}" for module, size in variants))
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):  # a folder without locks
-            file = stack.enter_context(pathlib.Path(str(wp.config.kernel_cache_dir), "builder").open("a+"))
-            try:
-                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                fcntl.lockf(file, fcntl.LOCK_SH)  # together, once the first is done
+            name = f"builder-{hashlib.sha256(names.encode()).hexdigest()[:16]}"
+            file = stack.enter_context(pathlib.Path(str(wp.config.kernel_cache_dir), name).open("a+"))
+            kind, begun, told = fcntl.LOCK_EX, time.monotonic(), False
+            while (waited := time.monotonic() - begun) < _PATIENCE:
+                try:
+                    fcntl.lockf(file, kind | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    kind = fcntl.LOCK_SH  # together, once the first is done
+                if waited > _WORD and not told:
+                    told = True
+                    _log.info("Waiting for the kernels that another process builds, at most %d s.", _PATIENCE)
+                time.sleep(0.1)
         yield
 
 

@@ -79,7 +79,8 @@ class Evaluate:
     seed: int = 0
     """Seed of constraints and episodes."""
     json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None
-    """Also write the rows to this file. A stopped evaluation resumes from the rows in FILE.parts."""
+    """Also write the rows to this file. A stopped evaluation resumes from the rows in FILE.parts, unless it also draws
+    --pictures."""
     pictures: pathlib.Path | None = None
     """Also draw failures, with their causes, and successes of every constraint into this folder."""
     hand: str = "human"

@@ -9,10 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
+import mujoco
 import numpy as np
 
 import congrasp.actors
 import congrasp.common
+import congrasp.services.evaluate
 from congrasp.actors.initial import InitialConditions
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
@@ -222,7 +224,8 @@ class Experiment:
 
     def digest(self, *about: object) -> str:
         """Returns sixteen hex digits that identify the code, the policy, the settings, and what else is given."""
-        code = [files.source_digest(package) for package in (congrasp.common, congrasp.actors)]
+        packages = (congrasp.common, congrasp.actors, congrasp.services.evaluate)
+        code = (files.source_digest(*packages), jax.__version__, mujoco.__version__)
         settings = (self.task, self.steps, self.episodes, self.worlds, self.physics, self.seed, self.pool)
         return content_hash(repr((code, *settings, self.measured, about)).encode() + encode(self.policy.to_message()))
 

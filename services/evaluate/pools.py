@@ -86,7 +86,7 @@ class Pools(NamedTuple):
     """Objects that are loaded in pools."""
 
     source: str
-    """Description of the objects, for the identity of results."""
+    """Identity of the objects, for that of results."""
     size: int
     """Objects of a pool; the last pools may have one less."""
     make: list[Callable[[], Loaded]]
@@ -108,7 +108,9 @@ def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
 
 def folder_pools(path: pathlib.Path, physics: PhysicsName) -> Pools:
     """The objects of a path, in pools that an engine can take."""
-    return listed_pools(objects_at(path), most_objects(physics))
+    found = objects_at(path)
+    identity = ",".join(f"{one.name} {one.digest()}" for one in found)
+    return listed_pools(found, most_objects(physics))._replace(source=identity)
 
 
 def most_objects(physics: PhysicsName) -> int:

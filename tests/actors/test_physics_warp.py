@@ -177,6 +177,7 @@ def test_kernels_are_listed_without_building_any_and_only_the_broadphase_depends
 def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monkeypatch):
     import warp as wp  # takes seconds in every worker
 
+    from congrasp.actors.physics import warp
     from congrasp.actors.physics.warp import _one_builder
 
     program = "import fcntl, sys; f = open(sys.argv[1], 'w'); fcntl.lockf(f, fcntl.LOCK_EX); print(flush=True); input()"
@@ -184,21 +185,31 @@ def test_processes_do_not_build_the_same_kernels_at_the_same_time(tmp_path, monk
     entered = threading.Event()
 
     def build():
-        with _one_builder():
+        with _one_builder([]):
             entered.set()
 
+    build()
+    entered.clear()
+    (lock,) = tmp_path.iterdir()
     with subprocess.Popen(
-        [sys.executable, "-c", program, str(tmp_path / "builder")], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", program, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:
         other.stdout.readline()
         thread = threading.Thread(target=build)
         thread.start()
         assert not entered.wait(0.5)
-        other.communicate(b"\n", timeout=30.0)
+        other.kill()
         thread.join(30.0)
     assert entered.is_set()
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(lock)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
+        monkeypatch.setattr(warp, "_PATIENCE", 0.1)
+        build()  # after a wait it builds, too
+        other.kill()
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "missing"))
-    with _one_builder():
+    with _one_builder([]):
         pass  # without a folder nothing is shared
 
 

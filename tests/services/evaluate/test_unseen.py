@@ -151,6 +151,7 @@ def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch)
         Catalogue(tmp_path).add(obj)
     pools = folder_pools(tmp_path, "native")
     (tmp_path / f"{sorted(obj.name for obj in OBJECTS)[-1]}.safetensors").write_bytes(b"damaged")
+    assert folder_pools(tmp_path, "native").source != pools.source, "results of other files are not resumed"
     loaded = [make() for make in pools.make]
     assert pools.size == 2 and [len(one.objects) for one in loaded] == [2, 2, 0]
     assert [one.left_out for one in loaded] == [[], [], [sorted(obj.name for obj in OBJECTS)[-1]]]
