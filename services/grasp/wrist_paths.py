@@ -20,7 +20,7 @@ HUGE = 1e9
 """Bound on angles, positions and quaternion components."""
 _ORDERS = {"xyzwxyz": (0, 1, 2, 3, 4, 5, 6), "xyzxyzw": (0, 1, 2, 6, 3, 4, 5)}
 """Last letters of a CSV header's names, and the places of x, y, z and the quaternion w, x, y, z among them."""
-_NO_NAME = re.compile(r"\[[^]]*\]|\([^)]*\)|[\"']")  # units and quotes around the names of a header
+_NO_NAME = re.compile(r"\[[^][]*\]|\([^()]*\)|[\"']")  # units and quotes around the names of a header
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
@@ -197,7 +197,7 @@ def _columns(header: str) -> tuple[list[int], int] | None:
       ValueError: it names several quaternions, or one in another place.
     """
     text = _NO_NAME.sub("", header).lower().strip(" #").rstrip(",; ")
-    names = re.split(r"\s*[,;\t]\s*" if re.search(r"[,;\t]", text) else r"\s+", text)
+    names = [name.strip() for name in re.split(r"[,;\t]" if re.search(r"[,;\t]", text) else r"\s+", text)]
     ends = "".join(name[-1:] or " " for name in names)
     orders = [
         [match.start() + place for place in places]
