@@ -20,6 +20,8 @@ HUGE = 1e9
 """Bound on angles, positions and quaternion components."""
 _ORDERS = {"xyzwxyz": (0, 1, 2, 3, 4, 5, 6), "xyzxyzw": (0, 1, 2, 6, 3, 4, 5)}
 """Last letters of a CSV header's names, and the places of x, y, z and the quaternion w, x, y, z among them."""
+_NO_NAME = re.compile(r"\[[^][]*\]|\([^()]*\)|[\"']")  # units and quotes around the names of a header
+_NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
     f"{sign}{axis}": s * row for axis, row in zip("xyz", np.eye(3), strict=True) for sign, s in (("+", 1), ("-", -1))
@@ -154,11 +156,12 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
 def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines.
 
-    A header whose names end in these letters may put w last, as ROS does, and have other columns: t, x, y, z, qx, qy,
-    qz, qw.
+    A header, also in a comment, whose names end in these letters may put w last, as ROS does, and have other columns:
+    t, x, y, z, qx, qy, qz, qw.
 
     Raises:
-      CongraspError: the file has more than `largest` bytes or cannot be read, or a line is not seven finite numbers.
+      CongraspError: the file has more than `largest` bytes or cannot be read, a line is not seven finite numbers, or a
+        header names a quaternion in another place, or several.
     """
     columns, width = list(range(7)), 7
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
@@ -168,12 +171,15 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         raise CongraspError(f"{path} is not text.", remedy) from None
     rows: list[list[float]] = []
     for number, line in enumerate(lines, 1):
-        words = re.sub(r"[,;]", " ", line.partition("#")[0]).split()
+        text, _, comment = line.partition("#")
+        words = re.sub(r"[,;\"]", " ", text).split()
         if not words or (not rows and not any(map(_is_number, words))):
-            ends = "".join(word[-1] for word in words).lower()
-            for order, places in _ORDERS.items():
-                if (first := ends.find(order)) >= 0:
-                    columns, width = [first + place for place in places], len(words)
+            try:
+                columns, width = (not rows and _columns(text.strip() or comment)) or (columns, width)
+            except ValueError as error:
+                raise CongraspError(
+                    f"line {number} of {path} {error}.", f"{remedy} A header may put qw last."
+                ) from None
             continue
         if len(words) != width or not all(_is_number(words[column]) for column in columns):
             raise CongraspError(f"line {number} of {path} is not {width} finite numbers.", remedy)
@@ -182,6 +188,28 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         raise CongraspError(f"{path} has no numbers.", remedy)
     table = np.array(rows)
     return table[:, :3], table[:, 3:]
+
+
+def _columns(header: str) -> tuple[list[int], int] | None:
+    """Places of x, y, z and the quaternion w, x, y, z in a header, and the number of its columns; None for other text.
+
+    Raises:
+      ValueError: it names several quaternions, or one in another place.
+    """
+    text = _NO_NAME.sub("", header).lower().strip(" #").rstrip(",; ")
+    names = [name.strip() for name in re.split(r"[,;\t]" if re.search(r"[,;\t]", text) else r"\s+", text)]
+    ends = "".join(name[-1:] or " " for name in names)
+    orders = [
+        [match.start() + place for place in places]
+        for order, places in _ORDERS.items()
+        for match in re.finditer(f"(?={order})", ends)
+    ]
+    found = [columns for columns in orders if len({names[column][:-1] for column in columns[3:]}) == 1]
+    if len(found) == 1:
+        return found[0], len(names)
+    if set("wxyz") <= set(ends) or len(_NUMBERED.findall(text)) > 3:
+        raise ValueError(f"names {'several quaternions' if found else 'no position and quaternion in a known order'}")
+    return None
 
 
 def _is_number(word: str) -> bool:

@@ -75,9 +75,13 @@ def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, qui
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     obj = find_object("mug:7")
     path = Catalogue(tmp_path).add(obj)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mug_7").write_text("a file of that name")
     assert digest(find_object(str(path))) == digest(find_object("mug_7", str(tmp_path))) == digest(obj)
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "block.stl")
     assert find_object(str(tmp_path / "block.stl")).name == "block"
+    with pytest.raises(CongraspError, match="mug_7 is not an STL"):
+        find_object(str(tmp_path / "mug_7"), str(tmp_path))
     with pytest.raises(CongraspError, match="no object 'mug_8'"):
         find_object("mug_8", str(tmp_path))
     with pytest.raises(CongraspError, match="no object family 'cat'"):

@@ -40,6 +40,7 @@ _NAMED = re.compile(r"""<(\w+)[^<>]*?\bfile\w*\s*=\s*["']([^"']+)["']""")
 _FOLDERS = re.compile(r"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']+)["']""")
 _CLASSES = re.compile(r"""<default\b[^<>]*?\bclass\s*=\s*["']([^"']+)["']""")
 _OPENING = re.compile(r"opening file '([^']*)'")
+_PROLOG = re.compile(r"<!--.*?(?:-->|\Z)|<\?.*?(?:\?>|\Z)|<!ENTITY|<(?!!)", re.DOTALL)  # up to the root element
 _XACRO = re.compile(r"<xacro:|\$\{|\$\((?:find|arg|eval)\b")
 _FINITE = (
     *("body_pos", "body_quat", "body_mass", "body_inertia", "jnt_pos", "jnt_axis", "jnt_range", "geom_pos"),
@@ -48,6 +49,7 @@ _FINITE = (
 )
 _NATIVE = (".stl", ".obj", ".msh")
 _FACES = 50_000  # most triangles of a mesh; MuJoCo's limit is 200,000, but two arms must fit into the memory
+_FEWER_FACES = 20_000  # of a mesh with more than that
 _REMEDY = "MuJoCo must be able to load it."
 
 
@@ -121,8 +123,10 @@ def _unread(path: pathlib.Path, error: Exception) -> str:
     """One line about an error of reading; MuJoCo's begins with its kind, and names the element in the second line."""
     lines = [line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()]
     reason = re.sub(r"^(?:(?:XML )?Error: )+", "", ", ".join(lines)) or "MuJoCo gives no reason"
-    remedy = f" {_REMEDY}" if not isinstance(error, _Known) else ""
-    if "plugin" in reason:
+    remedy = f" {_REMEDY}"
+    if isinstance(error, _Known):
+        remedy = ""
+    elif re.search("plugin (?:.+ not found|instance)|'plugin' nor", reason):
         remedy = f" Correct the plugin, or delete it and what uses it: MuJoCo {mujoco.__version__} has only its own."
     elif "unknown default class" in reason:
         remedy = " If another file includes this one, import that."
@@ -218,14 +222,13 @@ def robot_text(path: pathlib.Path) -> str:
         text = data.decode("utf-8-sig" if encoding.lower() in ("utf-8", "utf8") else encoding, errors="replace")
     except LookupError:
         raise ValueError(f"{path.name} has the unknown encoding '{encoding[:30]}'") from None
-    text = re.sub(r"<\?xml.*?\?>", "", text, count=1, flags=re.DOTALL).lstrip("\ufeff \t\r\n")
-    while text.startswith(("<!--", "<!DOCTYPE", "<?")):
-        before, _, text = text.partition("-->" if text.startswith("<!--") else ">")
-        if before.startswith("<!DOCTYPE") and "[" in before:
-            plain = f"plain_{path.name}"
-            raise _Known(f"{path.name} declares entities. Run 'xmllint --noent {path.name} > {plain}' and name that")
-        text = text.lstrip()
-    return text
+    for mark in _PROLOG.finditer(text):
+        if mark[0] == "<":
+            return text[mark.start() :]
+        if mark[0] == "<!ENTITY":
+            command = f"xmllint --noent --dropdtd {path.name} > plain_{path.name}"
+            raise _Known(f"{path.name} declares entities. Run '{command}' and name that")
+    return ""
 
 
 def _repeated_classes(texts: list[str], error: str) -> str:
@@ -391,7 +394,7 @@ def _readable(file: pathlib.Path) -> tuple[bytes, str]:
             # COLLADA states its unit. Its upward axis is ignored, as in ROS.
             mesh = (scene.convert_units("meters") if suffix == ".dae" else scene).to_mesh()
         if len(mesh.faces) > _FACES:
-            mesh = mesh.simplify_quadric_decimation(face_count=_FACES // 10)
+            mesh = mesh.simplify_quadric_decimation(face_count=_FEWER_FACES)
         return trimesh.exchange.stl.export_stl(mesh), "stl"
     except Exception:  # readers of many formats raise arbitrary errors
         return b"", ""

@@ -4,7 +4,8 @@ Both bodies are cut by parallel rays along each axis, the same for both. A ray i
 triangles around it is above zero: bodies may overlap, walls inside of others do not count, and neither does a gap along
 a ray that is narrower than `_SEAM`. The rays' interior length gives the volume; their entries and exits give the outer
 surface. The inside of a cup is outside. Only the part of the surface that a ball of radius `REACH` can touch from
-outside counts: no finger reaches into a crack, or into a void between pieces.
+outside counts: no finger reaches into a crack, or into a void between pieces. A body that every ray misses is thinner
+than their distance: its volume is exact, and its surface is sampled.
 """
 
 from collections.abc import Iterator
@@ -67,8 +68,9 @@ def fidelity(mesh: np.ndarray, pieces: list[np.ndarray], closed: bool) -> Fideli
     if closed:
         wanted, wanted_surface = _cut(mesh, low, spacing)
     else:
-        points, normals, _ = shapes.on_triangles(mesh, _random().random((2 * POINTS, 3)))
-        wanted, wanted_surface = 0.0, _Surface(points, normals, *np.ones((2, len(points)), bool))
+        wanted, wanted_surface = 0.0, _sampled(mesh)
+    if closed and not (volume and wanted):
+        volume, wanted = (float(mass_properties(triangles)["volume"]) for triangles in (union, mesh))
     distance = max(_farthest(surface, wanted_surface), _farthest(wanted_surface, surface))
     return Fidelity(volume / wanted - 1 if closed else None, distance)
 
@@ -80,6 +82,12 @@ class _Surface(NamedTuple):
     normals: np.ndarray
     outer: np.ndarray
     reached: np.ndarray
+
+
+def _sampled(triangles: np.ndarray) -> _Surface:
+    """Random points of triangles (F, 3, 3)."""
+    points, normals, _ = shapes.on_triangles(triangles, _random().random((2 * POINTS, 3)))
+    return _Surface(points, normals, *np.ones((2, len(points)), bool))
 
 
 def _random() -> np.random.Generator:
@@ -141,6 +149,8 @@ def interior(triangles: np.ndarray, count: int) -> np.ndarray:
     low, spacing = _grid(triangles)
     spans = [(found.points, *_intervals(found, _SEAM / spacing)) for found in _rays(triangles, low, spacing)]
     start, end = (np.concatenate([span[0][span[side]] for span in spans]) for side in (1, 2))
+    if not len(start):
+        return shapes.on_triangles(triangles, _random().random((count, 3)))[0]
     along = np.cumsum(np.linalg.norm(end - start, axis=-1))
     wanted = (np.arange(count) + 0.5) / count * along[-1]
     chosen = np.searchsorted(along, wanted)
@@ -187,7 +197,10 @@ def voxels(triangles: np.ndarray, margin: float, count: int = 128) -> Voxels:
         np.add.at(steps, (*rows, start), 1)
         np.add.at(steps, (*rows, np.maximum(end, start + 1)), -1)
         inside |= np.moveaxis(np.cumsum(steps, -1, dtype=np.int8) > 0, [0, 1, 2], order)
-    return Voxels(inside, low - _OFF_GRID * spacing, spacing)
+    cubes = Voxels(inside, low - _OFF_GRID * spacing, spacing)
+    if not inside.any():
+        inside[cubes.at(_sampled(triangles).points)] = True
+    return cubes
 
 
 class Enclosed(NamedTuple):
@@ -253,6 +266,8 @@ def _cut(triangles: np.ndarray, low: np.ndarray, spacing: float) -> tuple[float,
         ends = np.concatenate([entries, exits, closed])
         surfaces.append((found.points[ends], found.normals[ends], np.arange(len(ends)) < 2 * len(entries)))
     points, normals, outer = map(np.concatenate, zip(*surfaces, strict=True))
+    if not len(points):
+        return 0.0, _sampled(triangles)
     cubes = voxels(triangles, 2 * REACH, min(_RAYS, int(np.ptp(triangles, axis=(0, 1)).max() / (_FINE * REACH)) + 1))
     spaces, _ = label(distance_transform_edt(~cubes.inside, cubes.spacing) > _TOUCHES * REACH)
     free = binary_dilation(spaces == spaces[0, 0, 0], iterations=2, mask=~cubes.inside)
@@ -302,7 +317,7 @@ def _intervals(found: _Rays, seam: float) -> tuple[np.ndarray, np.ndarray, np.nd
     inside = np.cumsum(found.change[order]) > 0.5
     before = np.r_[False, inside[:-1]]
     entries, exits = np.flatnonzero(inside & ~before), np.flatnonzero(~inside & before)
-    if not len(entries):  # the body is thinner than the rays' distance
+    if not len(entries):  # the rays miss the body
         return entries, exits, entries
     same = (rays[entries[1:]] == rays[exits[:-1]]).all(-1)
     wide = ~same | (place[entries[1:]] - place[exits[:-1]] >= seam)

@@ -38,7 +38,11 @@ _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", 
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 _RELATIVE = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t/]-\d")
 _ZERO = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t]0+(?=[/\s]|$)")
-_COMMA = re.compile(rb"(?mi)^[ \t]*(?:v[ \t]+|vertex[ \t]+)?-?\d+,\d+[ \t]")
+_COMMA = re.compile(rb"(?mi)^[ \t]*(v[ \t]+|vertex[ \t]+)?[-+]?\d+,\d+(?:e[-+]?\d+)?[ \t]")
+_POINT = re.compile(rb"(?m)^[ \t]*v[ \t]")
+_FACE = re.compile(rb"(?m)^[ \t]*f[ \t][^\n#]*")
+_INDEX = re.compile(rb"[ \t](\d{1,18})")
+_NO_POINT = "a face refers to a point that is not in the file"
 _START = 4096
 _MARK = b"\xef\xbb\xbf"  # of UTF-8
 _FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and products are finite
@@ -117,7 +121,7 @@ def load_geometry(path: pathlib.Path, remedy: str, *, notes: list[str] | None = 
 def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: list[str], **options: Any) -> Any:
     """The geometry of a file with this content; see `load_geometry`."""
     try:
-        if b"\0" not in data[:_START] and _COMMA.search(data):
+        if b"\0" not in data[:_START] and any(kind == "ply" or row[1] for row in _COMMA.finditer(data)):
             raise ValueError("its numbers have commas for decimal points")
         if kind == "stl":
             found: Any = _stl(data, notes)
@@ -129,8 +133,8 @@ def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: li
         raise CongraspError(f"{path} {error}") from None
     except Exception as error:  # the readers raise whatever they stumble over
         reason = (str(error) or type(error).__name__).splitlines()[0][:200].rstrip(" .!")
-        if kind == "obj" and isinstance(error, IndexError):
-            reason = "a face refers to a point that is not in the file"
+        if kind == "obj" and isinstance(error, IndexError) and _lacks_points(data.replace(b"\r", b"\n")):
+            reason = _NO_POINT
         raise CongraspError(f"{path} cannot be read as {kind.upper()}: {reason}.", remedy) from None
     found.metadata["kind"] = kind
     return found
@@ -305,7 +309,7 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
     """Text with absolute indices: negative ones count back from the points so far.
 
     Raises:
-      ValueError: an index is 0.
+      ValueError: a face has the index 0, or counts back to before the first point.
     """
     data = data.removeprefix(_MARK)
     if b"\n" not in data:
@@ -320,19 +324,25 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
         if words and words[0] in counts:
             counts[words[0]] += 1
         elif words and words[0] == b"f":
-            corners = (word.split(b"/") for word in words[1:])
-            line = b" ".join([b"f", *(b"/".join(map(_absolute, corner, counts.values())) for corner in corners)])
+            corners = [list(map(_absolute, word.split(b"/"), counts.values())) for word in words[1:]]
+            if not all(corner[0] for corner in corners):
+                raise ValueError(_NO_POINT)
+            line = b" ".join([b"f", *map(b"/".join, corners)])
         lines.append(line)
     return b"\n".join(lines)
 
 
 def _absolute(index: bytes, count: int) -> bytes:
-    """An index of a face, such as -1, by the absolute index among so many points, texture coordinates or normals."""
+    """The absolute index for one such as -1, among so many points or coordinates so far; empty if there is none."""
     if not index.startswith(b"-"):
         return index
-    if int(index) < -count:
-        raise IndexError
-    return b"%d" % (int(index) + 1 + count)
+    return b"%d" % (int(index) + 1 + count) if int(index) >= -count else b""
+
+
+def _lacks_points(data: bytes) -> bool:
+    """True if a face of an OBJ refers to a point after the last."""
+    points = len(_POINT.findall(data))
+    return any(int(index) > points for face in _FACE.findall(data) for index in _INDEX.findall(face))
 
 
 def _checked_ply(data: bytes, notes: list[str]) -> bytes:
@@ -343,7 +353,7 @@ def _checked_ply(data: bytes, notes: list[str]) -> bytes:
     is_text, elements = b"ascii" in header, list[tuple[int, int]]()
     for line in header.decode("latin-1").splitlines():
         match line.split():
-            case ["element", "tristrips", _]:
+            case ["element", "tristrips", count] if int(count):
                 raise ValueError("its triangles are strips, which MeshLab opens and exports as faces")
             case ["element", _, count]:
                 elements.append((int(count), 0))

@@ -154,13 +154,15 @@ def one_object(path: pathlib.Path, options: ImportOptions = _METRES_OR_ASK) -> G
 
 
 def find_object(text: str, folder: str = "objects") -> GraspObject:
-    """The object that a user means: an object file, a mesh, FAMILY:SEED, or a name in a folder.
+    """The object that a user means: an object file, a mesh, FAMILY:SEED, or a name in a folder, before any other path.
 
     Raises:
       CongraspError: there is no such object.
     """
     path = pathlib.Path(text)
-    if path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or path.exists() or _generated(path):
+    stored = path.name == text and (pathlib.Path(folder) / f"{text}{store.SUFFIX}").is_file()
+    is_path = path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or (path.exists() and not stored)
+    if is_path or _generated(path):
         return one_object(path)
     catalogue = store.Catalogue(folder)
     if not catalogue.path(text).is_file():

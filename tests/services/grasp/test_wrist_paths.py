@@ -85,6 +85,46 @@ def test_csv_and_npz_give_the_same_path(tmp_path):
         check(read_wrist_path(tmp_path / name))
 
 
+ROS = "x,y,z,qx,qy,qz,qw"
+
+
+@pytest.mark.parametrize(
+    ("header", "order", "separator"),
+    [
+        ("# " + ROS, "pq", ","),
+        ("# ground truth of a wrist\n# timestamp tx ty tz qx qy qz qw", "tpq", " "),
+        ('"time","Pos X","Pos Y","Pos Z","Quat X","Quat Y","Quat Z","Quat W"', "tpq", ","),
+        ("Pos X;Pos Y;Pos Z;Quat X;Quat Y;Quat Z;Quat W;", "pq", ";"),
+        ("x [m] y [m] z [m] qx qy qz qw", "pq", " "),
+        ("t\tx (m)\ty (m)\tz (m)\tqx\tqy\tqz\tqw", "tpq", "\t"),
+        (f",{ROS}", "tpq", ","),
+        (ROS + ",vx,vy,vz", "pqp", ","),
+        ("a title of the file\n" + ROS, "pq", ","),
+    ],
+)
+def test_a_header_places_the_columns(tmp_path, header, order, separator):
+    parts = {"t": T[:, None], "p": POSITION, "q": ROTATION.as_quat()}
+    rows = np.concatenate([parts[part] for part in order], 1)
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=separator, header=header, comments="")
+    check(read_wrist_path(tmp_path / "a.csv"))
+
+
+@pytest.mark.parametrize(
+    ("header", "complaint"),
+    [
+        ("qx,qy,qz,qw,x,y,z", "no position and quaternion in a known order"),
+        ("x,y,z,q1,q2,q3,q4", "no position and quaternion in a known order"),
+        ("x,y,z,roll,pitch,yaw,grip", "no position and quaternion in a known order"),
+        ("lx,ly,lz,lqw,lqx,lqy,lqz,rx,ry,rz,rqw,rqx,rqy,rqz", "several quaternions"),
+        ("# lx ly lz lqx lqy lqz lqw rx ry rz rqx rqy rqz rqw", "several quaternions"),
+    ],
+)
+def test_a_header_in_no_known_order_is_refused(tmp_path, header, complaint):
+    (tmp_path / "a.csv").write_text(f"{header}\n0,0,0,1,0,0,0\n")
+    with pytest.raises(CongraspError, match=rf"line 1 of .*a\.csv names {complaint}\. Write x, y, z, qw"):
+        read_wrist_path(tmp_path / "a.csv")
+
+
 def test_another_wrist_frame_is_converted(tmp_path):
     # Fingers towards +x and the back of the hand +y: the thumb of a right hand then points to -z.
     own = Rotation.from_matrix(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.services.assets.objects.fidelity import fidelity
+from congrasp.services.assets.objects.fidelity import fidelity, interior, voxels
 
 SIDES = np.array([0.04, 0.06, 0.08])
 
@@ -80,6 +80,20 @@ def test_the_inside_of_a_cup_is_outside():
     errors = compared(cup, [outer])
     np.testing.assert_allclose(errors.volume, 0.03**2 / (0.03**2 - 0.026**2) - 1, rtol=0.03)
     assert errors.surface > 0.02
+
+
+def test_wires_between_the_rays_have_exact_volumes():
+    wires = [block((3e-4, 3e-4, 0.25)), block((3e-4, 0.25, 3e-4), (0, 0.12515, 0.12485))]
+    mesh = trimesh.util.concatenate(wires)
+    errors = compared(mesh, wires)
+    np.testing.assert_allclose(errors.volume, 0, atol=1e-6)
+    assert errors.surface < 5e-4
+    errors = compared(mesh, wires[:1])
+    np.testing.assert_allclose(errors.volume, -0.5, atol=1e-6)
+    np.testing.assert_allclose(errors.surface, 0.25, atol=1e-3)
+    points = interior(np.asarray(mesh.triangles), 1000)
+    np.testing.assert_allclose(np.ptp(points, axis=0), np.ptp(mesh.vertices, axis=0), rtol=0.05, atol=1e-4)
+    assert voxels(np.asarray(mesh.triangles), 0.01).inside.sum() >= 2 * 127
 
 
 def test_an_open_mesh_has_no_volume_to_compare_with():
