@@ -222,12 +222,17 @@ class Experiment:
             raise errors[0]
         return allowed, errors
 
-    def digest(self, *about: object) -> str:
-        """Returns sixteen hex digits that identify the code, the policy, the settings, and what else is given."""
+    @functools.cached_property
+    def _identity(self) -> tuple[object, ...]:
+        """Code, policy and settings."""
         packages = (congrasp.common, congrasp.actors, congrasp.services.evaluate)
         code = (files.source_digest(*packages), jax.__version__, mujoco.__version__)
         settings = (self.task, self.steps, self.episodes, self.worlds, self.physics, self.seed, self.pool)
-        return content_hash(repr((code, *settings, self.measured, about)).encode() + encode(self.policy.to_message()))
+        return (*code, *settings, self.measured, content_hash(encode(self.policy.to_message())))
+
+    def digest(self, *about: object) -> str:
+        """Returns sixteen hex digits that identify the code, the policy, the settings, and what else is given."""
+        return content_hash(repr((*self._identity, *about)).encode())
 
     def run(
         self, variations: Sequence[Variation], *, keep: bool = False, stored: pathlib.Path | None = None
@@ -261,7 +266,12 @@ class Experiment:
     def _name(self, variation: Variation) -> str:
         """File name of a row, from everything that it depends on."""
         bank = hashlib.sha256(b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(variation.bank(self))))
-        return self.digest(variation, bank.hexdigest(), [store.digest(obj) for obj in self.objects])
+        return self.digest(variation, bank.hexdigest(), self._contents)
+
+    @functools.cached_property
+    def _contents(self) -> list[str]:
+        """Digests of the objects."""
+        return [store.digest(obj) for obj in self.objects]
 
     def simulator(self, task: TaskConfig | None = None, *, traced: bool = False) -> Episodes:
         """Returns a simulator of the objects, by default of the experiment's task; its batch depends on `episodes`."""

@@ -110,7 +110,7 @@ def folder_pools(path: pathlib.Path, physics: PhysicsName) -> Pools:
     """The objects of a path, in pools that an engine can take."""
     found = objects_at(path)
     identity = ",".join(f"{one.name} {one.digest()}" for one in found)
-    return listed_pools(found, most_objects(physics))._replace(source=identity)
+    return listed_pools(found, most_objects(physics), source=identity)
 
 
 def most_objects(physics: PhysicsName) -> int:
@@ -118,7 +118,7 @@ def most_objects(physics: PhysicsName) -> int:
     return min(_MOST[ENGINES[physics].on_device], _MESHES)
 
 
-def listed_pools(found: Sequence[ObjectAt], most: int, options: ImportOptions = _UNCHANGED) -> Pools:
+def listed_pools(found: Sequence[ObjectAt], most: int, options: ImportOptions = _UNCHANGED, source: str = "") -> Pools:
     """Objects of different names in pools of at most `most`; meshes are imported when their turn comes, and those that
     cannot be are left out."""
     number, size = _divided(len(found), most)
@@ -135,7 +135,7 @@ def listed_pools(found: Sequence[ObjectAt], most: int, options: ImportOptions = 
         return Loaded([dataclasses.replace(obj, name=n) for obj, n in zip(objects, names, strict=True)], left_out)
 
     parts = [[found[i] for i in part] for part in np.array_split(np.arange(len(found)), number)]
-    return Pools(",".join(one.name for one in found), size, [functools.partial(make, part) for part in parts])
+    return Pools(source, size, [functools.partial(make, part) for part in parts])
 
 
 def _divided(count: int, most: int) -> tuple[int, int]:
