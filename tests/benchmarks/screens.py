@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from tests.services.studio.conftest import SIZE, chromium
-from tests.services.studio.test_page import drag, handle, on_object
+from tests.services.studio.test_page import drag, on_object, picture
 
 _PHONE = {"width": 390, "height": 844}
 _HELD = 6
@@ -76,7 +76,7 @@ def _studio(page: Any, out: pathlib.Path) -> None:
     drag(page, [(x - 30, y - 60), (x - 25, y - 20), (x - 15, y + 10)])
     page.wait_for_selector("[data-mask=affordance]")
     page.mouse.move(x + 25, y - 30)
-    handle(page, "tail")  # once everything is drawn
+    picture(page)  # once everything is drawn
     page.screenshot(path=out / "studio.png")
     page.click("#clear-paint")
     page.uncheck("[data-ask=pose]")
@@ -99,11 +99,7 @@ def _grasped(page: Any) -> str:
     for _ in range(_HELD):
         before = {item.get_attribute("data-motion") for item in page.locator("[data-motion]").all()}
         page.click("#grasp")
-        page.wait_for_function(
-            "(count) => document.querySelectorAll('[data-motion][data-shown]').length && "
-            "document.querySelectorAll('[data-motion]').length > count",
-            arg=len(before),
-        )
+        page.wait_for_function("(n) => document.querySelectorAll('[data-motion]').length > n", arg=len(before))
         (made,) = {item.get_attribute("data-motion") for item in page.locator("[data-motion]").all()} - before
         page.wait_for_selector(f"[data-motion='{made}'][data-shown]")
         if "not held" not in page.inner_text("#result") and "held" in page.inner_text("#result"):
@@ -118,8 +114,7 @@ def _stopped(page: Any, share: float) -> None:
     page.select_option("#speed", "1")
     page.wait_for_selector("#play:has-text('Play')")
     page.locator("#scrub").fill(str(round(share * float(page.get_attribute("#scrub", "max")))))
-    page.wait_for_selector("body:not([data-busy])")
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    picture(page)  # once everything is drawn
 
 
 def _training(page: Any, out: pathlib.Path) -> None:
