@@ -62,7 +62,7 @@ class Generate:
         from congrasp.common.objects.procedural import generate_many
         from congrasp.common.task.config import TaskConfig
         from congrasp.common.task.sampling.sets import make_sets, save
-        from congrasp.services.assets.objects.named import find_object, objects_of
+        from congrasp.services.assets.objects.named import located, objects_of
         from congrasp.services.cli.console import tracked
 
         if not self.objects and self.count < 1:
@@ -72,8 +72,7 @@ class Generate:
             track("Preparing objects", None)
             found: list[GraspObject] = []
             for text in self.objects:
-                path = pathlib.Path(text)
-                found += objects_of(path) if path.exists() else [find_object(text, self.folder)]
+                found += objects_of(located(text, self.folder))
             found += generate_many(self.count, self.first_seed, self.families)
             for obj, name in zip(found, distinct_names(obj.name for obj in found), strict=True):
                 if obj.name != name:

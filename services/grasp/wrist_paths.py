@@ -13,14 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file, read_npz
+from congrasp.services.assets.objects.options import METRES
 
 _LARGEST, _DEEPEST = 32 << 20, 200
 """Bytes of a BVH or CSV file, and joints of a BVH chain."""
 HUGE = 1e9
 """Bound on angles, positions and quaternion components."""
-_ORDERS = {"xyzwxyz": (0, 1, 2, 3, 4, 5, 6), "xyzxyzw": (0, 1, 2, 6, 3, 4, 5)}
-"""Last letters of a CSV header's names, and the places of x, y, z and the quaternion w, x, y, z among them."""
-_NO_NAME = re.compile(r"\[[^][]*\]|\([^()]*\)|[\"']")  # units and quotes around the names of a header
+_UNIT = re.compile(r"\s*[\[(]\s*([^])]*?)\s*[])]")
+_LETTERED = re.compile(r"(.*?)[\W_]*([wxyz])(?:\[(.*)\]|_(m|mm|cm|in))?")  # name, letter and unit of a column
+_PLACE = re.compile(r"(?:.*[\W_])?[ptc]?|.*(?:pose?|position|trans|translation|location)")
+_NO_PLACE = re.compile(r"(?:.*[\W_])?[vawfnre]|.*(?:vel|speed|acc|linear|ang|gyro|force|tor|rot|euler|normal).*")
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
@@ -156,14 +158,14 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
 def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines.
 
-    A header, also in a comment, whose names end in these letters may put w last, as ROS does, and have other columns:
-    t, x, y, z, qx, qy, qz, qw.
+    A header, also in a comment, may name them in any order and among other columns, such as t, qx, qy, qz, qw, vx, vy,
+    vz, px, py, pz, and positions in mm or cm: "x [mm]".
 
     Raises:
       CongraspError: the file has more than `largest` bytes or cannot be read, a line is not seven finite numbers, or a
-        header names a quaternion in another place, or several.
+        header names no position or quaternion, or several.
     """
-    columns, width = list(range(7)), 7
+    columns, width, metres = list(range(7)), 7, 1.0
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
@@ -175,11 +177,9 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         words = re.sub(r"[,;\"]", " ", text).split()
         if not words or (not rows and not any(map(_is_number, words))):
             try:
-                columns, width = (not rows and _columns(text.strip() or comment)) or (columns, width)
+                columns, width, metres = (not rows and _columns(text.strip() or comment)) or (columns, width, metres)
             except ValueError as error:
-                raise CongraspError(
-                    f"line {number} of {path} {error}.", f"{remedy} A header may put qw last."
-                ) from None
+                raise CongraspError(f"line {number} of {path} {error}.", "Name them x, y, z, qw, qx, qy, qz.") from None
             continue
         if len(words) != width or not all(_is_number(words[column]) for column in columns):
             raise CongraspError(f"line {number} of {path} is not {width} finite numbers.", remedy)
@@ -187,29 +187,44 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     if not rows:
         raise CongraspError(f"{path} has no numbers.", remedy)
     table = np.array(rows)
-    return table[:, :3], table[:, 3:]
+    return metres * table[:, :3], table[:, 3:]
 
 
-def _columns(header: str) -> tuple[list[int], int] | None:
-    """Places of x, y, z and the quaternion w, x, y, z in a header, and the number of its columns; None for other text.
+def _columns(header: str) -> tuple[list[int], int, float] | None:
+    """Places of x, y, z and the quaternion w, x, y, z in a header, the number of its columns, and metres per unit.
+
+    Columns of one name before their letters belong together: with w they are a quaternion. None for other text.
 
     Raises:
-      ValueError: it names several quaternions, or one in another place.
+      ValueError: it names no position or no quaternion, or several.
     """
-    text = _NO_NAME.sub("", header).lower().strip(" #").rstrip(",; ")
+    text = _UNIT.sub(r"[\1]", re.sub("[\"']", "", header).lower()).strip(" #").rstrip(",; ")
     names = [name.strip() for name in re.split(r"[,;\t]" if re.search(r"[,;\t]", text) else r"\s+", text)]
-    ends = "".join(name[-1:] or " " for name in names)
-    orders = [
-        [match.start() + place for place in places]
-        for order, places in _ORDERS.items()
-        for match in re.finditer(f"(?={order})", ends)
-    ]
-    found = [columns for columns in orders if len({names[column][:-1] for column in columns[3:]}) == 1]
-    if len(found) == 1:
-        return found[0], len(names)
-    if set("wxyz") <= set(ends) or len(_NUMBERED.findall(text)) > 3:
-        raise ValueError(f"names {'several quaternions' if found else 'no position and quaternion in a known order'}")
-    return None
+    groups: dict[str, list[dict[str, tuple[int, str]]]] = {}
+    for place, lettered in enumerate(map(_LETTERED.fullmatch, names)):
+        if lettered:
+            name, letter, *units = lettered.groups()
+            some = groups.setdefault(name, [{}])
+            if letter in some[-1] or (letter == "w" and not name and len(some) == 1 and len(some[0]) == 3):
+                some.append({})  # of columns x, y, z, w, x, y, z
+            some[-1][letter] = (place, units[0] or units[1] or "m")
+    whole = [(name, group) for name, some in groups.items() for group in some]
+    turns = [(name, group) for name, group in whole if group.keys() == set("wxyz")]
+    vectors = [(name, group) for name, group in whole if group.keys() == set("xyz")]
+    if not (vectors or turns or len(_NUMBERED.findall(text)) > 3):
+        return None
+    places = [one for one in vectors if _PLACE.fullmatch(one[0])]
+    places = places or [one for one in vectors if not _NO_PLACE.fullmatch(one[0])]
+    for what, some in (("position", places), ("quaternion", turns)):
+        if len(some) != 1:
+            several = f"several {what}s: {', '.join(name or 'x, y, z' for name, _ in some)}"
+            raise ValueError(f"names {several if some else f'no {what}'}")
+    (_, place), (_, turn) = places[0], turns[0]
+    units = {place[letter][1] for letter in "xyz"}
+    if not (len(units) == 1 and units <= METRES.keys()):
+        raise ValueError(f"names positions in {' and '.join(sorted(units))}, not all in one of {', '.join(METRES)}")
+    columns = [place[letter][0] for letter in "xyz"] + [turn[letter][0] for letter in "wxyz"]
+    return columns, len(names), METRES[units.pop()]
 
 
 def _is_number(word: str) -> bool:
