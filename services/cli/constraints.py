@@ -156,7 +156,7 @@ class Import:
 
         from congrasp.common.hands import get_hand
         from congrasp.common.hands.mano import own_mano_model
-        from congrasp.common.io.files import write_atomically
+        from congrasp.common.io.files import check_output, write_atomically
         from congrasp.common.objects.store import Catalogue
         from congrasp.common.task.sampling.sets import save
         from congrasp.services.assets.captures.build import Options, import_sets
@@ -168,6 +168,7 @@ class Import:
         if not self.path.exists():
             raise CongraspError(f"There is no file or folder {self.path}.", "Pass the data set's folder.")
         in_range(0.0, unit="radians", beyond=self.beyond)
+        check_output("--objects", self.objects, is_folder=True)
         hand, options = get_hand(self.hand), Options(self.headings, self.affordance, self.beyond, seed=self.seed)
         importer = importlib.import_module(IMPORTERS[self.format])
         with bars() as progress:
