@@ -26,12 +26,12 @@ from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
 from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
 from congrasp.services.assets.objects.mesh_files import read_mesh, sample_colours, up_of
-from congrasp.services.assets.objects.options import ImportOptions, Up, check_options, metres_per_unit
+from congrasp.services.assets.objects.options import ImportOptions, Up, check_options, metres_per_unit, rough_unit
 from congrasp.services.assets.objects.repair import encloses
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
-_CACHE_VERSION = 11
+_CACHE_VERSION = 12
 _DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
@@ -149,7 +149,7 @@ def _key(source: Source, options: ImportOptions) -> str:
 def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     """The object of a source; the seed draws its surface points."""
     notes: list[str] = []
-    given, visuals, parts, up, coloured = _read(source, options.up, notes)
+    given, visuals, parts, up, coloured = _read(source, options, notes)
     sides = tuple(trimesh.util.concatenate(visuals).extents.tolist())
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
     meshes, parts = ([_scaled(mesh, factor) for mesh in some] for some in (visuals, parts))
@@ -222,8 +222,9 @@ class _Files(NamedTuple):
     """Files of the surfaces that may have colours."""
 
 
-def _read(source: Source, up: Up, notes: list[str]) -> _Files:
+def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
     """Reads the meshes of a source."""
+    up = options.up
     pieces = [read_mesh(file.path, up=up) for file in source.pieces]
     visuals = [read_mesh(file.path, notes, up) for file in source.visuals]
     parts = [] if source.parts_are_pieces else [read_mesh(file.path, up=up) for file in source.parts]
@@ -235,6 +236,8 @@ def _read(source: Source, up: Up, notes: list[str]) -> _Files:
     given = [np.asarray(mesh.vertices, np.float64) for mesh in pieces]
     visuals = visuals or [shapes.triangulate(piece) for piece in given]
     if not (given or source.parts):
+        rough = [rough_unit(mesh.scale, options.unit) * options.scale for mesh in visuals]
+        visuals = [repair.without_table(mesh, unit, notes) for mesh, unit in zip(visuals, rough, strict=True)]
         visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
     if not source.parts:
         visuals = [repair.closed(mesh, notes) for mesh in visuals]

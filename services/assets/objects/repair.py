@@ -14,6 +14,7 @@ OPENING = 0.01
 """Width of an opening that no finger enters, m."""
 _REDUCED = 200_000  # triangles above which a mesh is reduced before other checks
 _FEW = 0.05  # share of a mesh that may be missing
+_TABLE, _FLAT = 0.3, 0.08  # a table's least width, m, and its greatest thickness, of its width
 _APART = 0.02  # of the mesh's size: bodies whose boxes are nearer than this belong together
 
 
@@ -94,6 +95,40 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     )
     used, faces = np.unique(np.asarray(mesh.faces)[kept], return_inverse=True)
     return trimesh.Trimesh(vertices[used], faces.reshape(-1, 3), process=False)
+
+
+def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> trimesh.Trimesh:
+    """A scan without its table: a flat body that is wide by `_TABLE` and by far, with all others above it.
+
+    Args:
+      mesh: the scan, in any unit.
+      metres: metres per unit, roughly.
+      notes: a table is appended.
+    """
+    if mesh.scale * metres < _TABLE:
+        return mesh
+    labels = connected_component_labels(mesh.edges, len(mesh.vertices))
+    low, high = (
+        reduce.reduceat(mesh.vertices[order := np.argsort(labels, kind="stable")], np.unique(labels[order], True)[1])
+        for reduce in (np.minimum, np.maximum)
+    )
+    is_table = labels == np.linalg.norm(high - low, axis=-1).argmax()
+    if is_table.all():
+        return mesh
+    table, others = mesh.vertices[is_table], mesh.vertices[~is_table]
+    axes = np.linalg.svd(table - table.mean(0), full_matrices=False)[2]
+    (low, high), (least, most) = (((points @ axes.T).min(0), (points @ axes.T).max(0)) for points in (table, others))
+    size, thick = high - low, (high - low)[2]
+    flat = thick < _FLAT * size[1] and size[1] * metres > _TABLE
+    within = (low <= least)[:2].all() and (most <= high)[:2].all() and (most - least)[:2].max() < size[1] / 2
+    one_side = least[2] > low[2] - thick or most[2] < high[2] + thick
+    if not (flat and within and one_side):
+        return mesh
+    notes.append(
+        f"a flat body {size[1] / (most - least)[:2].max():.1f} times as wide as the rest was left out: a table"
+    )
+    rest = mesh.submesh([~is_table[mesh.faces[:, 0]]], append=True)
+    return trimesh.Trimesh(rest.vertices, rest.faces, process=False)
 
 
 def bodies(vertices: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -24,6 +24,23 @@ def test_an_opening_is_left_and_bodies_that_touch_stay_together():
     assert len(largest_body(pair, said).faces) == 2 * len(ball().faces) and not said
 
 
+@pytest.mark.parametrize("gap", [-0.001, 0.0, 0.05])
+@pytest.mark.parametrize("unit", ["m", "mm", "auto"])
+def test_a_table_under_an_object_is_left_out(tmp_path, quick_import, unit, gap):
+    table = trimesh.creation.box((0.55, 0.4, 0.02)).apply_translation([0.0, 0.0, -0.01 - RADIUS - gap])
+    scan = trimesh.util.concatenate([table, ball()]).apply_scale(1000 if unit == "mm" else 1)
+    scan.export(tmp_path / "scan.stl")
+    obj = one_object(tmp_path / "scan.stl", ImportOptions(unit=unit, cache_dir=str(tmp_path / "cache")))
+    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), 2 * RADIUS, rtol=0.05)
+    assert obj.notes[0] == "a flat body 6.7 times as wide as the rest was left out: a table"
+
+
+def test_a_lid_is_no_table(tmp_path):
+    lid = trimesh.creation.cylinder(0.12, 0.01)
+    lid = trimesh.util.concatenate([lid, ball().apply_translation([0.0, 0.0, 0.03])])
+    assert repair.without_table(lid, 1.0, []) is lid
+
+
 @pytest.mark.parametrize(("neck", "filled"), [(0.004, True), (0.012, False)])
 def test_a_hollow_that_no_finger_enters_is_filled(neck, filled):
     """A bottle with a wall of 3 mm."""
