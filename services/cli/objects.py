@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.options import ImportOptions, size_in_words
 
 if TYPE_CHECKING:
     from congrasp.common.objects.spec import GraspObject
@@ -67,6 +67,8 @@ def import_meshes(
       congrasp objects import examples/mug.obj
       congrasp objects import scans/ --unit mm --density 300 --out my-objects
     """
+    import numpy as np
+
     from congrasp.common.objects.store import Catalogue
     from congrasp.services.assets.objects.meshes import import_sources
     from congrasp.services.assets.objects.named import distinct, find_sources
@@ -96,6 +98,7 @@ def import_meshes(
                 if earlier not in (None, catalogue.add(obj).read_bytes()):
                     say(f"{obj.name}: it replaced another object of that name in {out}.")
                 done += 1
+                say(f"{obj.name}: {size_in_words(np.ptp(obj.visual_vertices, axis=0))}.")
                 for note in obj.notes:
                     say(f"{obj.name}: {note}.")
                 if not obj.shape_reliable:

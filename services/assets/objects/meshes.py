@@ -32,6 +32,7 @@ from congrasp.services.assets.objects.repair import encloses
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
 _CACHE_VERSION = 12
+_FAR = 100  # sizes of an object that its middle may be from the origin
 _DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
@@ -152,7 +153,10 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     given, visuals, parts, up, coloured = _read(source, options, notes)
     sides = tuple(trimesh.util.concatenate(visuals).extents.tolist())
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
-    meshes, parts = ([_scaled(mesh, factor) for mesh in some] for some in (visuals, parts))
+    middle = factor * trimesh.util.concatenate(visuals).bounds.mean(0)
+    if np.abs(middle).max() < _FAR * max(sides) * factor:
+        middle = np.zeros(3)  # products of coordinates are exact enough
+    meshes, parts = ([_scaled(mesh, factor, middle) for mesh in some] for some in (visuals, parts))
     whole = trimesh.util.concatenate(meshes).copy()
     closed = all(encloses(mesh) for mesh in meshes)
     if not (closed or options.material):
@@ -164,7 +168,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     if solid and solid.overlaps:
         notes.append("its bodies overlap: what lies in several of them weighs once")
     surfaces = _surfaces(meshes, solid, notes)
-    hulls, owners, errors = _cut(source, [factor * piece for piece in given], surfaces, options, notes)
+    hulls, owners, errors = _cut(source, [factor * piece - middle for piece in given], surfaces, options, notes)
     if options.material:
         found = weigh_parts(meshes, parts or meshes, options.material, [part.part for part in source.parts])
     else:
@@ -180,7 +184,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     if not 0.1 <= share <= 0.9:
         notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
     picture = repair.with_few_faces(whole)
-    colours = _colours(coloured, factor, center, seed, options.up, notes)
+    colours = _colours(coloured, factor, center + middle, seed, options.up, notes)
     obj = GraspObject(
         name=source.name,
         family="imported",
@@ -195,7 +199,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         rest_poses=np.zeros((0, 7)),
         visual_vertices=np.asarray(picture.vertices, np.float32),
         visual_faces=np.asarray(picture.faces, np.int32),
-        origin=tuple((-center).tolist()),
+        origin=tuple((-center - middle).tolist()),
         file_scale=factor,
         file_up=up,
         notes=tuple(dict.fromkeys(notes)),
@@ -281,10 +285,11 @@ def _colours(
     return found and found._replace(points=(factor * found.points - center).astype(np.float32))
 
 
-def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
-    """A mesh in metres that faces outwards."""
+def _scaled(mesh: trimesh.Trimesh, factor: float, middle: np.ndarray) -> trimesh.Trimesh:
+    """A mesh in metres, relative to a point (3,), that faces outwards."""
     mesh = mesh.copy()
     mesh.apply_scale(factor)
+    mesh.apply_translation(-middle)
     if mesh.volume < 0:
         mesh.invert()
     return mesh

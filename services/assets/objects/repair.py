@@ -3,6 +3,7 @@
 import numpy as np
 import trimesh
 from scipy.ndimage import binary_propagation, distance_transform_edt, label
+from scipy.spatial import cKDTree
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import connected_component_labels
 
@@ -15,6 +16,8 @@ OPENING = 0.01
 _REDUCED = 200_000  # triangles above which a mesh is reduced before other checks
 _FEW = 0.05  # share of a mesh that may be missing
 _TABLE, _FLAT = 0.3, 0.08  # a table's least width, m, and its greatest thickness, of its width
+_CRACK = 1e-4  # of the mesh's size: vertices nearer than this are one, if that closes the mesh
+_FINS = 10  # rings of triangles that may stand out from a closed surface
 _APART = 0.02  # of the mesh's size: bodies whose boxes are nearer than this belong together
 
 
@@ -41,9 +44,8 @@ def reduced(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[
     keys = (bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)) ^ (bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F))
     keys ^= (bits[:, 2] * np.uint64(0x165667B19E3779F9)) >> np.uint64(7)
     _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
-    vertices, faces = vertices[first], merged.reshape(-1)[faces]
-    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    small = with_few_faces(trimesh.Trimesh(vertices, faces[proper], process=False))
+    vertices, faces = _welded(vertices[first], merged.reshape(-1)[faces])
+    small = with_few_faces(trimesh.Trimesh(vertices, faces, process=False))
     notes.append(f"its {before:,} triangles were reduced to {len(small.faces):,}: a hand does not feel the rest")
     return np.asarray(small.vertices), np.asarray(small.faces)
 
@@ -56,11 +58,27 @@ def merged(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> trimesh
     apart = trimesh.Trimesh(vertices, faces, process=False)
     mesh = apart.copy()
     mesh.merge_vertices()
+    if not (apart.is_watertight or mesh.is_watertight):
+        whole = trimesh.Trimesh(*_welded(mesh.vertices, mesh.faces), process=False)
+        if whole.is_watertight:
+            notes.append("cracks in its surface, narrower than 0.01 % of it, were closed")
+            mesh = whole
     if len(mesh.faces):
         mesh.update_faces(mesh.nondegenerate_faces())
         mesh = without_repeats(mesh, notes)
         mesh.remove_unreferenced_vertices()
     return apart if apart.is_watertight and not mesh.is_watertight else mesh
+
+
+def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh (V, 3), (F, 3) whose vertices nearer than `_CRACK` of its size are one, without triangles that vanish."""
+    tree = cKDTree(vertices)
+    pairs = tree.query_pairs(_CRACK * float(np.linalg.norm(tree.maxes - tree.mins)), output_type="ndarray")
+    labels = connected_component_labels(pairs, len(vertices))
+    _, first, labels = np.unique(labels, return_index=True, return_inverse=True)
+    faces = labels.reshape(-1)[faces]
+    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return vertices[first], faces[proper]
 
 
 def with_few_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -204,6 +222,10 @@ def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
         if filled.is_watertight and added < _FEW * mesh.area:
             notes.append(f"{len(holes)} hole{'s' if len(holes) > 1 else ''} in its surface {_was(len(holes))} closed")
             mesh = filled
+    if not mesh.is_watertight and (trimmed := _without_fins(mesh)) is not None:
+        count = len(mesh.faces) - len(trimmed.faces)
+        notes.append(f"{count} of its triangles stood out from its surface and {_was(count)} left out")
+        mesh = trimmed
     if mesh.is_watertight and not mesh.is_winding_consistent:
         outwards = _wound_alike(mesh)
         if outwards.is_winding_consistent:
@@ -216,6 +238,20 @@ def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
         mesh.invert()
         notes.append("it was inside out and was turned")
     return mesh
+
+
+def _without_fins(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
+    """The mesh without triangles at a free edge, and those at the edges that this frees; None unless that closes it."""
+    faces = np.asarray(mesh.faces)
+    for _ in range(_FINS):
+        _, group, counts = np.unique(_codes(faces_to_edges(faces)), return_inverse=True, return_counts=True)
+        free = (counts[group.reshape(-1)] == 1).reshape(-1, 3).any(1)
+        if not free.any():
+            rest = trimesh.Trimesh(mesh.vertices, faces, process=False)
+            rest.remove_unreferenced_vertices()
+            return rest if rest.is_watertight and rest.area > (1 - _FEW) * mesh.area else None
+        faces = faces[~free]
+    return None
 
 
 def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
