@@ -34,6 +34,7 @@ LIMITS = {"nbody": 1000, "nv": 500, "ngeom": 10_000, "nmesh": 1000, "nmeshvert":
 LEAST = 1e-3, 1e-7
 """Mass (kg) and inertia (kg m2) of moving links without mass."""
 _BALL = 0.4 * 0.02**2  # kg m2 for each kg: inertia of a ball with the radius of a finger link
+_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 _START = 30  # s, for the child's imports on a busy machine
 _MOST_FILES = 300  # that a description names
@@ -335,6 +336,8 @@ def _check_joints(robot: ET.Element, notes: list[str]) -> None:
     kinds = {joint.get("name"): joint.get("type") for joint in robot.findall("joint")}
     for joint in robot.findall("joint"):
         name, limit, mimic = joint.get("name", ""), joint.find("limit"), joint.find("mimic")
+        if (kind := joint.get("type", "")) not in _KINDS:
+            raise _Known(f"the type of the joint '{name}' is '{kind[:40]}'. Write one of: {', '.join(_KINDS)}")
         for end in ("parent", "child"):
             link = None if (element := joint.find(end)) is None else element.get("link")
             if link not in links:

@@ -111,7 +111,9 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
         shown = identifier(palm, f"body_{tree.palm}")
         if not model.njnt:
             raise CongraspError(f"{path} has no joints.", "If it is a part, import the file that includes it.")
-        raise CongraspError(f"{path} has {len(tree.ends)} finger(s) on its palm '{shown}'.", "Pass another --palm.")
+        count = ("no finger", "one finger")[len(tree.ends)]
+        remedy = "A hand has two or more: import a file with all of them, or pass another --palm."
+        raise CongraspError(f"{path} has {count} on its palm '{shown}'.", remedy)
     wide = np.sqrt(model.body_inertia.max(1) / np.maximum(model.body_mass, LEAST[0])) > _LINK[1]
     if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
         said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"
