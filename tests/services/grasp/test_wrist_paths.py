@@ -121,6 +121,21 @@ def test_a_header_places_the_columns(tmp_path, header, order, separator):
     check(read_wrist_path(tmp_path / "a.csv"))
 
 
+def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
+    def save(name, head, rows, mark=","):
+        (tmp_path / name).write_text("\n".join([head, *(mark.join(map(str, row)) for row in rows)]))
+        check(read_wrist_path(tmp_path / name))
+
+    rows = np.c_[POSITION, ROTATION.as_quat()].tolist()
+    save("ros.csv", f"stamp,frame_id,note,{ROS}", [[i, "", '"a, b"', *row] for i, row in enumerate(rows)])
+    save("dec.csv", ROS.replace(",", ";"), [[str(x).replace(".", ",") for x in row] for row in rows], ";")
+    above = ",,Rotation,Rotation,Rotation,Rotation,Position,Position,Position"
+    motive = f"Format Version,1.23,Frames,{len(rows)}\n\n{above}\nFrame,Time (Seconds),X,Y,Z,W,X,Y,Z"
+    save("motive.csv", motive, [[i, 0.1, *row[3:], *row[:3]] for i, row in enumerate(rows)])
+    with pytest.raises(CongraspError, match="quaternions that are not of length one"):
+        save("turned.csv", "X,Y,Z,W,X,Y,Z", [row[3:] + row[:3] for row in rows])
+
+
 @pytest.mark.parametrize(
     ("header", "complaint"),
     [
