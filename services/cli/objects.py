@@ -67,8 +67,6 @@ def import_meshes(
       congrasp objects import examples/mug.obj
       congrasp objects import scans/ --unit mm --density 300 --out my-objects
     """
-    import numpy as np
-
     from congrasp.common.objects.store import Catalogue
     from congrasp.services.assets.objects.meshes import import_sources
     from congrasp.services.assets.objects.named import distinct, find_sources
@@ -98,9 +96,8 @@ def import_meshes(
                 if earlier not in (None, catalogue.add(obj).read_bytes()):
                     say(f"{obj.name}: it replaced another object of that name in {out}.")
                 done += 1
-                say(f"{obj.name}: {size_in_words(np.ptp(obj.visual_vertices, axis=0))}.")
-                for note in obj.notes:
-                    say(f"{obj.name}: {note}.")
+                sides = obj.visual_vertices.max(0) - obj.visual_vertices.min(0)
+                say(*(f"{obj.name}: {text}." for text in (size_in_words(sides), *obj.notes)))
                 if not obj.shape_reliable:
                     unreliable += 1
                     print(f"{obj.name}: its shape is unreliable. Repair the mesh, or set --time-limit or --max-pieces.")

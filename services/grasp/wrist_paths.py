@@ -222,12 +222,12 @@ def _columns(names: list[str], above: list[str]) -> tuple[list[int], int, float]
     groups: dict[str, list[dict[str, tuple[int, str]]]] = {}
     for place, lettered in enumerate(map(_LETTERED.fullmatch, names)):
         if lettered:
-            name, letter, *units = lettered.groups()
-            some = groups.setdefault(name, [{}])
-            if letter in some[-1] or (letter == "w" and not name and len(some) == 1 and len(some[0]) == 3):
-                some.append({})  # of columns x, y, z, w, x, y, z
-            some[-1][letter] = (place, units[0] or units[1] or "m")
-    whole = [(name, group) for name, some in groups.items() for group in some]
+            name, letter, bracketed, suffix = lettered.groups()
+            same = groups.setdefault(name, [{}])
+            if letter in same[-1] or (letter == "w" and not name and len(same) == 1 and len(same[0]) == 3):
+                same.append({})  # of columns x, y, z, w, x, y, z
+            same[-1][letter] = (place, bracketed or suffix or "m")
+    whole = [(name, group) for name, same in groups.items() for group in same]
     turns = [(name, group) for name, group in whole if group.keys() == set("wxyz")]
     vectors = [(name, group) for name, group in whole if group.keys() == set("xyz")]
     if not (vectors or turns or len(_NUMBERED.findall(",".join(names))) > 3):
@@ -238,11 +238,11 @@ def _columns(names: list[str], above: list[str]) -> tuple[list[int], int, float]
         if len(some) != 1:
             several = f"several {what}s: {', '.join(name or 'x, y, z' for name, _ in some)}"
             raise ValueError(f"names {several if some else f'no {what}'}")
-    (_, place), (_, turn) = places[0], turns[0]
-    units = {place[letter][1] for letter in "xyz"}
+    (_, position), (_, turn) = places[0], turns[0]
+    units = {position[letter][1] for letter in "xyz"}
     if not (len(units) == 1 and units <= METRES.keys()):
         raise ValueError(f"names positions in {' and '.join(sorted(units))}, not all in one of {', '.join(METRES)}")
-    columns = [place[letter][0] for letter in "xyz"] + [turn[letter][0] for letter in "wxyz"]
+    columns = [position[letter][0] for letter in "xyz"] + [turn[letter][0] for letter in "wxyz"]
     return columns, len(names), METRES[units.pop()]
 
 

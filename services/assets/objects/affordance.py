@@ -7,6 +7,7 @@ hold. They relabel the object's surface points and pieces; nothing else about th
 import dataclasses
 import pathlib
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -109,7 +110,7 @@ def from_part(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
     Raises:
       CongraspError: the file cannot be read, or is empty.
     """
-    geometry = load_geometry(path, "Export the part as PLY.")
+    geometry: Any = load_geometry(path, "Export the part as PLY.")
     up = "y" if obj.file_up == "y" else up_of(geometry)
     geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
     points = np.asarray(getattr(geometry, "vertices", ()), float).reshape(-1, 3)

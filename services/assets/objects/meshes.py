@@ -153,9 +153,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     given, visuals, parts, up, coloured = _read(source, options, notes)
     sides = tuple(trimesh.util.concatenate(visuals).extents.tolist())
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
-    middle = factor * trimesh.util.concatenate(visuals).bounds.mean(0)
-    if np.abs(middle).max() < _FAR * max(sides) * factor:
-        middle = np.zeros(3)  # products of coordinates are exact enough
+    middle = factor * _far_middle(visuals)
     meshes, parts = ([_scaled(mesh, factor, middle) for mesh in some] for some in (visuals, parts))
     whole = trimesh.util.concatenate(meshes).copy()
     closed = all(encloses(mesh) for mesh in meshes)
@@ -293,6 +291,12 @@ def _scaled(mesh: trimesh.Trimesh, factor: float, middle: np.ndarray) -> trimesh
     if mesh.volume < 0:
         mesh.invert()
     return mesh
+
+
+def _far_middle(meshes: list[trimesh.Trimesh]) -> np.ndarray:
+    """Middle (3,) of meshes so far from the origin that products of their coordinates are inexact; else zeros."""
+    low, high = trimesh.util.concatenate(meshes).bounds
+    return (low + high) / 2 if np.abs(low + high).max() / 2 > _FAR * (high - low).max() else np.zeros(3)
 
 
 def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:

@@ -145,8 +145,9 @@ def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> tri
     notes.append(
         f"a flat body {size[1] / (most - least)[:2].max():.1f} times as wide as the rest was left out: a table"
     )
-    rest = mesh.submesh([~is_table[mesh.faces[:, 0]]], append=True)
-    return trimesh.Trimesh(rest.vertices, rest.faces, process=False)
+    rest = trimesh.Trimesh(mesh.vertices, mesh.faces[~is_table[mesh.faces[:, 0]]], process=False)
+    rest.remove_unreferenced_vertices()
+    return rest
 
 
 def bodies(vertices: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
