@@ -62,7 +62,7 @@ class Generate:
         from congrasp.common.objects.procedural import generate_many
         from congrasp.common.task.config import TaskConfig
         from congrasp.common.task.sampling.sets import make_sets, save
-        from congrasp.services.assets.objects.named import find_object, objects_of
+        from congrasp.services.assets.objects.named import located, objects_of
         from congrasp.services.cli.console import tracked
 
         if not self.objects and self.count < 1:
@@ -72,8 +72,7 @@ class Generate:
             track("Preparing objects", None)
             found: list[GraspObject] = []
             for text in self.objects:
-                path = pathlib.Path(text)
-                found += objects_of(path) if path.exists() else [find_object(text, self.folder)]
+                found += objects_of(located(text, self.folder))
             found += generate_many(self.count, self.first_seed, self.families)
             for obj, name in zip(found, distinct_names(obj.name for obj in found), strict=True):
                 if obj.name != name:
@@ -157,7 +156,7 @@ class Import:
 
         from congrasp.common.hands import get_hand
         from congrasp.common.hands.mano import own_mano_model
-        from congrasp.common.io.files import write_atomically
+        from congrasp.common.io.files import check_output, write_atomically
         from congrasp.common.objects.store import Catalogue
         from congrasp.common.task.sampling.sets import save
         from congrasp.services.assets.captures.build import Options, import_sets
@@ -169,6 +168,7 @@ class Import:
         if not self.path.exists():
             raise CongraspError(f"There is no file or folder {self.path}.", "Pass the data set's folder.")
         in_range(0.0, unit="radians", beyond=self.beyond)
+        check_output("--objects", self.objects, is_folder=True)
         hand, options = get_hand(self.hand), Options(self.headings, self.affordance, self.beyond, seed=self.seed)
         importer = importlib.import_module(IMPORTERS[self.format])
         with bars() as progress:

@@ -25,7 +25,7 @@ class Dataset:
       congrasp dataset all:0-9999 --out grasps --keep clean pushed --part 3/20
     """
 
-    objects: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
+    objects: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Meshes (STL, OBJ, PLY, GLB), object files, folders of them, names in --folder, or objects of the generator as
     FAMILY:FIRST-LAST (mug:0-99, all:0-9999)."""
     out: pathlib.Path = pathlib.Path("dataset")

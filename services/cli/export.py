@@ -31,13 +31,14 @@ def policy(
       congrasp export policy
       congrasp export policy --hand allegro --to stablehlo
     """
-    from congrasp.common.io.files import check_free
+    from congrasp.common.io.files import check_free, check_output
     from congrasp.common.policy.bundle import load
     from congrasp.common.policy.pretrained import policy_file
     from congrasp.services.export.policy import SUFFIXES, export_policy
 
     source = policy_file(policy, hand)
     path = out or pathlib.Path(f"policy{SUFFIXES[to]}")
+    check_output("--out", path, is_folder=False)
     check_free(path, force=force)
     export_policy(load(source), to, path)
     print(path)

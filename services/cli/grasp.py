@@ -51,7 +51,7 @@ class Grasp:
       congrasp grasp mug:7 --hand allegro --arm panda --base "-0.7 0 0 0"
     """
 
-    objects: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
+    objects: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Meshes (STL, OBJ, PLY, GLB), object files, folders of them, FAMILY:SEED of the generator (mug:7), or names in
     --folder."""
     out: pathlib.Path = pathlib.Path("grasps")

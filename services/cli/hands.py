@@ -113,10 +113,9 @@ def import_hand(
     """
     from congrasp.services.assets.hands import model_files
 
-    if out is not None:
-        check_output("--out", out, is_folder=False)
-        if out.suffix != SUFFIX:
-            raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
+    check_output("--out", out or hands_folder(), is_folder=out is None)
+    if out is not None and out.suffix != SUFFIX:
+        raise CongraspError(f"--out {out} does not end in {SUFFIX}.", "Hand files are JSON.")
     choices = model_files.Choices(name, palm, thumb, object_scale, collision == "own")
     with announced(f"Reading {file}"):
         proposal = model_files.import_hand(file, choices)
@@ -173,10 +172,11 @@ def check(
     from congrasp.services.viz.sheets import save_png
 
     found = get_hand(hand)
+    picture = png or pathlib.Path(f"{found.name}-check.png")
+    check_output("--png", picture, is_folder=False)
     checked = self_check.check_hand(found, recipe(found).task, cores())
     for finding in checked.findings:
         print(finding)
-    picture = png or pathlib.Path(f"{found.name}-check.png")
     save_png(picture, hand_sheets.check_sheet(found, checked.grips))
     if json is not None:
         self_check.write_findings(json, checked.findings)
@@ -233,6 +233,7 @@ class Train:
 
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
+        check_output("--out", self.out or pathlib.Path("runs", "hands"), is_folder=True)
         full = processes.accelerators()[0] != "cpu"
         jax.config.update("jax_platforms", "cpu")  # the stages are separate processes, each with the whole GPU memory
         reference = _taken(self.hand, Choices(self.name, self.palm, self.thumb, self.object_scale))

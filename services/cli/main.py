@@ -80,6 +80,9 @@ _PATH = (
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `congrasp` script; ends the process with the command's exit code."""
     alone = arguments is None  # no other code uses this process
+    for stream in (sys.stdout, sys.stderr) if alone else ():
+        if isinstance(stream, io.TextIOWrapper):  # characters that its encoding lacks become escapes
+            stream.reconfigure(errors="backslashreplace")
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     follow_parent()
     debug = "--debug" in arguments
@@ -170,7 +173,7 @@ def _check_files(arguments: Sequence[str]) -> None:
 
 
 def _check_outputs(call: Any) -> None:
-    """Raises a CongraspError for an output that cannot be written, before the work for it.
+    """Raises a CongraspError for an output that cannot be written, or a picture of another format, before the work.
 
     An output is a folder if its default has no suffix; one without a default may be either.
     """
@@ -179,6 +182,9 @@ def _check_outputs(call: Any) -> None:
             default = inspect.signature(call.args[0]).parameters[name].default
             is_folder = not default.suffix if default else None if name == "out" else name == "pictures"
             check_output(f"--{name}", path, is_folder)
+            is_png = name == "png" or (default and default.suffix == ".png")
+            if is_png and path.suffix.lower() not in ("", ".png"):
+                raise CongraspError(f"--{name} is {path}, but the picture is a PNG.", "End its name in .png.")
 
 
 def _is_there(path: pathlib.Path) -> bool:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.assets.objects.options import ImportOptions, size_in_words
 
 if TYPE_CHECKING:
     from congrasp.common.objects.spec import GraspObject
@@ -96,8 +96,8 @@ def import_meshes(
                 if earlier not in (None, catalogue.add(obj).read_bytes()):
                     say(f"{obj.name}: it replaced another object of that name in {out}.")
                 done += 1
-                for note in obj.notes:
-                    say(f"{obj.name}: {note}.")
+                sides = obj.visual_vertices.max(0) - obj.visual_vertices.min(0)
+                say(*(f"{obj.name}: {text}." for text in (size_in_words(sides), *obj.notes)))
                 if not obj.shape_reliable:
                     unreliable += 1
                     print(f"{obj.name}: its shape is unreliable. Repair the mesh, or set --time-limit or --max-pieces.")

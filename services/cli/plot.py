@@ -25,6 +25,7 @@ def plot(
       congrasp plot runs/mine runs/other --out plots --formats png
     """
     from congrasp.common.errors import CongraspError
+    from congrasp.common.io.files import check_output
     from congrasp.services.evaluate.plots import plot_evaluation
     from congrasp.services.viz.plots import plot_runs
 
@@ -36,6 +37,7 @@ def plot(
     if len(paths) > 1 and out is None:
         raise CongraspError("The figures of several runs have no default folder.", "Pass a folder with --out.")
     folder = out or (paths[0] if paths[0].is_dir() else paths[0].parent) / "plots"
+    check_output("--out", folder, is_folder=True)
     for file in plot_evaluation(paths[0], folder, formats) if evaluations else plot_runs(paths, folder, formats):
         print(file)
     return 0

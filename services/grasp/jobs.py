@@ -15,9 +15,8 @@ from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import distinct_names, file_name
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.objects.store import Catalogue
 from congrasp.services.assets.objects.materials import with_mass
-from congrasp.services.assets.objects.named import ObjectAt, objects_at
+from congrasp.services.assets.objects.named import ObjectAt, located, objects_at
 from congrasp.services.assets.objects.options import ImportOptions, check_options, size_in_words
 from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, key_of, save_grasp
 from congrasp.services.grasp.grasper import Grasper, Progress
@@ -92,28 +91,21 @@ def _shown(facts: dict[str, Any], stem: str) -> str:
     return f"{np.degrees(facts[f'{stem}_rad']):.0f}° and {1000 * facts[f'{stem}_m']:.0f} mm"
 
 
-def find_objects(paths: Sequence[pathlib.Path], folder: str = "objects") -> tuple[list[ObjectAt], list[Result]]:
-    """The objects of some paths (meshes, object files, folders of either), and errors of paths without objects.
+def find_objects(texts: Sequence[str], folder: str = "objects") -> tuple[list[ObjectAt], list[Result]]:
+    """The objects that a user names (`located`), and errors of names without objects.
 
-    A path that does not exist may be the name of an object in `folder`. Objects of the same name are numbered, since
-    each name becomes that of a folder.
+    Objects of the same name are numbered, since each name becomes that of a folder.
     """
     found: list[ObjectAt] = []
     errors: list[Result] = []
-    for path in paths:
+    for text in texts:
         try:
-            stored = Catalogue(folder).path(str(path)) if _is_name(path) else path
-            found += objects_at(stored if stored.is_file() else path)
+            found += objects_at(located(text, folder))
         except CongraspError as error:
-            errors.append(Result(path.name, {}, str(error)))
+            errors.append(Result(pathlib.Path(text).name, {}, str(error)))
     return [
         one._replace(name=name) for one, name in zip(found, distinct_names(one.name for one in found), strict=True)
     ], errors
-
-
-def _is_name(path: pathlib.Path) -> bool:
-    """True if a path can be an object's name: there is no such file, and it has neither a folder nor a suffix."""
-    return not path.exists() and path.name == str(path) and not path.suffix and ":" not in path.name
 
 
 def grasp_object(at: ObjectAt, grasper: Grasper, settings: Settings, progress: Progress) -> Result:

@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-import trimesh
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from congrasp.common.errors import CongraspError
@@ -29,7 +27,8 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.assets.captures.extract import Surface, approach
 from congrasp.services.assets.captures.references import followed
 from congrasp.services.assets.captures.sequence import Dropped
-from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
+from congrasp.services.assets.objects.affordance import from_part
+from congrasp.services.assets.objects.mesh_files import upright
 from congrasp.services.assets.objects.options import size_in_words
 from congrasp.services.export.motion_file import GraspMotion, load_motion
 from congrasp.services.grasp.wrist_paths import HUGE, read_csv, read_wrist_path
@@ -152,8 +151,10 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
 def _part(text: str, target: Target) -> Part:
     """A part of the object: a mesh file in the coordinates of its file, or names of its parts."""
     path, obj = pathlib.Path(text), target.obj
+    names = [word.strip() for word in text.split(",")]
+    if path.exists() and set(names) <= set(obj.part_names):
+        raise CongraspError(f"'{text}' is a file here, and a part of '{obj.name}'.", f"Pass ./{text} for the file.")
     if not path.suffix and not path.exists():
-        names = [word.strip() for word in text.split(",")]
         if unknown := [part for part in names if part not in obj.part_names]:
             known = f"Its parts are: {', '.join(obj.part_names)}; or name a mesh file of the part."
             raise CongraspError(f"'{obj.name}' has no part '{unknown[0]}'.", known)
@@ -161,16 +162,7 @@ def _part(text: str, target: Target) -> Part:
         return Part(text, np.where(inside, 0.0, 1.0))
     if not path.is_file():
         raise CongraspError(f"there is no file {path}.", "Check the path.")
-    geometry = load_geometry(path, "Export the part as PLY.")
-    up = "y" if obj.file_up == "y" else up_of(geometry)
-    geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
-    points = np.asarray(getattr(geometry, "vertices", ()), float).reshape(-1, 3)
-    if len(getattr(geometry, "faces", ())):
-        points = np.concatenate([points, trimesh.sample.sample_surface(geometry, 8000, seed=0)[0]])
-    points = upright(points[np.isfinite(points).all(-1)], up)
-    if not len(points):
-        raise CongraspError(f"{path} holds no points.", "Export the part as PLY.")
-    return Part(text, cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0])
+    return Part(text, from_part(obj, path))
 
 
 def _pose(text: str, target: Target) -> dict[str, np.ndarray]:

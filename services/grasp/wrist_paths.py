@@ -4,6 +4,7 @@ Results are in metres, in a world frame with the z axis up, for the wrist frame 
 -y, thumb side +x, back of the hand +z.
 """
 
+import csv
 import pathlib
 import re
 from typing import NamedTuple
@@ -13,14 +14,17 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file, read_npz
+from congrasp.services.assets.objects.options import METRES
 
 _LARGEST, _DEEPEST = 32 << 20, 200
 """Bytes of a BVH or CSV file, and joints of a BVH chain."""
+_UNIT_LENGTH = 0.01  # tolerance of a quaternion's length: positions in its place differ more
 HUGE = 1e9
 """Bound on angles, positions and quaternion components."""
-_ORDERS = {"xyzwxyz": (0, 1, 2, 3, 4, 5, 6), "xyzxyzw": (0, 1, 2, 6, 3, 4, 5)}
-"""Last letters of a CSV header's names, and the places of x, y, z and the quaternion w, x, y, z among them."""
-_NO_NAME = re.compile(r"\[[^][]*\]|\([^()]*\)|[\"']")  # units and quotes around the names of a header
+_UNIT = re.compile(r"\s*[\[(]\s*([^])]*?)\s*[])]")
+_LETTERED = re.compile(r"(.*?)[\W_]*([wxyz])(?:\[(.*)\]|_(m|mm|cm|in))?")  # name, letter and unit of a column
+_PLACE = re.compile(r"(?:.*[\W_])?[ptc]?|.*(?:pose?|position|trans|translation|location)")
+_NO_PLACE = re.compile(r"(?:.*[\W_])?[vawfnre]|.*(?:vel|speed|acc|linear|ang|gyro|force|tor|rot|euler|normal).*")
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
@@ -156,14 +160,14 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
 def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines.
 
-    A header, also in a comment, whose names end in these letters may put w last, as ROS does, and have other columns:
-    t, x, y, z, qx, qy, qz, qw.
+    A header, also in a comment or of two lines, may name them in any order and among other columns, such as t, qx, qy,
+    qz, qw, vx, vy, vz, px, py, pz, and positions in mm or cm: "x [mm]".
 
     Raises:
-      CongraspError: the file has more than `largest` bytes or cannot be read, a line is not seven finite numbers, or a
-        header names a quaternion in another place, or several.
+      CongraspError: the file has more than `largest` bytes or cannot be read, a line is not seven finite numbers, a
+        header names no position or quaternion, or several, or quaternions are not of length one.
     """
-    columns, width = list(range(7)), 7
+    columns, width, metres, named, above = list(range(7)), 7, 1.0, False, list[str]()
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
@@ -172,44 +176,74 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     rows: list[list[float]] = []
     for number, line in enumerate(lines, 1):
         text, _, comment = line.partition("#")
-        words = re.sub(r"[,;\"]", " ", text).split()
-        if not words or (not rows and not any(map(_is_number, words))):
+        words = _cells(text) if named else re.sub(r"[,;\"]", " ", text).split()
+        numbers = sum(map(_is_number, words))
+        if not any(words) or (not rows and (not numbers if named else 2 * numbers < len(words))):
+            names = _cells(_UNIT.sub(r"[\1]", text.strip() or comment).lower().strip(" #"))
             try:
-                columns, width = (not rows and _columns(text.strip() or comment)) or (columns, width)
+                found = None if rows or named else _columns(names, above)
             except ValueError as error:
-                raise CongraspError(
-                    f"line {number} of {path} {error}.", f"{remedy} A header may put qw last."
-                ) from None
+                raise CongraspError(f"line {number} of {path} {error}.", "Name them x, y, z, qw, qx, qy, qz.") from None
+            if found:
+                (columns, width, metres), named = found, True
+            above = names
             continue
-        if len(words) != width or not all(_is_number(words[column]) for column in columns):
+        if len(words) < width or any(words[width:]) or not all(_is_number(words[column]) for column in columns):
             raise CongraspError(f"line {number} of {path} is not {width} finite numbers.", remedy)
         rows.append([float(words[column]) for column in columns])
     if not rows:
         raise CongraspError(f"{path} has no numbers.", remedy)
     table = np.array(rows)
-    return table[:, :3], table[:, 3:]
+    if np.abs(np.linalg.norm(table[:, 3:], axis=-1) - 1).max() > _UNIT_LENGTH:
+        raise CongraspError(f"{path} holds quaternions that are not of length one.", remedy)
+    return metres * table[:, :3], table[:, 3:]
 
 
-def _columns(header: str) -> tuple[list[int], int] | None:
-    """Places of x, y, z and the quaternion w, x, y, z in a header, and the number of its columns; None for other text.
+def _cells(line: str) -> list[str]:
+    """The cells of a line between semicolons, tabs, commas or blanks; decimal commas become points."""
+    mark = next((mark for mark in ";\t," if mark in line), None)
+    cells = line.split() if mark is None else next(csv.reader([line], delimiter=mark, skipinitialspace=True), [])
+    return [cell.strip(" '").replace(",", "." if mark == ";" else ",") for cell in cells]
+
+
+def _columns(names: list[str], above: list[str]) -> tuple[list[int], int, float] | None:
+    """Places of x, y, z and the quaternion w, x, y, z in a header, the number of its columns, and metres per unit.
+
+    Columns of one name before their letters belong together, or of one name in the line above: with w they are a
+    quaternion. None for other text.
 
     Raises:
-      ValueError: it names several quaternions, or one in another place.
+      ValueError: it names no position or no quaternion, or several.
     """
-    text = _NO_NAME.sub("", header).lower().strip(" #").rstrip(",; ")
-    names = [name.strip() for name in re.split(r"[,;\t]" if re.search(r"[,;\t]", text) else r"\s+", text)]
-    ends = "".join(name[-1:] or " " for name in names)
-    orders = [
-        [match.start() + place for place in places]
-        for order, places in _ORDERS.items()
-        for match in re.finditer(f"(?={order})", ends)
-    ]
-    found = [columns for columns in orders if len({names[column][:-1] for column in columns[3:]}) == 1]
-    if len(found) == 1:
-        return found[0], len(names)
-    if set("wxyz") <= set(ends) or len(_NUMBERED.findall(text)) > 3:
-        raise ValueError(f"names {'several quaternions' if found else 'no position and quaternion in a known order'}")
-    return None
+    while names and not names[-1]:
+        names = names[:-1]
+    if len(above) >= len(names) and not any(above[len(names) :]):
+        names = [f"{over} {name}" if len(name) == 1 else name for over, name in zip(above, names, strict=False)]
+    groups: dict[str, list[dict[str, tuple[int, str]]]] = {}
+    for place, lettered in enumerate(map(_LETTERED.fullmatch, names)):
+        if lettered:
+            name, letter, bracketed, suffix = lettered.groups()
+            same = groups.setdefault(name, [{}])
+            if letter in same[-1] or (letter == "w" and not name and len(same) == 1 and len(same[0]) == 3):
+                same.append({})  # of columns x, y, z, w, x, y, z
+            same[-1][letter] = (place, bracketed or suffix or "m")
+    whole = [(name, group) for name, same in groups.items() for group in same]
+    turns = [(name, group) for name, group in whole if group.keys() == set("wxyz")]
+    vectors = [(name, group) for name, group in whole if group.keys() == set("xyz")]
+    if not (vectors or turns or len(_NUMBERED.findall(",".join(names))) > 3):
+        return None
+    places = [one for one in vectors if _PLACE.fullmatch(one[0])]
+    places = places or [one for one in vectors if not _NO_PLACE.fullmatch(one[0])]
+    for what, some in (("position", places), ("quaternion", turns)):
+        if len(some) != 1:
+            several = f"several {what}s: {', '.join(name or 'x, y, z' for name, _ in some)}"
+            raise ValueError(f"names {several if some else f'no {what}'}")
+    (_, position), (_, turn) = places[0], turns[0]
+    units = {position[letter][1] for letter in "xyz"}
+    if not (len(units) == 1 and units <= METRES.keys()):
+        raise ValueError(f"names positions in {' and '.join(sorted(units))}, not all in one of {', '.join(METRES)}")
+    columns = [position[letter][0] for letter in "xyz"] + [turn[letter][0] for letter in "wxyz"]
+    return columns, len(names), METRES[units.pop()]
 
 
 def _is_number(word: str) -> bool:
@@ -239,5 +273,5 @@ def _check(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> 
             "A frame is x, y, z and a quaternion w, x, y, z.",
         )
     both = np.concatenate([position, quaternion], 1)
-    if not np.isfinite(both).all() or np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > 0.05:
+    if not np.isfinite(both).all() or np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > _UNIT_LENGTH:
         raise CongraspError(f"{path} holds numbers that are not finite, or quaternions that are not of length one.")

@@ -119,7 +119,7 @@ def _results(scans: pathlib.Path, work: pathlib.Path, out: pathlib.Path, attempt
         if shown.hand not in graspers:
             graspers[shown.hand] = Grasper(bundles.load(file), attempts=attempts, phases=_PHASES)
         path = scans / shown.object
-        (at,), errors = find_objects([path if path.exists() else pathlib.Path(shown.object)])
+        (at,), errors = find_objects([str(path) if path.exists() else shown.object])
         if errors:
             raise CongraspError(errors[0].error)
         settings = Settings(

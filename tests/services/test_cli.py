@@ -68,6 +68,12 @@ def test_help_names_every_command_and_every_command_exists():
         (["objects", "generate", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["reproduce", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["report", "--out", "/"], "--out is the folder /. Pass a file"),
+        (["render", "hand", "--out", "hand.pdf"], "--out is hand.pdf, but the picture is a PNG. End its name in .png"),
+        (["objects", "show", "mug:7", "--png", "x.jpg"], "--png is x.jpg, but the picture is a PNG"),
+        (["export", "policy", "--out", "/"], "--out is the folder /. Pass a file"),
+        (["plot", "/nonexistent-run", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
+        (["hands", "train", "no-hand", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
+        (["constraints", "import", "grab", "/", "--objects", "/dev/null"], "--objects is the file /dev/null. Pass a"),
         (["grasp", "mug:7", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["serve", "--hand", "paw"], "no hand 'paw'"),
         (["serve", "--policy", "a", "--connect", "tcp/127.0.0.1:1"], "either a or"),
@@ -177,6 +183,15 @@ def test_a_reader_that_is_gone_is_no_error():
     os.close(writer)
     lines = errors(done.stderr)
     assert not lines and done.returncode in (0, 128 + signal.SIGPIPE)
+
+
+def test_an_output_without_some_characters_gets_escapes():
+    command, env = (
+        [sys.executable, "-m", "congrasp", "objects", "list", "ü"],
+        {**os.environ, "PYTHONIOENCODING": "ascii"},
+    )
+    done = subprocess.run(command, env=env, capture_output=True, timeout=60, check=False)
+    is_one_line(done.returncode, done.stderr.decode(), r"no folder .*\\xfc")
 
 
 @pytest.mark.parametrize("late", [True, False])

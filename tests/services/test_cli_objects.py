@@ -1,5 +1,7 @@
 """`congrasp objects …` as a user meets it."""
 
+import re
+
 import numpy as np
 import pytest
 import trimesh
@@ -76,16 +78,30 @@ def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, qui
     obj = find_object("mug:7")
     path = Catalogue(tmp_path).add(obj)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mug_7").write_text("a file of that name")
     assert digest(find_object(str(path))) == digest(find_object("mug_7", str(tmp_path))) == digest(obj)
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "block.stl")
     assert find_object(str(tmp_path / "block.stl")).name == "block"
-    with pytest.raises(CongraspError, match="mug_7 is not an STL"):
-        find_object(str(tmp_path / "mug_7"), str(tmp_path))
     with pytest.raises(CongraspError, match="no object 'mug_8'"):
         find_object("mug_8", str(tmp_path))
     with pytest.raises(CongraspError, match="no object family 'cat'"):
         find_object("cat:1")
+
+
+def test_a_name_that_is_also_a_path_is_ambiguous(tmp_path, monkeypatch, quick_import):
+    from congrasp.services.cli import constraints
+    from congrasp.services.grasp.jobs import find_objects
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    stored = Catalogue("objects").add(find_object("mug:7"))
+    (tmp_path / "mug_7").mkdir()
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "mug_7" / "block.stl")
+    said = r"'mug_7' is a folder here, and an object in objects\. Pass \./mug_7 or objects/mug_7\.safetensors"
+    for find in (find_object, lambda name: constraints.Generate((name,))()):
+        with pytest.raises(CongraspError, match=said):
+            find("mug_7")
+    ((mesh, mug), (error,)) = find_objects(["./mug_7", str(stored), "mug_7"])
+    assert mesh.source and not mug.source and re.search(said, error.error)
 
 
 def test_a_picture_that_cannot_be_written_is_named(tmp_path):

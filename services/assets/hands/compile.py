@@ -33,6 +33,9 @@ LIMITS = {"nbody": 1000, "nv": 500, "ngeom": 10_000, "nmesh": 1000, "nmeshvert":
 """Limits of a model's parts, by MuJoCo's names."""
 LEAST = 1e-3, 1e-7
 """Mass (kg) and inertia (kg m2) of moving links without mass."""
+_BALL = 0.4 * 0.02**2  # kg m2 for each kg: inertia of a ball with the radius of a finger link
+_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+_INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 _START = 30  # s, for the child's imports on a busy machine
 _MOST_FILES = 300  # that a description names
 _COUNTS = re.compile(r"""\bcount\s*=\s*["']([^"']*)["']""")
@@ -303,10 +306,9 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     if robot.find("link") is not None and all(link.get("name") in children for link in robot.findall("link")):
         raise _Known("its links form a loop, and none is the root. Remove the joint that closes it")
     _check_joints(robot, notes)
+    _complete_inertias(robot, notes)
     assets, shared, lacking = dict[str, bytes](), dict[tuple[pathlib.Path | None, str], str](), dict[str, None]()
     for link in robot.iter("link"):
-        for again in link.findall("inertial")[1:]:
-            link.remove(again)
         for shape in (*link.findall("visual"), *link.findall("collision")):
             for mesh in shape.iter("mesh"):
                 file = _mesh_file(path, mesh.get("filename", ""))
@@ -326,16 +328,26 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
 
 
 def _check_joints(robot: ET.Element, notes: list[str]) -> None:
-    """Refuses limits in the wrong order; removes limits of effort below zero, and mimics that MuJoCo would drop."""
+    """Refuses missing links and limits in the wrong order.
+
+    Removes limits of effort below zero, and mimics that MuJoCo would drop.
+    """
+    links = {link.get("name") for link in robot.findall("link")}
     kinds = {joint.get("name"): joint.get("type") for joint in robot.findall("joint")}
     for joint in robot.findall("joint"):
         name, limit, mimic = joint.get("name", ""), joint.find("limit"), joint.find("mimic")
+        if (kind := joint.get("type", "")) not in _KINDS:
+            raise _Known(f"the type of the joint '{name}' is '{kind[:40]}'. Write one of: {', '.join(_KINDS)}")
+        for end in ("parent", "child"):
+            link = None if (element := joint.find(end)) is None else element.get("link")
+            if link not in links:
+                raise _Known(f"the {end} of the joint '{name}' is the link '{link}', which does not exist. Correct it")
         if limit is not None:
-            lower, upper = (_value(limit, end, name) for end in ("lower", "upper"))
+            lower, upper = (_value(limit, end, joint) for end in ("lower", "upper"))
             if lower > upper:
                 raise _Known(f"the lower limit {lower:g} of the joint '{name}' is above the upper {upper:g}. Swap them")
             for bound in ("effort", "velocity"):
-                if _value(limit, bound, name) < 0:
+                if _value(limit, bound, joint) < 0:
                     limit.set(bound, "0")
         if mimic is None:
             continue
@@ -343,22 +355,50 @@ def _check_joints(robot: ET.Element, notes: list[str]) -> None:
         why = {None: "which does not exist", "fixed": "which is fixed"}.get(kinds.get(leader), "")
         if leader == name:
             why = "which is itself"
-        elif not _value(mimic, "multiplier", name, 1.0):
+        elif not _value(mimic, "multiplier", joint, 1.0):
             why = "with the multiplier 0"
         if why:
             joint.remove(mimic)
             notes.append(f"'{name}' mimics '{leader}', {why}: it has a motor of its own ('couplings' in the hand file)")
 
 
-def _value(element: ET.Element, name: str, joint: str, missing: float = 0.0) -> float:
-    """A number of an element of a joint."""
+def _complete_inertias(robot: ET.Element, notes: list[str]) -> None:
+    """Removes repeated inertials and those without mass; adds the elements of inertia that MuJoCo requires."""
+    guessed, weightless = list[str](), list[str]()
+    for link in robot.findall("link"):
+        found = link.findall("inertial")
+        for inertial in found[1:]:
+            link.remove(inertial)
+        if not found:
+            continue
+        mass = found[0].find("mass")
+        if mass is None or mass.get("value") is None:
+            link.remove(found[0])
+            weightless.append(link.get("name", ""))
+            continue
+        inertia = found[0].find("inertia")
+        inertia = ET.SubElement(found[0], "inertia") if inertia is None else inertia
+        if not {"ixx", "iyy", "izz"} <= inertia.attrib.keys():
+            inertia.attrib |= dict.fromkeys(("ixx", "iyy", "izz"), str(_BALL * _value(mass, "value", link)))
+            guessed.append(link.get("name", ""))
+        for name in _INERTIA:
+            inertia.set(name, str(_value(inertia, name, link)))
+    if guessed:
+        notes.append(f"links without '<inertia>' get that of a ball of their mass, 4 cm wide: {', '.join(guessed)}")
+    if weightless:
+        notes.append(f"'<inertial>' without mass, which follows from the link's shapes: {', '.join(weightless)}")
+
+
+def _value(element: ET.Element, name: str, owner: ET.Element, missing: float = 0.0) -> float:
+    """A number of an element of a joint or link."""
     text = element.get(name, str(missing))
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise _Known(f"{name} of the joint '{joint}' is '{text[:40]}', not a finite number. Correct it")
+        whose = f"the {owner.tag} '{owner.get('name', '')[:40]}'"
+        raise _Known(f"{name} of {whose} is '{text[:40]}', not a finite number. Correct it")
     return value
 
 

@@ -7,6 +7,7 @@ its collision shapes, else for its visual shapes, else for its inertia; and a vi
 
 import dataclasses
 import re
+from collections import Counter
 from typing import Any, Literal
 
 import mujoco
@@ -86,11 +87,15 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
     if wanted and wanted not in names:
         raise CongraspError(f"There is no body '{wanted}'.", f"Pass one of: {', '.join(filter(None, names))}.")
     palm = names.index(wanted) if wanted else _palm(model, notes)
-    owner, groups = {palm: palm}, {palm: [palm]}
+    owner, groups, loose = {palm: palm}, {palm: [palm]}, list[str]()
     for body in range(palm + 1, model.nbody):
-        if int(model.body_parentid[body]) in owner:
+        if not model.body_parentid[body] and _is_free(model, body):
+            loose.append(names[body] or f"body {body}")
+        elif int(model.body_parentid[body]) in owner:
             owner[body] = max(palm, int(model.body_weldid[body]))
             groups.setdefault(owner[body], []).append(body)
+    if loose:
+        notes.append(f"not of the hand, and left out: {', '.join(loose)}")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     _to_palm(data, palm)
@@ -122,33 +127,44 @@ def _palm(model: mujoco.MjModel, notes: list[str]) -> int:
     carrier = model.body_weldid  # for each body, the one whose joints move it
     branches: dict[int, int] = {}
     for body in np.flatnonzero(model.body_jntnum).tolist():
-        if not any(mujoco.mjtJoint(model.jnt_type[j]) in _FREE for j in hinges(model, body)):
+        if not _is_free(model, body):
             parent = int(carrier[model.body_parentid[body]])
             branches[parent] = branches.get(parent, 0) + 1
-    found = {link: _fork(model, link) for link, count in branches.items() if count > 1} or {0: 0}
+    found = {link: _forks(model, link) for link, count in branches.items() if count > 1} or {0: [0]}
     most = max(branches.get(link, 0) for link in found)
     best = [link for link in found if branches.get(link, 0) == most]
-    called = [link for link in best if any(word in model.body(found[link]).name.lower() for word in _CALLED)]
+    called = [link for link in best if any(word in model.body(found[link][0]).name.lower() for word in _CALLED)]
     chosen = max(called or best)
-    others = [model.body(found[link]).name for link in best if link != chosen and link]
+    palm = found[chosen][0]
+    others = [model.body(body).name for link in best for body in found[link] if body not in (0, palm)]
     if others:
         notes.append(f"the palm could also be {' or '.join(others)} (--palm)")
-    return found[chosen]
+    return palm
 
 
-def _fork(model: mujoco.MjModel, link: int) -> int:
-    """Body of a link whose bodies carry all of its branches: the world body may be a fixed mount below."""
-    moved = np.flatnonzero(model.body_jntnum)
+def _is_free(model: mujoco.MjModel, body: int) -> bool:
+    """True if a body floats or has a ball joint."""
+    return any(mujoco.mjtJoint(model.jnt_type[j]) in _FREE for j in hinges(model, body))
+
+
+def _forks(model: mujoco.MjModel, link: int) -> list[int]:
+    """Body of a link whose bodies carry all of its branches: the world body may be a fixed mount below.
+
+    If that is the world itself, the bodies with several of them, which are the palms of several hands.
+    """
+    moved = np.array([body for body in np.flatnonzero(model.body_jntnum).tolist() if not _is_free(model, body)])
     carriers = [int(body) for body in model.body_parentid[moved] if model.body_weldid[body] == link]
     if len(set(carriers)) == 1:
-        return carriers[0]
+        return carriers[:1]
     paths = []
     for body in carriers:
         path = [body]
         while path[-1] != link:
             path.append(int(model.body_parentid[path[-1]]))
         paths.append(path)
-    return next(body for body in paths[0] if all(body in path for path in paths))
+    fork = next(body for body in paths[0] if all(body in path for path in paths))
+    palms = [body for body, count in Counter(carriers).items() if count > 1 and body]
+    return [fork] if fork or len(palms) < 2 else palms
 
 
 def placed(tree: Tree, link: int, *, colliding: bool) -> list[trimesh.Trimesh]:

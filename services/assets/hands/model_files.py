@@ -34,6 +34,7 @@ from congrasp.services.assets.hands.links import (
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
 from congrasp.services.assets.objects.options import METRES, length
 
+_TWO = "A hand has two or more: import a file with all of them, or pass another --palm."
 _LEVER = 0.02  # least distance of a joint from the tip that it moves, m
 _TURN = np.deg2rad(10)  # largest range of a joint below which grasping is impossible
 _SMALL = 0.03  # opening below which a hand is doubtful, m
@@ -108,10 +109,10 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
     tree = hand_tree(model, choices.palm, notes)
     palm = model.body(tree.palm).name
     if len(tree.ends) < 2:
-        shown = identifier(palm, f"body_{tree.palm}")
         if not model.njnt:
             raise CongraspError(f"{path} has no joints.", "If it is a part, import the file that includes it.")
-        raise CongraspError(f"{path} has {len(tree.ends)} finger(s) on its palm '{shown}'.", "Pass another --palm.")
+        count, shown = ("no finger", "one finger")[len(tree.ends)], identifier(palm, f"body_{tree.palm}")
+        raise CongraspError(f"{path} has {count} on its palm '{shown}'.", _TWO)
     wide = np.sqrt(model.body_inertia.max(1) / np.maximum(model.body_mass, LEAST[0])) > _LINK[1]
     if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
         said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"

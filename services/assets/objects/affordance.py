@@ -7,6 +7,7 @@ hold. They relabel the object's surface points and pieces; nothing else about th
 import dataclasses
 import pathlib
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -18,7 +19,7 @@ from congrasp.common.hands.files import HUMAN
 from congrasp.common.objects.shapes import halves
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.task.sampling.headings import max_width, sample_headings, within_reach
-from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh, upright
+from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
 
 LEAST_SHARE = 0.10
 """Least share of the surface that the graspable region must have (paper, section Constraint Setup)."""
@@ -98,19 +99,36 @@ def in_half_space(obj: GraspObject, normal: Sequence[float], offset: float) -> n
     return obj.points @ (np.asarray(normal, float) / length) >= offset
 
 
-def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
-    """(512,) bool: surface points that lie on the mesh of a part.
+def from_part(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
+    """(512,) distances of the surface points from a part, m.
 
     Args:
       obj: an imported object.
-      path: the part, in the frame and unit of the file that the object was imported from.
+      path: the part, a closed mesh, a patch of the surface or points of it, in the frame and unit of the file that the
+        object was imported from.
 
     Raises:
-      CongraspError: the mesh cannot be read, or lies elsewhere.
+      CongraspError: the file cannot be read, or is empty.
     """
-    part = read_mesh(path, up="y" if obj.file_up == "y" else "auto")
-    dense, _ = trimesh.sample.sample_surface(part, 8000, seed=0)
-    distance = cKDTree(np.asarray(dense) * obj.file_scale + obj.origin).query(obj.points)[0]
+    geometry: Any = load_geometry(path, "Export the part as PLY.")
+    up = "y" if obj.file_up == "y" else up_of(geometry)
+    geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
+    points = np.asarray(getattr(geometry, "vertices", ()), float).reshape(-1, 3)
+    if len(getattr(geometry, "faces", ())) and geometry.area > 0:
+        points = np.concatenate([points, trimesh.sample.sample_surface(geometry, 8000, seed=0)[0]])
+    points = upright(points[np.isfinite(points).all(-1)], up)
+    if not len(points):
+        raise CongraspError(f"{path} holds no points.", "Export the part as PLY.")
+    return np.asarray(cKDTree(points * obj.file_scale + np.asarray(obj.origin)).query(obj.points)[0])
+
+
+def on_part_mesh(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
+    """(512,) bool: surface points that lie on a part (`from_part`).
+
+    Raises:
+      CongraspError: the file cannot be read, or the part lies elsewhere.
+    """
+    distance = from_part(obj, path)
     if distance.min() > _ON_PART:
         raise CongraspError(
             f"{path} lies {100 * distance.min():.1f} cm from the surface of '{obj.name}'.",

@@ -264,16 +264,19 @@ def _by_coacd(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> list[
 
     if closed and _convex(hull := shapes.hull_of(vertices), vertices[faces], enclosed(vertices[faces]).volume):
         return [hull.points[hull.vertices]]
+    # Measured: fine cuts that are joined afterwards are as faithful as a longer search, in a tenth of the time. An open
+    # surface becomes a thin wall, which the same search would cut into hundreds of pieces: a sphere without its top
+    # took 71 s and was 4.0 mm off, and takes 18 s and is 4.1 mm off.
+    search = {"mcts_iterations": 20, "mcts_nodes": 10, "mcts_max_depth": 2}
+    if not closed:
+        search = {"mcts_iterations": 10, "mcts_nodes": 5, "mcts_max_depth": 1, "preprocess_resolution": 40}
     found = coacd.run_coacd(
         coacd.Mesh(vertices, faces),
-        threshold=min(1.0, max(_FINEST, 2 * DEPTH / np.ptp(vertices, axis=0).max())),
+        threshold=min(1.0, max(_FINEST, (2 if closed else 3) * DEPTH / np.ptp(vertices, axis=0).max())),
         preprocess_mode="off" if closed and is_watertight(faces_to_edges(faces))[0] else "auto",
-        # Measured: fine cuts that are joined afterwards are as faithful as a longer search, in a tenth of the time.
         merge=False,
-        mcts_iterations=20,
-        mcts_nodes=10,
-        mcts_max_depth=2,
         seed=0,
+        **search,
     )
     return [piece[0] for piece in found]
 

@@ -35,6 +35,10 @@ def plain_glb(data: bytes, notes: list[str]) -> bytes:
         raise ValueError(f"it announces {length} bytes of JSON, but has {len(data)}")
     tree, binary = json.loads(data[20 : 20 + length]), bytearray(data[28 + length :])
     _check_extensions(tree)
+    if not _list(tree, "scenes"):  # which the format allows; viewers show every node then
+        inner = {child for node in _list(tree, "nodes") for child in node.get("children", ())}
+        tree["scenes"] = [{"nodes": sorted(set(range(len(_list(tree, "nodes")))) - inner)}]
+        tree["scene"] = 0
     _keep_triangles(tree, notes)
     _check_scene(tree, len(data))
     accessors = _list(tree, "accessors")

@@ -40,12 +40,15 @@ _RELATIVE = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t/]-\d")
 _ZERO = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t]0+(?=[/\s]|$)")
 _COMMA = re.compile(rb"(?mi)^[ \t]*(v[ \t]+|vertex[ \t]+)?[-+]?\d+,\d+(?:e[-+]?\d+)?[ \t]")
 _POINT = re.compile(rb"(?m)^[ \t]*v[ \t]")
+_POINTS = re.compile(rb"(?m)^[ \t]*v[ \t]+([^\n#]*)")
+_POLYGON = re.compile(rb"(?m)^[ \t]*f((?:[ \t]+\d[\d/]*){4,64})[ \t\r]*$")
 _FACE = re.compile(rb"(?m)^[ \t]*f[ \t][^\n#]*")
 _INDEX = re.compile(rb"[ \t](\d{1,18})")
 _NO_POINT = "a face refers to a point that is not in the file"
 _START = 4096
 _MARK = b"\xef\xbb\xbf"  # of UTF-8
 _FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and products are finite
+_COARSE = 0.01  # of a mesh's size: largest rounding of its coordinates in single precision
 _PLY_HEADER = 1 << 16  # bytes
 _SIZES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
 _SIZES |= {"int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8}
@@ -82,6 +85,12 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto
         raise CongraspError(f"{path} has {bad} vertices that are not finite numbers.", "Repair or export it again.")
     if (farthest := np.abs(finite[0]).max(initial=0.0)) > _FARTHEST:
         raise CongraspError(f"{path} has a coordinate of {farthest:.3g}.", f"{_FARTHEST:g} is the most, in any unit.")
+    step, size = float(np.spacing(np.float32(farthest))), np.ptp(finite[0], axis=0).max(initial=0.0)
+    if 0 < _COARSE * size < step and (finite[0].astype(np.float32) == finite[0]).all():
+        raise CongraspError(
+            f"{path} is so far from its origin that its coordinates are rounded to {step:.2g}.",
+            "Move it to the origin in the program that wrote it, and export it again.",
+        )
     vertices, faces = repair.reduced(*finite, said)
     mesh = repair.merged(upright(vertices, axis), faces, said)
     if len(mesh.faces) < 4:
@@ -306,7 +315,7 @@ def _plausible(rows: np.ndarray, sound: np.ndarray) -> bool:
 
 
 def _plain_obj(data: bytes, notes: list[str]) -> bytes:
-    """Text with absolute indices: negative ones count back from the points so far.
+    """Text with absolute indices, for negative ones count back from the points so far, and without dented polygons.
 
     Raises:
       ValueError: a face has the index 0, or counts back to before the first point.
@@ -316,8 +325,13 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
         data = data.replace(b"\r", b"\n")
     if _ZERO.search(data):
         raise ValueError("a face has the index 0, but OBJ counts from 1")
-    if not _RELATIVE.search(data):
-        return data
+    if _RELATIVE.search(data):
+        data = _absolute_obj(data)
+    return _cut_polygons(data) if _POLYGON.search(data) else data
+
+
+def _absolute_obj(data: bytes) -> bytes:
+    """An OBJ whose negative indices are replaced."""
     counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
     for line in re.sub(rb"\\\r?\n", b" ", data).splitlines():
         words = line.split()
@@ -330,6 +344,63 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
             line = b" ".join([b"f", *map(b"/".join, corners)])
         lines.append(line)
     return b"\n".join(lines)
+
+
+def _cut_polygons(data: bytes) -> bytes:
+    """An OBJ whose dented polygons are cut into triangles inside of them; readers cut all as if they had no dent."""
+    points = np.array([[_number(word) for word in row.split()[:3]] for row in _POINTS.findall(data)])
+    polygons: dict[int, list[tuple[re.Match[bytes], list[bytes]]]] = {}
+    for row in _POLYGON.finditer(data):
+        polygons.setdefault(len(corners := row[1].split()), []).append((row, corners))
+    cut: list[tuple[re.Match[bytes], bytes]] = []
+    for some in polygons.values():
+        places = np.array([[int(corner.partition(b"/")[0]) - 1 for corner in corners] for _, corners in some])
+        if places.max() >= len(points):
+            return data  # which is an error of its own
+        for i in np.flatnonzero(_dented(points[places])):
+            row, corners = some[i]
+            triangles = _ears(points[places[i]])
+            cut.append((row, b"\n".join(b"f " + b" ".join(corners[k] for k in ear) for ear in triangles) or row[0]))
+    ends, parts = 0, list[bytes]()
+    for row, text in sorted(cut, key=lambda one: one[0].start()):
+        parts += [data[ends : row.start()], text]
+        ends = row.end()
+    return b"".join([*parts, data[ends:]])
+
+
+def _normals(corners: np.ndarray) -> np.ndarray:
+    """Normals (n, 3) of polygons (n, k, 3), as long as twice their areas."""
+    spokes = corners - corners[:, :1]
+    return np.cross(spokes, np.roll(spokes, -1, 1)).sum(1)
+
+
+def _dented(corners: np.ndarray) -> np.ndarray:
+    """(n,) bool: polygons (n, k, 3) with a corner that turns against the others."""
+    sides, normals = np.roll(corners, -1, 1) - corners, _normals(corners)
+    turns = np.einsum("nkd,nd->nk", np.cross(np.roll(sides, 1, 1), sides), normals)
+    return np.asarray(turns.min(1) < -1e-3 * (normals**2).sum(-1))
+
+
+def _ears(corners: np.ndarray) -> list[list[int]]:
+    """Triangles of a polygon (n, 3), cut off ear by ear; none if it crosses itself."""
+    (normal,) = _normals(corners[None])
+
+    def turn(a: int, b: int, c: int) -> float:
+        return float(normal @ np.cross(corners[b] - corners[a], corners[c] - corners[b]))
+
+    left, found = list(range(len(corners))), list[list[int]]()
+    while len(left) > 3:
+        for i, b in enumerate(left):
+            a, c = left[i - 1], left[(i + 1) % len(left)]
+            others = [p for p in left if p not in (a, b, c)]
+            inside = any(min(turn(a, b, p), turn(b, c, p), turn(c, a, p)) >= 0 for p in others)
+            if turn(a, b, c) > 0 and not inside:
+                found.append([a, b, c])
+                left.remove(b)
+                break
+        else:
+            return []
+    return [*found, left]
 
 
 def _absolute(index: bytes, count: int) -> bytes:
@@ -397,7 +468,7 @@ def sample_colours(
         reason = (str(error) or type(error).__name__).splitlines()[0][:100].rstrip(" .!")
         raise CongraspError(f"The colours of {paths[0]} cannot be read: {reason}.") from None
     points, colours = (np.concatenate(parts) for parts in zip(*sampled, strict=True))
-    return Colours(points.astype(np.float32), colours)
+    return Colours(points, colours)
 
 
 def _meshes(path: pathlib.Path, up: Up, notes: list[str] | None) -> list[trimesh.Trimesh]:

@@ -26,12 +26,13 @@ from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
 from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
 from congrasp.services.assets.objects.mesh_files import read_mesh, sample_colours, up_of
-from congrasp.services.assets.objects.options import ImportOptions, Up, check_options, metres_per_unit
+from congrasp.services.assets.objects.options import ImportOptions, Up, check_options, metres_per_unit, rough_unit
 from congrasp.services.assets.objects.repair import encloses
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
-_CACHE_VERSION = 11
+_CACHE_VERSION = 12
+_FAR = 100  # sizes of an object that its middle may be from the origin
 _DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
 
@@ -149,10 +150,11 @@ def _key(source: Source, options: ImportOptions) -> str:
 def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     """The object of a source; the seed draws its surface points."""
     notes: list[str] = []
-    given, visuals, parts, up, coloured = _read(source, options.up, notes)
+    given, visuals, parts, up, coloured = _read(source, options, notes)
     sides = tuple(trimesh.util.concatenate(visuals).extents.tolist())
     factor = metres_per_unit(source.path, sides, options.unit, options.scale, notes)
-    meshes, parts = ([_scaled(mesh, factor) for mesh in some] for some in (visuals, parts))
+    middle = factor * _far_middle(visuals)
+    meshes, parts = ([_scaled(mesh, factor, middle) for mesh in some] for some in (visuals, parts))
     whole = trimesh.util.concatenate(meshes).copy()
     closed = all(encloses(mesh) for mesh in meshes)
     if not (closed or options.material):
@@ -164,7 +166,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     if solid and solid.overlaps:
         notes.append("its bodies overlap: what lies in several of them weighs once")
     surfaces = _surfaces(meshes, solid, notes)
-    hulls, owners, errors = _cut(source, [factor * piece for piece in given], surfaces, options, notes)
+    hulls, owners, errors = _cut(source, [factor * piece - middle for piece in given], surfaces, options, notes)
     if options.material:
         found = weigh_parts(meshes, parts or meshes, options.material, [part.part for part in source.parts])
     else:
@@ -180,7 +182,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     if not 0.1 <= share <= 0.9:
         notes.append(f"its graspable region is {share:.0%} of the surface (10 to 90 % work best)")
     picture = repair.with_few_faces(whole)
-    colours = _colours(coloured, factor, center, seed, options.up, notes)
+    colours = _colours(coloured, factor, center + middle, seed, options.up, notes)
     obj = GraspObject(
         name=source.name,
         family="imported",
@@ -195,7 +197,7 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         rest_poses=np.zeros((0, 7)),
         visual_vertices=np.asarray(picture.vertices, np.float32),
         visual_faces=np.asarray(picture.faces, np.int32),
-        origin=tuple((-center).tolist()),
+        origin=tuple((-center - middle).tolist()),
         file_scale=factor,
         file_up=up,
         notes=tuple(dict.fromkeys(notes)),
@@ -222,8 +224,9 @@ class _Files(NamedTuple):
     """Files of the surfaces that may have colours."""
 
 
-def _read(source: Source, up: Up, notes: list[str]) -> _Files:
+def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
     """Reads the meshes of a source."""
+    up = options.up
     pieces = [read_mesh(file.path, up=up) for file in source.pieces]
     visuals = [read_mesh(file.path, notes, up) for file in source.visuals]
     parts = [] if source.parts_are_pieces else [read_mesh(file.path, up=up) for file in source.parts]
@@ -235,6 +238,8 @@ def _read(source: Source, up: Up, notes: list[str]) -> _Files:
     given = [np.asarray(mesh.vertices, np.float64) for mesh in pieces]
     visuals = visuals or [shapes.triangulate(piece) for piece in given]
     if not (given or source.parts):
+        rough = [rough_unit(mesh.scale, options.unit) * options.scale for mesh in visuals]
+        visuals = [repair.without_table(mesh, unit, notes) for mesh, unit in zip(visuals, rough, strict=True)]
         visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
     if not source.parts:
         visuals = [repair.closed(mesh, notes) for mesh in visuals]
@@ -278,13 +283,20 @@ def _colours(
     return found and found._replace(points=(factor * found.points - center).astype(np.float32))
 
 
-def _scaled(mesh: trimesh.Trimesh, factor: float) -> trimesh.Trimesh:
-    """A mesh in metres that faces outwards."""
+def _scaled(mesh: trimesh.Trimesh, factor: float, middle: np.ndarray) -> trimesh.Trimesh:
+    """A mesh in metres, relative to a point (3,), that faces outwards."""
     mesh = mesh.copy()
     mesh.apply_scale(factor)
+    mesh.apply_translation(-middle)
     if mesh.volume < 0:
         mesh.invert()
     return mesh
+
+
+def _far_middle(meshes: list[trimesh.Trimesh]) -> np.ndarray:
+    """Middle (3,) of meshes so far from the origin that products of their coordinates are inexact; else zeros."""
+    low, high = trimesh.util.concatenate(meshes).bounds
+    return (low + high) / 2 if np.abs(low + high).max() / 2 > _FAR * (high - low).max() else np.zeros(3)
 
 
 def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:

@@ -153,24 +153,36 @@ def one_object(path: pathlib.Path, options: ImportOptions = _METRES_OR_ASK) -> G
     return found[0].load(options)
 
 
-def find_object(text: str, folder: str = "objects") -> GraspObject:
-    """The object that a user means: an object file, a mesh, FAMILY:SEED, or a name in a folder, before any other path.
+def located(text: str, folder: str = "objects") -> pathlib.Path:
+    """The path that a user means for `objects_at`: a file, a folder, FAMILY:SEED, or the file of a name in `folder`.
 
     Raises:
-      CongraspError: there is no such object.
+      CongraspError: there is no such object, or both a path here and an object of the folder have the name.
     """
-    path = pathlib.Path(text)
-    stored = path.name == text and (pathlib.Path(folder) / f"{text}{store.SUFFIX}").is_file()
-    is_path = path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or (path.exists() and not stored)
-    if is_path or _generated(path):
-        return one_object(path)
-    catalogue = store.Catalogue(folder)
-    if not catalogue.path(text).is_file():
+    path, stored = pathlib.Path(text), pathlib.Path(folder) / f"{text}{store.SUFFIX}"
+    is_name = path.name == text and stored.is_file()
+    if is_name and path.exists():
         raise CongraspError(
-            f"There is no object '{text}' in {folder}.",
-            "Name an object of the folder, an object file, a mesh, or FAMILY:SEED such as mug:7.",
+            f"'{text}' is a {'folder' if path.is_dir() else 'file'} here, and an object in {folder}.",
+            f"Pass ./{text} or {stored}.",
         )
-    return catalogue.get(text)
+    if is_name:
+        return stored
+    if path.suffix == store.SUFFIX or path.suffix.lower() in SUFFIXES or path.exists() or _generated(path):
+        return path
+    raise CongraspError(
+        f"There is no object '{text}' in {folder}, and no file or folder of that name.",
+        "Name an object of the folder, an object file, a mesh, or FAMILY:SEED such as mug:7.",
+    )
+
+
+def find_object(text: str, folder: str = "objects") -> GraspObject:
+    """The one object that a user means (`located`).
+
+    Raises:
+      CongraspError: there is no such object, or several.
+    """
+    return one_object(located(text, folder))
 
 
 def _generated(path: pathlib.Path) -> list[ObjectAt]:

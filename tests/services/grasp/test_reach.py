@@ -160,10 +160,8 @@ def test_an_object_is_found_by_its_name_in_a_folder(tmp_path, monkeypatch) -> No
 
     mug = procedural.generate(7, "mug")
     Catalogue(tmp_path / "mine").add(mug)
-    import pathlib
-
-    (found,), errors = find_objects([pathlib.Path("mug_7")], str(tmp_path / "mine"))
+    (found,), errors = find_objects(["mug_7"], str(tmp_path / "mine"))
     assert not errors and found.load().name == "mug_7"
     trimesh.creation.box((0.05, 0.05, 0.1)).export(tmp_path / "mug_7.stl")
-    (other,), _ = find_objects([tmp_path / "mug_7.stl"], str(tmp_path / "mine"))
+    (other,), _ = find_objects([str(tmp_path / "mug_7.stl")], str(tmp_path / "mine"))
     assert other.source is not None  # a file is a file

@@ -53,6 +53,22 @@ def test_each_source_finds_the_lower_half(box, folder):
     assert labelled.name == "half" and labelled.part_names == ("grasp", "avoid")
 
 
+@pytest.mark.parametrize("kind", ["patch", "flat", "points"])
+def test_a_part_may_be_a_patch_of_the_surface(box, folder, tmp_path, kind):
+    """Such as one that is cut out of a scan: it is open, and may be flat."""
+    mesh = trimesh.load(folder / "box.stl")
+    patch = mesh.submesh([mesh.triangles_center[:, 0] > mesh.bounds[1, 0] - 1e-3], append=True)
+    if kind == "flat":
+        (_, y, z), (x, y1, z1) = patch.bounds
+        patch = trimesh.Trimesh([(x, y, z), (x, y1, z), (x, y1, z1), (x, y, z1)], [[0, 1, 2], [0, 2, 3]])
+    if kind == "points":
+        patch = trimesh.PointCloud(trimesh.sample.sample_surface(patch, 3000, seed=0)[0])
+    patch.export(tmp_path / "part.ply")
+    depth = box.points[:, 0].max() - box.points[:, 0]
+    found = on_part_mesh(box, tmp_path / "part.ply")
+    assert found[depth < 1e-3].all() and not found[depth > 0.005].any()
+
+
 def test_the_command_stores_the_new_object(box, folder, tmp_path, capsys):
     catalogue = store.Catalogue(tmp_path)
     catalogue.add(box)

@@ -66,3 +66,8 @@ def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path
 def test_a_scene_that_shows_a_mesh_often_is_read_in_bounded_memory(tmp_path):
     (tmp_path / "a.glb").write_bytes(_glb(_many))
     assert "Trimesh" in limited(read_mesh, tmp_path / "a.glb")
+
+
+def test_a_glb_without_scenes_shows_all_of_its_nodes(tmp_path):
+    (tmp_path / "a.glb").write_bytes(_glb(lambda tree: [tree.pop("scenes"), tree.pop("scene", None)]))
+    assert len(read_mesh(tmp_path / "a.glb").faces) == 12

@@ -188,6 +188,14 @@ def decomposed(mesh, time_limit):
     return decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=time_limit)
 
 
+@SLOW
+def test_an_open_sphere_is_cut_within_the_default_limit(tmp_path):
+    sphere = trimesh.creation.icosphere(4, 0.04)
+    sphere.update_faces(sphere.triangles_center[:, 2] < 0.02)
+    found = decompose.decompose(sphere.vertices, sphere.faces, volume=None, time_limit=ImportOptions().time_limit)
+    assert (found.method, found.notes) == ("coacd", [])
+
+
 def test_vhacd_and_then_the_hull_replace_a_slow_coacd(monkeypatch):
     mesh = ell()
     result = decompose.decompose(mesh.vertices, mesh.faces, volume=mesh.volume, time_limit=0.01)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects import repair
+from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.repair import closed, largest_body, reduced, without_hollows
@@ -22,6 +24,70 @@ def test_an_opening_is_left_and_bodies_that_touch_stay_together():
     assert len(closed(half, said).faces) == len(half.faces) and not said  # a bowl stays a bowl
     pair = trimesh.util.concatenate([ball(), ball().apply_translation([2 * RADIUS, 0, 0])])
     assert len(largest_body(pair, said).faces) == 2 * len(ball().faces) and not said
+
+
+@pytest.mark.parametrize("gap", [-0.001, 0.0, 0.05])
+@pytest.mark.parametrize("unit", ["m", "mm", "auto"])
+def test_a_table_under_an_object_is_left_out(tmp_path, quick_import, unit, gap):
+    table = trimesh.creation.box((0.55, 0.4, 0.02)).apply_translation([0.0, 0.0, -0.01 - RADIUS - gap])
+    scan = trimesh.util.concatenate([table, ball()]).apply_scale(1000 if unit == "mm" else 1)
+    scan.export(tmp_path / "scan.stl")
+    obj = one_object(tmp_path / "scan.stl", ImportOptions(unit=unit, cache_dir=str(tmp_path / "cache")))
+    np.testing.assert_allclose(np.ptp(obj.visual_vertices, axis=0), 2 * RADIUS, rtol=0.05)
+    assert obj.notes[0] == "a flat body 6.7 times as wide as the rest was left out: a table"
+
+
+def test_a_lid_is_no_table(tmp_path):
+    lid = trimesh.creation.cylinder(0.12, 0.01)
+    lid = trimesh.util.concatenate([lid, ball().apply_translation([0.0, 0.0, 0.03])])
+    assert repair.without_table(lid, 1.0, []) is lid
+
+
+def _with_fin(mesh):
+    return trimesh.util.concatenate([mesh, trimesh.Trimesh([*mesh.vertices[mesh.edges[0]], [0, 0, 0.06]], [[0, 1, 2]])])
+
+
+def _cracked(mesh):
+    corners = mesh.triangles + np.random.default_rng(0).normal(0, 1e-7, mesh.triangles.shape)
+    return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(corners.size // 3).reshape(-1, 3), process=False)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "note"),
+    [
+        (_with_fin, "1 of its triangles stood out from its surface and was left out"),
+        (_cracked, "cracks in its surface, narrower than 0.01 % of it, were closed"),
+        (lambda mesh: mesh.apply_translation([1e5, -2e5, 3e5]), ""),
+    ],
+)
+def test_what_is_solid_but_for_its_writer_is_solid(tmp_path, quick_import, spoil, note):
+    spoil(ball()).export(tmp_path / "a.obj", digits=9)
+    obj = one_object(tmp_path / "a.obj", ImportOptions(density=1000.0, cache_dir=str(tmp_path / "cache")))
+    assert obj.mass == pytest.approx(1000 * ball().volume, rel=1e-3)
+    np.testing.assert_allclose(
+        np.diag(obj.inertia) if np.ndim(obj.inertia) == 2 else obj.inertia[:3], 0.4 * obj.mass * RADIUS**2, rtol=0.05
+    )
+    assert note in obj.notes if note else not [text for text in obj.notes if "open" in text]
+    np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.06)
+
+
+def test_what_single_precision_has_rounded_away_is_refused(tmp_path):
+    ball().apply_translation([1e5, 0, 0]).export(tmp_path / "a.stl")
+    with pytest.raises(CongraspError, match=r"a\.stl is so far from its origin that .* rounded to 0\.0078\. Move it"):
+        read_mesh(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_dented_polygons_are_cut_inside_of_them(tmp_path, turn):
+    """The ends of a channel, as modelling programs export it: one polygon each."""
+    outline = [(0, 0), (6, 0), (6, 4), (5, 4), (5, 1), (1, 1), (1, 4), (0, 4)][::turn]
+    points = [(x, y, z) for z in (0, 3) for x, y in outline]
+    sides = [(i, (i + 1) % 8, (i + 1) % 8 + 8, i + 8) for i in range(8)]
+    faces = [tuple(range(8))[::-1], tuple(range(8, 16)), *sides]
+    text = "".join("v {} {} {}\n".format(*point) for point in points)
+    (tmp_path / "a.obj").write_text(text + "".join(f"f {' '.join(f'{i + 1}//' for i in face)}\n" for face in faces))
+    mesh = read_mesh(tmp_path / "a.obj")
+    assert mesh.is_watertight and abs(mesh.volume) == pytest.approx(36) and mesh.area == pytest.approx(24 + 26 * 3)
 
 
 @pytest.mark.parametrize(("neck", "filled"), [(0.004, True), (0.012, False)])
