@@ -3,12 +3,16 @@
 A listener bounds the resources of untrusted peers: silent connections, incomplete messages, and replies that are not
 read. If a reader's link is full, a reply waits a few milliseconds and is then dropped: Zenoh replies with the
 congestion control of the query, which every process here overwrites on arrival.
+
+Zenoh closes a connection in the thread that waits for the data of all of them, and closing lasts until the peer has
+acknowledged it (zenoh #1101). A listener therefore has many such threads.
 """
 
 import contextlib
 import functools
 import json
 import logging
+import os
 import re
 import resource
 import struct
@@ -40,6 +44,8 @@ _QUEUE = 8  # batches of 64 KiB queued for a link: an acknowledgement fits in ad
 _ACCEPT_MS = 5000  # deadline of a connection's handshake, ms
 _PENDING = 4096  # most connections in a handshake, but at most a quarter of the open files
 _FILES = 16384  # limit of the process's open files, if the system allows it: each connection is one
+_CLOSERS = 64  # threads of a listener that accept and close connections and wait for their data
+os.environ.setdefault("ZENOH_RUNTIME", f"(acc: (worker_threads: {_CLOSERS}))")  # read at the first session
 _SESSIONS = 1000  # most connected peers, but at most a quarter of the open files: Zenoh panics if none is left
 STAMP = struct.Struct("<8sQ")
 """Sender and count of a sample, by which a subscriber detects gaps."""

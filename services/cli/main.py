@@ -105,7 +105,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = _fail(str(MissingPackageError("This", package)), USAGE_ERROR, debug)
     _last_words(sys.stdout)
     # Native code of a daemon thread that is late, such as one that closes Zenoh, aborts in the interpreter's shutdown.
-    late = [thread for thread in threading.enumerate() if thread.daemon and thread.name != SIGNALS]
+    # That also waits for other threads, such as one that builds kernels for minutes: after a failure, for nothing.
+    others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+    late = [thread for thread in others if thread.name != SIGNALS and (thread.daemon or code)]
     if code in SIGNALLED or (alone and late):
         _last_words(sys.stderr)
         os._exit(code)

@@ -1,6 +1,7 @@
 """What hostile and slow clients of a policy server cost an honest one: the same queries alone and beside each attack.
 
-The server is the real one with an untrained policy; the attackers (`tests.benchmarks.attackers`) are processes.
+The server is the real one with an untrained policy; the attackers (`tests.benchmarks.attackers`) are processes. The
+same attack on a second server shows what is due to this machine, which attackers, servers and client share.
 """
 
 import contextlib
@@ -40,38 +41,48 @@ def attacks(seconds: float = 5.0, turns: int = 3) -> int:
 
     Args:
       seconds: Length of each measurement.
-      turns: Measurements alone and beside each attack, alternating; medians are printed.
+      turns: Measurements alone, beside each attack on another server and on this one, in turn; medians are printed.
 
     Examples:
       python -m tests.benchmarks attacks
       python -m tests.benchmarks attacks --seconds 2 --turns 1
     """
     table = Table(title=f"{turns} x {seconds:g} s; load average {os.getloadavg()[0]:.1f}")
-    for column in ("beside", "honest", "alone", "attacked", "ratio"):
+    for column in ("beside", "honest", "alone", "elsewhere", "attacked", "attacked / alone", "attacked / elsewhere"):
         table.add_column(column, justify="right" if table.columns[1:] else "left")
-    with tempfile.TemporaryDirectory() as folder, _honest(pathlib.Path(folder), seconds) as (endpoint, measure):
-        query = pathlib.Path(folder, "query")
+    with tempfile.TemporaryDirectory() as name, _servers(folder := pathlib.Path(name), seconds) as (endpoints, measure):
         for kind, count in _KINDS.items():
-            alone, beside = [], []
+            rows: list[list[list[float]]] = [[], [], []]
             for _ in range(turns):
-                alone.append(measure())
-                with attacked(kind, endpoint, "policy", query if kind == "unread" else None, count):
-                    time.sleep(_SETTLE)
-                    beside.append(measure())
-            medians = zip(np.median(alone, 0), np.median(beside, 0), strict=True)
-            for (unit, digits), (before, after) in zip(_FIGURES.items(), medians, strict=True):
-                ratio = f"{after / max(before, 1e-9):.2f}"
-                table.add_row(f"{count} x {kind}", unit, f"{before:.{digits}f}", f"{after:.{digits}f}", ratio)
+                rows[0].append(measure())
+                for row, endpoint in zip(rows[1:], endpoints, strict=True):
+                    query = folder / "query" if kind == "unread" else None
+                    with attacked(kind, endpoint, "policy", query, count):
+                        time.sleep(_SETTLE)
+                        row.append(measure())
+            for (unit, digits), medians in zip(_FIGURES.items(), np.median(rows, 1).T, strict=True):
+                ratios = medians[2] / np.maximum(medians[:2], 1e-9)
+                figures = [*(f"{x:.{digits}f}" for x in medians), *(f"{x:.2f}" for x in ratios)]
+                table.add_row(f"{count} x {kind}", unit, *figures)
     Console(width=120).print(table)
     return 0
 
 
 @contextlib.contextmanager
-def _honest(folder: pathlib.Path, seconds: float) -> Iterator[tuple[str, Callable[[], list[float]]]]:
-    """A policy server's endpoint, and a function that returns `_FIGURES`; writes a long query to `folder/query`."""
-    bundles.save(untrained(get_preset("quickstart")), folder / "policy.safetensors")
-    with serving(folder / "policy.safetensors", folder / "serve.log") as (endpoint, process):
+def _servers(folder: pathlib.Path, seconds: float) -> Iterator[tuple[list[str], Callable[[], list[float]]]]:
+    """Endpoints of another policy server and of the honest client's, and a function that returns the honest `_FIGURES`.
+
+    Writes a long query to `folder/query`.
+    """
+    policy = folder / "policy.safetensors"
+    bundles.save(untrained(get_preset("quickstart")), policy)
+    with (
+        serving(policy, folder / "other.log") as (other, _),
+        serving(policy, folder / "serve.log") as (endpoint, process),
+    ):
         episode = example_episode(1_000_000)
+        with PolicyClient(other, wait=_START) as client:
+            client.metadata()
         with PolicyClient(endpoint, wait=_START) as client:
             client.metadata()
             (folder / "query").write_bytes(_long_query(client, episode))
@@ -82,7 +93,7 @@ def _honest(folder: pathlib.Path, seconds: float) -> Iterator[tuple[str, Callabl
                 p99 = 1e3 * float(np.percentile(times, 99))
                 return [p99, len(times) / seconds, 1e3 * _connecting(endpoint), memory]
 
-            yield endpoint, measure
+            yield [other, endpoint], measure
 
 
 def _latencies(client: PolicyClient, episode: Example, seconds: float) -> list[float]:

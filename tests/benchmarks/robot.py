@@ -1,6 +1,8 @@
 """The ROS 2 node's loop over Zenoh: a simulated hand on a wrist, the node and the policy server as processes."""
 
 import contextlib
+import dataclasses
+import functools
 import importlib.util
 import json
 import os
@@ -9,8 +11,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
+import jax
 import numpy as np
 import zenoh
 from rosbags.typesys import Stores, get_typestore
@@ -23,11 +27,15 @@ from congrasp.common.objects import procedural, store
 from congrasp.common.objects.pool import scale_objects
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import named_policy
+from congrasp.common.task import camera, sensing
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.constraints import goal_of
+from congrasp.common.task.types import Surface
 from congrasp.common.transport.ports import free_port
 
 EXAMPLES = pathlib.Path(__file__).resolve().parents[2] / "examples"
 JOINTS, POSE = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
+CLOUD, FIELD, FLOAT32 = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/PointField", 7
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 SEED = 1_000_000
 """Of the object."""
@@ -44,8 +52,44 @@ def example(name: str) -> Any:
     return module
 
 
+class DepthCamera:
+    """The camera of an episode as drawn in training (`common.task.camera`), which takes images throughout.
+
+    Attributes:
+      delay: seconds from an image to its arrival.
+    """
+
+    def __init__(self, robot: Any, task: TaskConfig, surface: np.ndarray, episode: int):
+        """Draws the camera and takes the first image, of an object with surface points (N, 3) in its frame, m."""
+        config = dataclasses.replace(task.sensing, single_image=0.0)
+        sensors = sensing.draw_sensors(config, task.control_dt, jax.random.key(episode), 1)
+        self._surface = Surface(surface[None].astype(np.float32), np.zeros((1, len(surface)), bool))
+        start, steps = robot.request, sensing.longest(config, task.control_dt)
+        goal, pose = goal_of(get_hand(task.hand), task, start), np.concatenate(start.object_pose)
+        goal, pose = jax.tree.map(lambda x: np.asarray(x, np.float32)[None], (goal, pose))
+        self._camera = camera.begin(task, sensors, steps, pose, self._surface, goal)
+        self._base = dict(zip(("base_position", "base_quaternion"), start.wrist, strict=True))
+        self._hand, self._steps, self._shown = get_hand(task.hand), 0, np.zeros(0)
+        self.delay = task.control_dt * int(sensors.delay[0])
+
+    def look(self, state: dict[str, np.ndarray]) -> np.ndarray | None:
+        """Advances by a control step to the robot's state; returns the points (N, 3) of an image that arrives, m."""
+        self._steps += 1
+        one = jax.tree.map(lambda x: np.asarray(x)[None], (np.int32(self._steps), state, self._base))
+        self._camera = _look(self._hand, self._camera, *one, self._surface)
+        before, self._shown = self._shown, np.asarray(self._camera.cloud.points[0])
+        return None if np.array_equal(before, self._shown) else self._shown
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _look(hand: Any, seen: Any, time: Any, state: dict[str, Any], base: dict[str, Any], surface: Surface) -> Any:
+    return camera.look(hand, seen, time, SimpleNamespace(**state), SimpleNamespace(**base), surface)
+
+
 class Rig:
     """A simulated hand whose joints, wrist and object are topics, and which follows the topics of commands.
+
+    A policy with a camera gets clouds of the object instead of its pose.
 
     Attributes:
       robot: the simulation (`examples/robot_loop.py`).
@@ -61,11 +105,12 @@ class Rig:
           robot: a `MujocoRobot` with the object of `SEED`.
           task: its task.
         """
-        self.robot, self._folder, self._hand, hand = robot, folder, task.hand, get_hand(task.hand)
+        self.robot, self._folder, self._task, hand = robot, folder, task, get_hand(task.hand)
         (obj,) = scale_objects(hand, task, [procedural.generate(SEED)])
         self._object = folder / f"object{store.SUFFIX}"
         store.save(obj, self._object)
         self._origin, self._names = np.asarray(obj.origin), [joint.name for joint in hand.joints]
+        self._surface, self._camera, self._episodes = obj.points[: task.surface_points], None, 0
         position, quaternion = self.robot.request.wrist
         self._base = np.asarray(position), Rotation.from_quat(quaternion, scalar_first=True)
         self._endpoint, config = f"tcp/127.0.0.1:{free_port()}", zenoh.Config()
@@ -89,9 +134,15 @@ class Rig:
         self.robot.reset()
         self._target, self._highest = (np.array(self.robot.request.q), np.zeros(6)), -np.inf
         self._begun = time.time_ns()
-        heading = " ".join(f"{x:.6f}" for x in self.robot.request.constraints["heading"]["direction"])
-        command = [sys.executable, str(EXAMPLES / "ros2_node.py"), str(self._object), "--zenoh", self._endpoint]
-        command += ["--connect", server, "--heading", heading, "--hand", self._hand, *options]
+        heading, thing = self.robot.request.constraints["heading"]["direction"], [str(self._object)]
+        if self._task.observation == "camera":
+            self._camera = DepthCamera(self.robot, self._task, self._surface, self._episodes)
+            self._episodes += 1
+            turn = Rotation.from_quat(self.robot.request.object_pose[1], scalar_first=True)
+            heading, thing = turn.apply(heading), ["--cloud-topic", "points"]
+        direction = " ".join(f"{x:.6f}" for x in heading)
+        command = [sys.executable, str(EXAMPLES / "ros2_node.py"), *thing, "--zenoh", self._endpoint]
+        command += ["--connect", server, "--heading", direction, "--hand", self._task.hand, *options]
         with (self._folder / "node.txt").open("wb") as output:
             environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parent)}
             self._node = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=environment)
@@ -132,7 +183,10 @@ class Rig:
         thing = Rotation.from_quat(state["object_quaternion"], scalar_first=True)
         self._send_joints(state["q"])
         self._send_pose("wrist_pose", self._base[0] + self._base[1].apply(state["u"][:3]), turn)
-        self._send_pose("object_pose", state["object_position"] + thing.apply(self._origin), thing)
+        if self._camera is None:
+            self._send_pose("object_pose", state["object_position"] + thing.apply(self._origin), thing)
+        elif (points := self._camera.look(state)) is not None:
+            self._send_points(points, self._camera.delay)
         joints, wrist = self._newest("joint_command", JOINTS), self._newest("wrist_command", POSE)
         q_target, u_target = self._target
         if joints is not None:
@@ -156,8 +210,8 @@ class Rig:
             return None
         return message
 
-    def _header(self) -> Any:
-        types, stamp = STORE.types, time.time_ns()
+    def _header(self, age: float = 0.0) -> Any:
+        types, stamp = STORE.types, time.time_ns() - round(1e9 * age)
         now = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
         return types["std_msgs/msg/Header"](stamp=now, frame_id="world")
 
@@ -172,24 +226,38 @@ class Rig:
         pose = types["geometry_msgs/msg/Pose"](place, types["geometry_msgs/msg/Quaternion"](x, y, z, w))
         self._session.put(topic, bytes(STORE.serialize_cdr(types[POSE](self._header(), pose), POSE)))
 
+    def _send_points(self, points: np.ndarray, age: float) -> None:
+        fields = [STORE.types[FIELD](name, 4 * i, FLOAT32, 1) for i, name in enumerate("xyz")]
+        data, size = points.astype("<f4").view(np.uint8).ravel(), len(points)
+        message = STORE.types[CLOUD](self._header(age), 1, size, fields, False, 12, 12 * size, data, True)
+        self._session.put("points", bytes(STORE.serialize_cdr(message, CLOUD)))
 
-def robot(seconds: float = 600.0, kill_every: float = 30.0, out: pathlib.Path = pathlib.Path("runs/robot")) -> int:
+
+def robot(
+    seconds: float = 600.0,
+    kill_every: float = 30.0,
+    student: str = "allegro-student",
+    out: pathlib.Path = pathlib.Path("runs/robot"),
+) -> int:
     """The ROS 2 node over Zenoh against a simulated hand that lifts an object, while the policy server is killed.
 
-    The policy is the student with a tracker, because the topics have neither contact forces nor velocities.
+    The policy is a student, because the topics have neither contact forces nor velocities.
 
     Args:
       seconds: How long.
       kill_every: Seconds from one kill to the next; half of them come while the object is held.
+      student: Policy: allegro-student has a tracker, allegro-camera a camera as in its training.
       out: Folder for the node's output.
 
     Examples:
       python -m tests.benchmarks robot
+      python -m tests.benchmarks robot --student allegro-camera
       python -m tests.benchmarks robot --seconds 60 --kill-every 20
     """
     out.mkdir(parents=True, exist_ok=True)
-    loop, policy = example("robot_loop"), named_policy("allegro-student")
-    hand, task = get_hand("allegro"), bundles.load(policy).task
+    loop, policy = example("robot_loop"), named_policy(student)
+    task = bundles.load(policy).task
+    hand = get_hand(task.hand)
     simulated = loop.MujocoRobot(hand, task, SEED, congrasp.JointLimits.of_hand(hand, task.control))
     with contextlib.closing(Rig(out, simulated, task)) as rig:
         server = loop.Server(policy)
@@ -197,7 +265,7 @@ def robot(seconds: float = 600.0, kill_every: float = 30.0, out: pathlib.Path = 
         end, kill = time.monotonic() + seconds, time.monotonic() + kill_every
         try:
             while time.monotonic() < end:
-                with congrasp.PolicyClient(server.url, hand="allegro", wait=180.0) as client:
+                with congrasp.PolicyClient(server.url, hand=task.hand, wait=180.0) as client:
                     client.metadata()  # the node itself does not wait for a server that is still compiling
                 rig.begin(server.url, "--lift", "0.1")
                 counts["episodes"] += 1

@@ -126,6 +126,19 @@ def test_libraries_add_nothing_to_the_line(arguments, words):
     is_one_line(done.returncode, done.stderr, words)
 
 
+def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path):
+    program = (
+        "import time; import congrasp.services.cli.main as cli; from congrasp.actors.physics import ENGINES; "
+        "ENGINES['native'] = ENGINES['native']._replace(prepare=lambda *_: time.sleep(3600)); cli.main()"
+    )
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port, options = str(taken.getsockname()[1]), ["--physics", "native", "--actors", "0"]
+        arguments = ["train", *options, "--run-dir", str(tmp_path / "run"), "--metrics-port", port]
+        command = [sys.executable, "-c", program, *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    is_one_line(done.returncode, done.stderr, f"metrics cannot be served at .*:{port}")
+
+
 @pytest.mark.parametrize(
     ("error", "line"),
     [
