@@ -58,6 +58,7 @@ class PolicyFunction:
 
     def warm_up(self, weights: InferenceParameters, sizes: Sequence[int] = BATCH_SIZES) -> dict[int, float]:
         """Compiles batches of these sizes; returns the seconds that one of each takes from then on."""
+        self.layout.estimate_normals(np.zeros((1, self.layout.size), np.float32))
         seconds = {}
         for size in sizes:
             batch = np.zeros((size, self.layout.size), np.float32)
@@ -72,6 +73,7 @@ class PolicyFunction:
         ends = list(itertools.accumulate(len(query.vectors) for query in queries))
         batch = np.zeros((next(size for size in BATCH_SIZES if size >= ends[-1]), self.layout.size), np.float32)
         np.concatenate([query.vectors for query in queries], out=batch[: ends[-1]])
+        self.layout.estimate_normals(batch[: ends[-1]])
         found = np.asarray(self._compiled(weights, batch))
         starts = [0, *ends[:-1]]
         return [self._answer(query, found[a:b]) for query, a, b in zip(queries, starts, ends, strict=True)]

@@ -20,6 +20,7 @@ vectors. Zeros are estimated from the points, those of a cloud toward `camera_po
 The reply is one array `packed` with a row for each state: action, finger targets, wrist targets.
 """
 
+import functools
 import hashlib
 import json
 import math
@@ -192,7 +193,7 @@ class Layout:
         held = rotations.rotate(rotations.multiply(*start), jnp.array(grasp_frame(self.hand).cross))
         fields["heading_cross"] = _orthogonal(fields["heading_cross"], fields["heading_direction"], held)
         if NORMALS in fields:
-            fields[NORMALS], length = self._normals(fields)
+            fields[NORMALS], length = _unit(fields[NORMALS], jnp.ones_like(finite), np.array((0, 0, 1), np.float32))
             lengths.append(length)
         surface, goal = self.surface(fields), self.goal(fields)
         fitting = [~asked[:, i] | c.valid(surface, goal[c.name]) for i, c in enumerate(self.known)]
@@ -202,17 +203,18 @@ class Layout:
         """Returns the labelled surface points, or the cloud, of completed fields."""
         return Surface(fields[self.points], fields["surface_avoid"], fields.get(NORMALS))
 
-    def _normals(self, fields: Mapping[str, Any]) -> tuple[jax.Array, jax.Array]:
-        """Normals (B, N, 3), estimated where a query has none, and the norm (B,) farthest from 1 of given ones."""
-        points, normals = fields[self.points], fields[NORMALS]
-        absent = jnp.all(normals == 0.0, (1, 2))
-        eye = fields.get(CAMERA)
-        estimated = estimated_normals(points)
-        if eye is not None:
-            known = jnp.any(eye != 0.0, -1)
-            estimated = jnp.where(known[:, None, None], estimated_normals(points, eye), estimated)
-        normals, length = _unit(normals, ~absent, np.array((0, 0, 1), np.float32))
-        return jnp.where(absent[:, None, None], estimated, normals), length
+    def estimate_normals(self, vectors: np.ndarray) -> None:
+        """Writes normals into queries (B, S) that have none, if the policy observes them; those of a surface are kept.
+
+        An estimate costs ten times an action, and an episode's points stay the same.
+        """
+        if NORMALS not in self.shapes:
+            return
+        own = self._places(NORMALS)
+        for index in np.flatnonzero(~vectors[:, own].any(1)):
+            row = vectors[index]
+            eye = self._field(row, CAMERA) if CAMERA in self.shapes else np.zeros(0, np.float32)
+            row[own] = _estimated(self._field(row, self.points).tobytes(), eye.tobytes() if eye.any() else b"")
 
     def goal(self, fields: Mapping[str, Any]) -> Goal:
         """Returns the goal arrays of completed fields, before the priority rules."""
@@ -256,6 +258,13 @@ class Layout:
                 "The query has no constraint that guides the wrist.", f"Add one of: {', '.join(leading)}."
             )
         return tuple(constraint.name for constraint in self.known if constraint.name in names)
+
+
+@functools.lru_cache(maxsize=1024)
+def _estimated(points: bytes, eye: bytes) -> np.ndarray:
+    """Normals (3 N) at points (N, 3), float32, toward an eye if there is one."""
+    cloud, *camera = (np.frombuffer(data, np.float32).reshape(1, -1, 3) for data in (points, eye) if data)
+    return np.asarray(estimated_normals(cloud, *(position[:, 0] for position in camera))).reshape(-1)
 
 
 def _unit(vectors: jax.Array, wanted: jax.Array, default: np.ndarray) -> tuple[jax.Array, jax.Array]:

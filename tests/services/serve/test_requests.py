@@ -17,6 +17,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import PAPER
 from congrasp.common.task.normals import estimated_normals
 from congrasp.common.wire.codec import Message
+from congrasp.services.serve import requests
 from congrasp.services.serve.requests import Layout
 from tests.queries import packed
 
@@ -192,6 +193,7 @@ def normals_of(task=CLOSER, **changes):
     if points == "cloud":
         given_arrays = {n: x for n, x in given_arrays.items() if "object" not in n} | {points: changes[points]}
     query = layout.parse(packed(layout, given_arrays))
+    layout.estimate_normals(query.vectors)
     checks, surface = complete(query.vectors)
     if error := layout.find_error(query, np.asarray(checks)):
         raise error
@@ -208,6 +210,21 @@ def test_given_normals_are_used_and_missing_ones_are_estimated():
     np.testing.assert_array_equal(normals_of(**twice, surface_avoid=None), axes)
     # A policy that does not observe normals ignores them.
     assert "surface_normals" not in parse(surface_normals=UP)[1]
+
+
+def test_normals_are_estimated_once_for_a_surface(monkeypatch):
+    calls = []
+    monkeypatch.setattr(requests, "estimated_normals", lambda points: calls.append(points) or estimated_normals(points))
+    layout, own = Layout(HAND, CLOSER), np.random.default_rng(3).normal(size=(2, 8, 3)).astype(np.float32)
+    vectors = np.zeros((5, layout.size), np.float32)
+    for row, surface in enumerate((0, 1, 0, 0, 1)):
+        vectors[row, layout.offsets["surface_points"] :][:24] = own[surface].reshape(-1)
+    vectors[3, layout.offsets["surface_normals"] :][:24] = UP.reshape(-1)
+    layout.estimate_normals(vectors.copy())
+    layout.estimate_normals(vectors)
+    assert len(calls) == 2
+    found, expected = layout.unpack(vectors)["surface_normals"], np.asarray(estimated_normals(own))
+    np.testing.assert_allclose(found, [expected[0], expected[1], expected[0], UP, expected[1]], atol=1e-5)
 
 
 @pytest.mark.parametrize(
