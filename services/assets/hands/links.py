@@ -136,7 +136,8 @@ def _palm(model: mujoco.MjModel, notes: list[str]) -> int:
     called = [link for link in best if _called(model, found[link][0])]
     chosen = max(called or best)
     palm = found[chosen][0]
-    others = [model.body(body).name for link in best for body in found[link] if body != palm and (body or len(found[link]) > 1)]
+    choices = [body for link in best for body in found[link] if body or len(found[link]) > 1]
+    others = [model.body(body).name for body in choices if body != palm]
     if others:
         notes.append(f"the palm could also be {' or '.join(others)} (--palm)")
     return palm
@@ -155,8 +156,8 @@ def _is_free(model: mujoco.MjModel, body: int) -> bool:
 def _forks(model: mujoco.MjModel, link: int) -> list[int]:
     """Body of a link whose bodies carry all of its branches: the world body may be a fixed mount below.
 
-    If that is the world itself, and the bodies with several of them are named as palms, those of several hands; then the
-    world, which may be the palm of one.
+    If that is the world itself, and the bodies with several of them are named as palms, these, of several hands, and
+    the world.
     """
     moved = np.array([body for body in np.flatnonzero(model.body_jntnum).tolist() if not _is_free(model, body)])
     carriers = [int(body) for body in model.body_parentid[moved] if model.body_weldid[body] == link]
