@@ -265,7 +265,7 @@ def _columns(names: list[str], *, titled: bool) -> tuple[list[int], int, float] 
     for what, some in (("position", places), ("quaternion", turns)):
         if len(some) != 1:
             several = f"several {what}s: {', '.join(name or 'x, y, z' for name, _ in some)}"
-            raise ValueError(f"names {several if some else f'no {what}'}")
+            raise ValueError(f"names {several[:300] if some else f'no {what}'}")
     (_, position), (_, turn) = places[0], turns[0]
     units = {position[letter][1] for letter in "xyz"}
     if not (len(units) == 1 and units <= METRES.keys()):
