@@ -5,6 +5,7 @@ Results are in metres, in a world frame with the z axis up, for the wrist frame 
 """
 
 import csv
+import itertools
 import pathlib
 import re
 from typing import NamedTuple
@@ -21,10 +22,13 @@ _LARGEST, _DEEPEST = 32 << 20, 200
 _UNIT_LENGTH = 0.01  # tolerance of a quaternion's length: positions in its place differ more
 HUGE = 1e9
 """Bound on angles, positions and quaternion components."""
-_UNIT = re.compile(r"\s*[\[(]\s*([^])]*?)\s*[])]")
-_LETTERED = re.compile(r"(.*?)[\W_]*([wxyz])(?:\[(.*)\]|_(m|mm|cm|in))?")  # name, letter and unit of a column
-_PLACE = re.compile(r"(?:.*[\W_])?[ptc]?|.*(?:pose?|position|trans|translation|location)")
-_NO_PLACE = re.compile(r"(?:.*[\W_])?[vawfnre]|.*(?:vel|speed|acc|linear|ang|gyro|force|tor|rot|euler|normal).*")
+_UNIT = re.compile(r" ?[\[(]([^][()]*)[])]")
+_LETTERED = re.compile(r"([wxyz]) *(?:\[([^][]*)\]|_(m|mm|cm|in))?$")  # letter and unit at the end of a column's name
+_SEPARATOR = re.compile(r"[\W_]+")
+_NO_PLACE = re.compile(
+    r"(?:.* )?(?:[vawfnre]|(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*)"
+)
+_KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.*")  # first word without a body
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
@@ -160,14 +164,14 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
 def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines.
 
-    A header, also in a comment or of two lines, may name them in any order and among other columns, such as t, qx, qy,
-    qz, qw, vx, vy, vz, px, py, pz, and positions in mm or cm: "x [mm]".
+    A header, also in a comment, may name them in any order and among other columns, such as t, qx, qy, qz, qw, vx, vy,
+    vz, px, py, pz, and positions in mm or cm: "x [mm]".
 
     Raises:
       CongraspError: the file has more than `largest` bytes or cannot be read, a line is not seven finite numbers, a
         header names no position or quaternion, or several, or quaternions are not of length one.
     """
-    columns, width, metres, named, above = list(range(7)), 7, 1.0, False, list[str]()
+    columns, width, metres, named, titled, mark = list(range(7)), 7, 1.0, False, False, ""
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
@@ -175,22 +179,34 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         raise CongraspError(f"{path} is not text.", remedy) from None
     rows: list[list[float]] = []
     for number, line in enumerate(lines, 1):
-        text, _, comment = line.partition("#")
-        words = _cells(text) if named else re.sub(r"[,;\"]", " ", text).split()
-        numbers = sum(map(_is_number, words))
-        if not any(words) or (not rows and (not numbers if named else 2 * numbers < len(words))):
-            names = _cells(_UNIT.sub(r"[\1]", text.strip() or comment).lower().strip(" #"))
-            try:
-                found = None if rows or named else _columns(names, above)
-            except ValueError as error:
-                raise CongraspError(f"line {number} of {path} {error}.", "Name them x, y, z, qw, qx, qy, qz.") from None
-            if found:
-                (columns, width, metres), named = found, True
-            above = names
-            continue
-        if len(words) < width or any(words[width:]) or not all(_is_number(words[column]) for column in columns):
-            raise CongraspError(f"line {number} of {path} is not {width} finite numbers.", remedy)
-        rows.append([float(words[column]) for column in columns])
+        comment = line.lstrip().startswith("#")
+        text = line.strip(" #") if comment else line if named else line.partition("#")[0]
+        advice = remedy
+        try:
+            if not (rows or named):
+                if "length units" in text.lower():
+                    raise ValueError("is of Motive, whose y axis may point up: export z up, in m, a header of one line")
+                header = _UNIT.sub(lambda unit: f"[{unit[1].strip()}]", re.sub("(?<=[a-z])(?=[A-Z])", "_", text))
+                names = _cells(header.lower(), _mark(text))
+                if comment or all(_number(name) is None for name in names):
+                    advice = "Name them x, y, z, qw, qx, qy, qz."
+                    if found := _columns(names, titled=titled):
+                        (columns, width, metres), named, mark = found, True, _mark(text)
+                    titled = titled or (any(names) and not comment)
+                    continue
+            if comment or not text.strip(" ,;\t"):
+                continue
+            if not rows:
+                mark = mark if mark and mark in text else _mark(text)
+            cells = _cells(text, mark)
+            values = [_number(cells[column]) for column in columns if column < len(cells)]
+            row = [value for value in values if value is not None and abs(value) < HUGE]
+            if len(cells) < width or any(cells[width:]) or len(row) < 7:
+                raise ValueError(f"is not {width} finite numbers")
+        except (ValueError, csv.Error) as error:
+            what = f"cannot be read: {error}" if isinstance(error, csv.Error) else error
+            raise CongraspError(f"line {number} of {path} {what}.", advice) from None
+        rows.append(row)
     if not rows:
         raise CongraspError(f"{path} has no numbers.", remedy)
     table = np.array(rows)
@@ -199,45 +215,57 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     return metres * table[:, :3], table[:, 3:]
 
 
-def _cells(line: str) -> list[str]:
-    """The cells of a line between semicolons, tabs, commas or blanks; decimal commas become points."""
-    mark = next((mark for mark in ";\t," if mark in line), None)
-    cells = line.split() if mark is None else next(csv.reader([line], delimiter=mark, skipinitialspace=True), [])
-    return [cell.strip(" '").replace(",", "." if mark == ";" else ",") for cell in cells]
+def _mark(line: str) -> str:
+    """The separator of a line's cells; empty for blanks."""
+    return next((mark for mark in ";\t," if mark in line), "")
 
 
-def _columns(names: list[str], above: list[str]) -> tuple[list[int], int, float] | None:
+def _cells(line: str, mark: str) -> list[str]:
+    """The cells of a line; with semicolons between them, decimal commas become points."""
+    cells = next(csv.reader([line], delimiter=mark, skipinitialspace=True), []) if mark else line.split()
+    return [cell.strip(" '\"").replace(",", "." if mark == ";" else ",") for cell in cells]
+
+
+def _columns(names: list[str], *, titled: bool) -> tuple[list[int], int, float] | None:
     """Places of x, y, z and the quaternion w, x, y, z in a header, the number of its columns, and metres per unit.
 
-    Columns of one name before their letters belong together, or of one name in the line above: with w they are a
-    quaternion. None for other text.
+    Columns of one name before their letters belong together: with w they are a quaternion, whose position shares most
+    leading words with it. None for other text.
 
     Raises:
-      ValueError: it names no position or no quaternion, or several.
+      ValueError: it names no position or no quaternion, or several, or a name twice below a title.
     """
     while names and not names[-1]:
         names = names[:-1]
-    if len(above) >= len(names) and not any(above[len(names) :]):
-        names = [f"{over} {name}" if len(name) == 1 else name for over, name in zip(above, names, strict=False)]
     groups: dict[str, list[dict[str, tuple[int, str]]]] = {}
-    for place, lettered in enumerate(map(_LETTERED.fullmatch, names)):
-        if lettered:
-            name, letter, bracketed, suffix = lettered.groups()
-            same = groups.setdefault(name, [{}])
-            if letter in same[-1] or (letter == "w" and not name and len(same) == 1 and len(same[0]) == 3):
+    for place, name in enumerate(names):
+        if lettered := _LETTERED.search(name):
+            letter, bracketed, suffix = lettered.groups()
+            body = " ".join(_SEPARATOR.split(name[: lettered.start()])).strip()
+            same = groups.setdefault(body, [{}])
+            if letter in same[-1] or (letter == "w" and not body and len(same) == 1 and len(same[0]) == 3):
                 same.append({})  # of columns x, y, z, w, x, y, z
             same[-1][letter] = (place, bracketed or suffix or "m")
     whole = [(name, group) for name, same in groups.items() for group in same]
     turns = [(name, group) for name, group in whole if group.keys() == set("wxyz")]
-    vectors = [(name, group) for name, group in whole if group.keys() == set("xyz")]
-    if not (vectors or turns or len(_NUMBERED.findall(",".join(names))) > 3):
+    places = [(name, group) for name, group in whole if group.keys() == set("xyz")]
+    if not (places or turns or len(_NUMBERED.findall(",".join(names))) > 3):
         return None
-    places = [one for one in vectors if _PLACE.fullmatch(one[0])]
-    places = places or [one for one in vectors if not _NO_PLACE.fullmatch(one[0])]
+    if titled and any(len(same) > 1 for same in groups.values()):
+        raise ValueError("names columns twice below another line: it needs a header of one line")
+    places = [one for one in places if not _NO_PLACE.fullmatch(one[0])]
+    if len(turns) == 1:
+        turned = turns[0][0]
+        shared = [_shared(name.split(), turned.split()) for name, _ in places]
+        most = max(shared, default=0)
+        places = [one for one, words in zip(places, shared, strict=True) if words == most]
+        bodies = [name.partition(" ")[0] for name in (*dict(places[:1]), turned)]
+        if not most and len(places) == 1 and not any(map(_KIND.fullmatch, bodies)):
+            raise ValueError(f"names the position of '{bodies[0]}', but the quaternion of '{bodies[1]}'")
     for what, some in (("position", places), ("quaternion", turns)):
         if len(some) != 1:
             several = f"several {what}s: {', '.join(name or 'x, y, z' for name, _ in some)}"
-            raise ValueError(f"names {several if some else f'no {what}'}")
+            raise ValueError(f"names {several[:300] if some else f'no {what}'}")
     (_, position), (_, turn) = places[0], turns[0]
     units = {position[letter][1] for letter in "xyz"}
     if not (len(units) == 1 and units <= METRES.keys()):
@@ -246,12 +274,17 @@ def _columns(names: list[str], above: list[str]) -> tuple[list[int], int, float]
     return columns, len(names), METRES[units.pop()]
 
 
-def _is_number(word: str) -> bool:
-    """True if a word is a plausible number."""
+def _shared(first: list[str], second: list[str]) -> int:
+    """Number of leading words that two names have in common."""
+    return len(list(itertools.takewhile(lambda pair: pair[0] == pair[1], zip(first, second, strict=False))))
+
+
+def _number(word: str) -> float | None:
+    """The number in a word, also one that is not finite."""
     try:
-        return abs(float(word)) < HUGE
+        return float(word)
     except ValueError:
-        return False
+        return None
 
 
 def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:

@@ -34,7 +34,7 @@ LIMITS = {"nbody": 1000, "nv": 500, "ngeom": 10_000, "nmesh": 1000, "nmeshvert":
 LEAST = 1e-3, 1e-7
 """Mass (kg) and inertia (kg m2) of moving links without mass."""
 _BALL = 0.4 * 0.02**2  # kg m2 for each kg: inertia of a ball with the radius of a finger link
-_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical")
 _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 _START = 30  # s, for the child's imports on a busy machine
 _MOST_FILES = 300  # that a description names
@@ -302,10 +302,10 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
         names = Counter(element.get("name") for element in robot.findall(kind))
         if repeated := [name for name, count in names.items() if count > 1]:
             raise _Known(f"several {kind}s are called '{repeated[0]}'. Rename all but one")
+    _check_joints(robot, notes)
     children = {child.get("link") for child in robot.findall("joint/child")}
     if robot.find("link") is not None and all(link.get("name") in children for link in robot.findall("link")):
         raise _Known("its links form a loop, and none is the root. Remove the joint that closes it")
-    _check_joints(robot, notes)
     _complete_inertias(robot, notes)
     assets, shared, lacking = dict[str, bytes](), dict[tuple[pathlib.Path | None, str], str](), dict[str, None]()
     for link in robot.iter("link"):
@@ -376,10 +376,12 @@ def _complete_inertias(robot: ET.Element, notes: list[str]) -> None:
             link.remove(found[0])
             weightless.append(link.get("name", ""))
             continue
+        if (weight := _value(mass, "value", link)) < 0:
+            raise _Known(f"the mass of the link '{link.get('name', '')[:40]}' is {weight:g}, below zero. Correct it")
         inertia = found[0].find("inertia")
         inertia = ET.SubElement(found[0], "inertia") if inertia is None else inertia
-        if not {"ixx", "iyy", "izz"} <= inertia.attrib.keys():
-            inertia.attrib |= dict.fromkeys(("ixx", "iyy", "izz"), str(_BALL * _value(mass, "value", link)))
+        if not set(_INERTIA[:3]) <= inertia.attrib.keys():
+            inertia.attrib = dict.fromkeys(_INERTIA[:3], str(_BALL * weight))
             guessed.append(link.get("name", ""))
         for name in _INERTIA:
             inertia.set(name, str(_value(inertia, name, link)))

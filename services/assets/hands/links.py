@@ -89,7 +89,7 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
     palm = names.index(wanted) if wanted else _palm(model, notes)
     owner, groups, loose = {palm: palm}, {palm: [palm]}, list[str]()
     for body in range(palm + 1, model.nbody):
-        if not model.body_parentid[body] and _is_free(model, body):
+        if not model.body_parentid[body] and mujoco.mjtJoint.mjJNT_FREE in model.jnt_type[hinges(model, body)]:
             loose.append(names[body] or f"body {body}")
         elif int(model.body_parentid[body]) in owner:
             owner[body] = max(palm, int(model.body_weldid[body]))
@@ -133,13 +133,19 @@ def _palm(model: mujoco.MjModel, notes: list[str]) -> int:
     found = {link: _forks(model, link) for link, count in branches.items() if count > 1} or {0: [0]}
     most = max(branches.get(link, 0) for link in found)
     best = [link for link in found if branches.get(link, 0) == most]
-    called = [link for link in best if any(word in model.body(found[link][0]).name.lower() for word in _CALLED)]
+    called = [link for link in best if _called(model, found[link][0])]
     chosen = max(called or best)
     palm = found[chosen][0]
-    others = [model.body(body).name for link in best for body in found[link] if body not in (0, palm)]
+    choices = [body for link in best for body in found[link] if body or len(found[link]) > 1]
+    others = [model.body(body).name for body in choices if body != palm]
     if others:
         notes.append(f"the palm could also be {' or '.join(others)} (--palm)")
     return palm
+
+
+def _called(model: mujoco.MjModel, body: int) -> bool:
+    """True if a body is named as a palm."""
+    return any(word in model.body(body).name.lower() for word in _CALLED)
 
 
 def _is_free(model: mujoco.MjModel, body: int) -> bool:
@@ -150,7 +156,8 @@ def _is_free(model: mujoco.MjModel, body: int) -> bool:
 def _forks(model: mujoco.MjModel, link: int) -> list[int]:
     """Body of a link whose bodies carry all of its branches: the world body may be a fixed mount below.
 
-    If that is the world itself, the bodies with several of them, which are the palms of several hands.
+    If that is the world itself, and the bodies with several of them are named as palms, these, of several hands, and
+    the world.
     """
     moved = np.array([body for body in np.flatnonzero(model.body_jntnum).tolist() if not _is_free(model, body)])
     carriers = [int(body) for body in model.body_parentid[moved] if model.body_weldid[body] == link]
@@ -164,7 +171,7 @@ def _forks(model: mujoco.MjModel, link: int) -> list[int]:
         paths.append(path)
     fork = next(body for body in paths[0] if all(body in path for path in paths))
     palms = [body for body, count in Counter(carriers).items() if count > 1 and body]
-    return [fork] if fork or len(palms) < 2 else palms
+    return [*palms, 0] if not fork and len(palms) > 1 and all(_called(model, body) for body in palms) else [fork]
 
 
 def placed(tree: Tree, link: int, *, colliding: bool) -> list[trimesh.Trimesh]:

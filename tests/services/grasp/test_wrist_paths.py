@@ -110,6 +110,16 @@ ROS = "x,y,z,qx,qy,qz,qw"
         ),
         ("wrist_x,wrist_y,wrist_z,acc_x,acc_y,acc_z,wrist_rot_x,wrist_rot_y,wrist_rot_z,wrist_rot_w", "pvq", ","),
         ("x_mm,y_mm,z_mm,qx,qy,qz,qw", "mq", ","),
+        (
+            "wrist_x,wrist_y,wrist_z,wrist_qx,wrist_qy,wrist_qz,wrist_qw,target_pos_x,target_pos_y,target_pos_z",
+            "pqv",
+            ",",
+        ),
+        ("targetPosX,targetPosY,targetPosZ,wristPosX,wristPosY,wristPosZ,wristQX,wristQY,wristQZ,wristQW", "vpq", ","),
+        (",".join(f"end_effector_{name}" for name in ROS.split(",")), "pq", ","),
+        (",".join(f"torso_{name}" for name in ROS.split(",")), "pq", ","),
+        ("title,of,the,file,and,its,cells,written\n" + ROS, "pq", ","),
+        (ROS, "pq", " "),
         ("Pos X [cm],Pos Y [cm],Pos Z [cm],QX [-],QY [-],QZ [-],QW [-]", "cq", ","),
     ],
 )
@@ -129,9 +139,7 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
     rows = np.c_[POSITION, ROTATION.as_quat()].tolist()
     save("ros.csv", f"stamp,frame_id,note,{ROS}", [[i, "", '"a, b"', *row] for i, row in enumerate(rows)])
     save("dec.csv", ROS.replace(",", ";"), [[str(x).replace(".", ",") for x in row] for row in rows], ";")
-    above = ",,Rotation,Rotation,Rotation,Rotation,Position,Position,Position"
-    motive = f"Format Version,1.23,Frames,{len(rows)}\n\n{above}\nFrame,Time (Seconds),X,Y,Z,W,X,Y,Z"
-    save("motive.csv", motive, [[i, 0.1, *row[3:], *row[:3]] for i, row in enumerate(rows)])
+    save("note.csv", f"note,{ROS}", [[f"a;b #{i}", *row] for i, row in enumerate(rows)])
     with pytest.raises(CongraspError, match="quaternions that are not of length one"):
         save("turned.csv", "X,Y,Z,W,X,Y,Z", [row[3:] + row[:3] for row in rows])
 
@@ -142,8 +150,16 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
         ("vx,vy,vz,qx,qy,qz,qw", "no position"),
         ("x,y,z,q1,q2,q3,q4", "no quaternion"),
         ("x,y,z,roll,pitch,yaw,grip", "no quaternion"),
-        ("px,py,pz,elbow.px,elbow.py,elbow.pz,qx,qy,qz,qw", "several positions: p, elbow.p"),
+        ("px,py,pz,elbow.px,elbow.py,elbow.pz,qx,qy,qz,qw", "several positions: p, elbow p"),
         ("x_mm,y_mm,z_m,qx,qy,qz,qw", "positions in m and mm, not all in one of m, cm, mm, in"),
+        (
+            "target_x,target_y,target_z,wrist_qw,wrist_qx,wrist_qy,wrist_qz",
+            "the position of 'target', but the quat.*'wrist'",
+        ),
+        (
+            "wrist_pos_x,wrist_pos_y,wrist_pos_z,wrist_tip_x,wrist_tip_y,wrist_tip_z,wrist_qw,wrist_qx,wrist_qy,wrist_qz",
+            "several positions: wrist pos, wrist tip",
+        ),
         ("lx,ly,lz,lqw,lqx,lqy,lqz,rx,ry,rz,rqw,rqx,rqy,rqz", "several quaternions"),
         ("# lx ly lz lqx lqy lqz lqw rx ry rz rqx rqy rqz rqw", "several quaternions"),
     ],
@@ -151,6 +167,24 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
 def test_a_header_without_one_position_and_one_quaternion_is_refused(tmp_path, header, complaint):
     (tmp_path / "a.csv").write_text(f"{header}\n0,0,0,1,0,0,0\n")
     with pytest.raises(CongraspError, match=rf"line 1 of .*a\.csv names {complaint}.*\. Name them x, y, z, qw"):
+        read_wrist_path(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("0,0,0,nan,nan,nan,nan\n0,0,0,1,0,0,0", "line 1 of .* is not 7 finite numbers"),
+        ("1,2,3,,x,y,z\n0,0,0,1,0,0,0", "line 1 of .* is not 7 finite numbers"),
+        (f"{ROS}\nm,m,m,,,,\n0,0,0,0,0,0,1", "line 2 of .* is not 7 finite numbers"),
+        (f"note,{ROS}\n{'a' * 200_000},0,0,0,0,0,0,1", "line 2 of .* cannot be read: field larger"),
+        ("Format Version,1.23,Length Units,Millimeters\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0", "line 1 of .*export z up"),
+        ("Rotation,,,,Position,,\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0", "line 2 of .* names columns twice below another"),
+        ("a" + "[ " * 300 + "_" * 40_000 + "\n", "has no numbers"),
+    ],
+)
+def test_lines_that_could_be_misread_are_refused(tmp_path, text, complaint):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(CongraspError, match=complaint):
         read_wrist_path(tmp_path / "a.csv")
 
 
