@@ -5,6 +5,7 @@ import trimesh
 from scipy.ndimage import binary_propagation, distance_transform_edt, label
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import connected_component_labels
+from trimesh.proximity import closest_point
 
 from congrasp.services.assets.objects.fidelity import voxels
 from congrasp.services.assets.objects.options import LONGEST
@@ -18,6 +19,7 @@ _FEW = 0.05  # share of a mesh that may be missing
 _FLAT = 0.08  # of its width: greatest thickness of a table
 _SMALLEST = 0.03  # m: least length of what is left of a scan without its table
 _FINS = 10  # rings of triangles that may stand out from a closed surface
+_NEAR = 0.01  # of the size: how far they may
 _APART = 0.02  # of the mesh's size: bodies whose boxes are nearer than this belong together
 
 
@@ -230,15 +232,25 @@ def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 
 def _without_fins(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
-    """The mesh without triangles at a free edge, and those at the edges that this frees; None unless that closes it."""
-    faces = np.asarray(mesh.faces)
+    """The mesh without triangles at a free edge, and those at the edges that this frees.
+
+    None unless that closes it, and all that is left out lies within `_NEAR` of the rest.
+    """
+    faces, removed = np.asarray(mesh.faces), list[np.ndarray]()
     for _ in range(_FINS):
         _, group, counts = np.unique(_codes(faces_to_edges(faces)), return_inverse=True, return_counts=True)
         free = (counts[group.reshape(-1)] == 1).reshape(-1, 3).any(1)
         if not free.any():
             rest = trimesh.Trimesh(mesh.vertices, faces, process=False)
             rest.remove_unreferenced_vertices()
-            return rest if rest.is_watertight and rest.area > (1 - _FEW) * mesh.area else None
+            if not (removed and rest.is_watertight and rest.area > (1 - _FEW) * mesh.area):
+                return None
+            corners = mesh.vertices[np.concatenate(removed)]
+            points = np.concatenate(
+                [corners, (corners + np.roll(corners, 1, 1)) / 2, corners.mean(1, keepdims=True)], axis=1
+            )
+            return rest if closest_point(rest, points.reshape(-1, 3))[1].max() < _NEAR * mesh.scale else None
+        removed.append(faces[free])
         faces = faces[~free]
     return None
 

@@ -64,7 +64,23 @@ def test_a_distant_speck_changes_nothing_of_a_large_scan(tmp_path):
 
 
 def _with_fin(mesh):
-    return trimesh.util.concatenate([mesh, trimesh.Trimesh([*mesh.vertices[mesh.edges[0]], [0, 0, 0.06]], [[0, 1, 2]])])
+    edge = mesh.vertices[mesh.edges[0]]
+    return trimesh.util.concatenate([mesh, trimesh.Trimesh([*edge, 1.02 * edge.mean(0)], [[0, 1, 2]])])
+
+
+@pytest.mark.parametrize("rows", [3, 20])
+def test_a_handle_of_one_sheet_is_kept(rows):
+    """From edge to edge of the side of a mug, in two spans or many."""
+    cup = trimesh.creation.box((0.08, 0.016, 0.1)).subdivide().subdivide()
+    a = np.linspace(0, np.pi, rows)
+    spine = np.stack([0.04 + 0.03 * np.sin(a), 0 * a, 0.025 * np.cos(a)], -1)[:, None]
+    strap = (spine + np.array([[0, 0, 0], [0, 0.004, 0]])).reshape(-1, 3)
+    faces = [face for i in range(0, 2 * rows - 2, 2) for face in ((i, i + 1, i + 2), (i + 1, i + 3, i + 2))]
+    mug = trimesh.util.concatenate([cup, trimesh.Trimesh(strap, faces, process=False)])
+    mug.merge_vertices()
+    assert (mug.faces.shape, mug.body_count) == ((len(cup.faces) + len(faces), 3), 1)
+    said = list[str]()
+    assert len(closed(mug, said).faces) == len(mug.faces) and not said
 
 
 @pytest.mark.parametrize(
