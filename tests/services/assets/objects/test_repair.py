@@ -6,7 +6,7 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects import repair
-from congrasp.services.assets.objects.mesh_files import read_mesh
+from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.repair import closed, largest_body, reduced, without_hollows
@@ -108,16 +108,49 @@ def test_what_single_precision_has_rounded_away_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("turn", [1, -1])
-def test_dented_polygons_are_cut_inside_of_them(tmp_path, turn):
+@pytest.mark.parametrize("end", ["", "# end", "\\\n"])
+def test_dented_polygons_are_cut_inside_of_them(tmp_path, turn, end):
     """The ends of a channel, as modelling programs export it: one polygon each."""
     outline = [(0, 0), (6, 0), (6, 4), (5, 4), (5, 1), (1, 1), (1, 4), (0, 4)][::turn]
     points = [(x, y, z) for z in (0, 3) for x, y in outline]
     sides = [(i, (i + 1) % 8, (i + 1) % 8 + 8, i + 8) for i in range(8)]
     faces = [tuple(range(8))[::-1], tuple(range(8, 16)), *sides]
     text = "".join("v {} {} {}\n".format(*point) for point in points)
-    (tmp_path / "a.obj").write_text(text + "".join(f"f {' '.join(f'{i + 1}//' for i in face)}\n" for face in faces))
+    (tmp_path / "a.obj").write_text(text + "".join(f"f {_row(face, end)}\n" for face in faces))
     mesh = read_mesh(tmp_path / "a.obj")
     assert mesh.is_watertight and abs(mesh.volume) == pytest.approx(36) and mesh.area == pytest.approx(24 + 26 * 3)
+
+
+def _row(face, end):
+    words = [f"{i + 1}//" for i in face]
+    return " ".join([*words[:3], end, *words[3:]] if "\n" in end else [*words, end])
+
+
+def _flat(outline, face=None):
+    face = face or range(len(outline))
+    return "".join(f"v {x} {y} 0\n" for x, y in outline) + f"f {' '.join(str(i + 1) for i in face)}\n"
+
+
+def test_a_polygon_with_a_bridge_to_its_hole_and_dented_quads_are_cut(tmp_path):
+    square = [(0, 0), (4, 0), (4, 4), (0, 4), (1, 1), (1, 3), (3, 3), (3, 1)]
+    for text, area in [
+        (_flat(square, (0, 1, 2, 3, 0, 4, 5, 6, 7, 4)), 12),
+        (_flat([(0, 0), (2, 0), (0.5, 0.5), (0, 2)]), 1),
+    ]:
+        (tmp_path / "a.obj").write_text(text)
+        assert load_geometry(tmp_path / "a.obj", "").area == pytest.approx(area)
+
+
+def test_many_corners_are_left_with_a_note(tmp_path):
+    angle = np.linspace(0, 2 * np.pi, 66, endpoint=False)
+    radius = np.where(np.arange(66) % 2, 1, 0.4)
+    (tmp_path / "a.obj").write_text(_flat(np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)))
+    said = list[str]()
+    assert len(load_geometry(tmp_path / "a.obj", "", notes=said).faces) == 64
+    assert said == ["1 of its dented polygons could not be cut and may be filled (export it as triangles)"]
+    (tmp_path / "a.obj").write_text("v 0 0\n" + _flat(np.eye(4, 2)))
+    with pytest.raises(CongraspError, match="a point has fewer than three numbers"):
+        read_mesh(tmp_path / "a.obj")
 
 
 @pytest.mark.parametrize(("neck", "filled"), [(0.004, True), (0.012, False)])
