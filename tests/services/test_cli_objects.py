@@ -95,6 +95,8 @@ def test_a_name_that_is_also_a_path_is_ambiguous(tmp_path, monkeypatch, quick_im
     monkeypatch.chdir(tmp_path)
     stored = Catalogue("objects").add(find_object("mug:7"))
     (tmp_path / "mug_7").mkdir()
+    (tmp_path / "mug_7" / "grasp.npz").touch()
+    assert find_object("mug_7").name == "mug_7"  # which a folder of grasps leaves alone
     trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "mug_7" / "block.stl")
     said = r"'mug_7' is a folder here, and an object in objects\. Pass \./mug_7 or objects/mug_7\.safetensors"
     for find in (find_object, lambda name: constraints.Generate((name,))()):

@@ -19,7 +19,7 @@ from congrasp.common.hands.files import HUMAN
 from congrasp.common.objects.shapes import halves
 from congrasp.common.objects.spec import GraspObject, Piece
 from congrasp.common.task.sampling.headings import max_width, sample_headings, within_reach
-from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
+from congrasp.services.assets.objects.mesh_files import check_triangles, load_geometry, up_of, upright
 
 LEAST_SHARE = 0.10
 """Least share of the surface that the graspable region must have (paper, section Constraint Setup)."""
@@ -114,6 +114,8 @@ def from_part(obj: GraspObject, path: pathlib.Path) -> np.ndarray:
     up = "y" if obj.file_up == "y" else up_of(geometry)
     geometry = geometry.to_geometry() if isinstance(geometry, trimesh.Scene) else geometry
     points = np.asarray(getattr(geometry, "vertices", ()), float).reshape(-1, 3)
+    if len(getattr(geometry, "faces", ())):
+        check_triangles(path, geometry)
     if len(getattr(geometry, "faces", ())) and geometry.area > 0:
         points = np.concatenate([points, trimesh.sample.sample_surface(geometry, 8000, seed=0)[0]])
     points = upright(points[np.isfinite(points).all(-1)], up)

@@ -41,7 +41,10 @@ _ZERO = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t]0+(?=[/\s]|$)")
 _COMMA = re.compile(rb"(?mi)^[ \t]*(v[ \t]+|vertex[ \t]+)?[-+]?\d+,\d+(?:e[-+]?\d+)?[ \t]")
 _POINT = re.compile(rb"(?m)^[ \t]*v[ \t]")
 _POINTS = re.compile(rb"(?m)^[ \t]*v[ \t]+([^\n#]*)")
-_POLYGON = re.compile(rb"(?m)^[ \t]*f((?:[ \t]+\d[\d/]*){4,64})[ \t\r]*$")
+_POLYGON = re.compile(rb"(?m)^[ \t]*f((?:[ \t]+\d[\d/]*){4,})[ \t\r]*$")
+_REMARK = re.compile(rb"(?m)^([ \t]*f[^\n#]*)#[^\n]*")
+_CORNERS, _CUT = 64, 20_000  # most corners of a dented polygon that is cut, and of all that have more than four
+_DENT = 0.01  # sine of the least turn of a corner against the others
 _FACE = re.compile(rb"(?m)^[ \t]*f[ \t][^\n#]*")
 _INDEX = re.compile(rb"[ \t](\d{1,18})")
 _NO_POINT = "a face refers to a point that is not in the file"
@@ -77,8 +80,7 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto
         raise CongraspError(*_without_triangles(path, kind, data, len(getattr(mesh, "vertices", ()))))
     if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
         raise CongraspError(f"{path} has points that are not of three numbers.", _AGAIN)
-    if len(mesh.faces) > MAX_FACES or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise CongraspError(f"{path} has triangles without vertices, or too many.", _AGAIN)
+    check_triangles(path, mesh)
     finite = repair.without_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), said)
     if finite is None:
         bad = int((~np.isfinite(mesh.vertices)).any(-1).sum())
@@ -97,6 +99,12 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto
         raise CongraspError(f"{path} has no volume: only {len(mesh.faces)} proper triangles.", "Export a closed mesh.")
     mesh.metadata["kind"] = kind
     return mesh
+
+
+def check_triangles(path: pathlib.Path, mesh: trimesh.Trimesh) -> None:
+    """Raises a CongraspError if a triangle of a mesh refers to a vertex that it lacks, or there are too many."""
+    if len(mesh.faces) > MAX_FACES or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise CongraspError(f"{path} has triangles without vertices, or too many.", _AGAIN)
 
 
 def up_of(geometry: Any, up: Up = "auto") -> Literal["y", "z"]:
@@ -325,15 +333,16 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
         data = data.replace(b"\r", b"\n")
     if _ZERO.search(data):
         raise ValueError("a face has the index 0, but OBJ counts from 1")
+    data = _REMARK.sub(rb"\1", re.sub(rb"\\\r?\n", b" ", data))
     if _RELATIVE.search(data):
         data = _absolute_obj(data)
-    return _cut_polygons(data) if _POLYGON.search(data) else data
+    return _cut_polygons(data, notes) if _POLYGON.search(data) else data
 
 
 def _absolute_obj(data: bytes) -> bytes:
     """An OBJ whose negative indices are replaced."""
     counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
-    for line in re.sub(rb"\\\r?\n", b" ", data).splitlines():
+    for line in data.splitlines():
         words = line.split()
         if words and words[0] in counts:
             counts[words[0]] += 1
@@ -346,21 +355,36 @@ def _absolute_obj(data: bytes) -> bytes:
     return b"\n".join(lines)
 
 
-def _cut_polygons(data: bytes) -> bytes:
+def _cut_polygons(data: bytes, notes: list[str]) -> bytes:
     """An OBJ whose dented polygons are cut into triangles inside of them; readers cut all as if they had no dent."""
-    points = np.array([[_number(word) for word in row.split()[:3]] for row in _POINTS.findall(data)])
+    numbers = [row.split()[:3] for row in _POINTS.findall(data)]
+    if any(len(row) < 3 for row in numbers):
+        raise ValueError("a point has fewer than three numbers")
+    points = np.array([_number(word) for row in numbers for word in row]).reshape(-1, 3)
     polygons: dict[int, list[tuple[re.Match[bytes], list[bytes]]]] = {}
     for row in _POLYGON.finditer(data):
         polygons.setdefault(len(corners := row[1].split()), []).append((row, corners))
-    cut: list[tuple[re.Match[bytes], bytes]] = []
-    for some in polygons.values():
-        places = np.array([[int(corner.partition(b"/")[0]) - 1 for corner in corners] for _, corners in some])
+    cut, budget, uncut = list[tuple[re.Match[bytes], bytes]](), _CUT, 0
+    for count, some in sorted(polygons.items()):
+        words = re.sub(rb"/[\d/]*", b"", b" ".join(row[1] for row, _ in some)).split()
+        places = np.array([*map(int, words)]).reshape(-1, count) - 1
         if places.max() >= len(points):
             return data  # which is an error of its own
-        for i in np.flatnonzero(_dented(points[places])):
+        turns = _turns(points[places])
+        for i in np.flatnonzero((turns < -_DENT).any(1)):
             row, corners = some[i]
-            triangles = _ears(points[places[i]])
+            triangles: list[list[int]] = []
+            if count == 4:
+                dents = np.flatnonzero(turns[i] < -_DENT)
+                order = [(int(dents[0]) + k) % 4 for k in range(4)]
+                triangles = [order[:3], [order[0], *order[2:]]] if len(dents) == 1 else []
+            elif count <= min(_CORNERS, budget):
+                budget -= count
+                triangles = _ears(points[places[i]])
+            uncut += not triangles
             cut.append((row, b"\n".join(b"f " + b" ".join(corners[k] for k in ear) for ear in triangles) or row[0]))
+    if uncut:
+        notes.append(f"{uncut} of its dented polygons could not be cut and may be filled (export it as triangles)")
     ends, parts = 0, list[bytes]()
     for row, text in sorted(cut, key=lambda one: one[0].start()):
         parts += [data[ends : row.start()], text]
@@ -374,33 +398,44 @@ def _normals(corners: np.ndarray) -> np.ndarray:
     return np.cross(spokes, np.roll(spokes, -1, 1)).sum(1)
 
 
-def _dented(corners: np.ndarray) -> np.ndarray:
-    """(n,) bool: polygons (n, k, 3) with a corner that turns against the others."""
+@np.errstate(all="ignore")
+def _turns(corners: np.ndarray) -> np.ndarray:
+    """(n, k) sines of the turns at the corners of polygons (n, k, 3), negative at dents."""
     sides, normals = np.roll(corners, -1, 1) - corners, _normals(corners)
-    turns = np.einsum("nkd,nd->nk", np.cross(np.roll(sides, 1, 1), sides), normals)
-    return np.asarray(turns.min(1) < -1e-3 * (normals**2).sum(-1))
+    sides /= np.linalg.norm(sides, axis=-1, keepdims=True)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return np.einsum("nkd,nd->nk", np.cross(np.roll(sides, 1, 1), sides), normals)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products (...) of vectors (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _ears(corners: np.ndarray) -> list[list[int]]:
-    """Triangles of a polygon (n, 3), cut off ear by ear; none if it crosses itself."""
+    """Triangles of a polygon (n, 3), cut off ear by ear; none if it crosses itself.
+
+    Its points may coincide, as where a bridge leads to the outline of a hole.
+    """
     (normal,) = _normals(corners[None])
-
-    def turn(a: int, b: int, c: int) -> float:
-        return float(normal @ np.cross(corners[b] - corners[a], corners[c] - corners[b]))
-
-    left, found = list(range(len(corners))), list[list[int]]()
+    axis = int(np.abs(normal).argmax())
+    first, second = ((axis + 1) % 3, (axis + 2) % 3)[:: 1 if normal[axis] > 0 else -1]
+    flat = corners[:, [first, second]]
+    left, found = np.arange(len(corners)), list[list[int]]()
     while len(left) > 3:
-        for i, b in enumerate(left):
-            a, c = left[i - 1], left[(i + 1) % len(left)]
-            others = [p for p in left if p not in (a, b, c)]
-            inside = any(min(turn(a, b, p), turn(b, c, p), turn(c, a, p)) >= 0 for p in others)
-            if turn(a, b, c) > 0 and not inside:
-                found.append([a, b, c])
-                left.remove(b)
-                break
-        else:
+        here = flat[left]
+        ears = np.roll(here, 1, 0), here, np.roll(here, -1, 0)
+        others = np.ones((len(left), len(left)), bool)
+        for start, end in zip(ears, (*ears[1:], ears[0]), strict=True):
+            others &= _cross((end - start)[:, None], here - start[:, None]) >= 0
+            others &= (here != start[:, None]).any(-1)
+        free = np.flatnonzero((_cross(ears[1] - ears[0], ears[2] - ears[1]) > 0) & ~others.any(1))
+        if not len(free):
             return []
-    return [*found, left]
+        i = int(free[0])
+        found.append([int(left[i - 1]), int(left[i]), int(left[(i + 1) % len(left)])])
+        left = np.delete(left, i)
+    return [*found, left.tolist()]
 
 
 def _absolute(index: bytes, count: int) -> bytes:

@@ -26,12 +26,12 @@ from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
 from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
 from congrasp.services.assets.objects.mesh_files import read_mesh, sample_colours, up_of
-from congrasp.services.assets.objects.options import ImportOptions, Up, check_options, metres_per_unit, rough_unit
+from congrasp.services.assets.objects.options import METRES, ImportOptions, Up, check_options, metres_per_unit
 from congrasp.services.assets.objects.repair import encloses
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
-_CACHE_VERSION = 12
+_CACHE_VERSION = 13
 _FAR = 100  # sizes of an object that its middle may be from the origin
 _DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
@@ -238,8 +238,9 @@ def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
     given = [np.asarray(mesh.vertices, np.float64) for mesh in pieces]
     visuals = visuals or [shapes.triangulate(piece) for piece in given]
     if not (given or source.parts):
-        rough = [rough_unit(mesh.scale, options.unit) * options.scale for mesh in visuals]
-        visuals = [repair.without_table(mesh, unit, notes) for mesh, unit in zip(visuals, rough, strict=True)]
+        if options.unit in METRES:
+            metres = METRES[options.unit] * options.scale
+            visuals = [repair.without_table(mesh, metres, notes) for mesh in visuals]
         visuals = [repair.largest_body(mesh, notes) for mesh in visuals]
     if not source.parts:
         visuals = [repair.closed(mesh, notes) for mesh in visuals]

@@ -161,7 +161,7 @@ def located(text: str, folder: str = "objects") -> pathlib.Path:
     """
     path, stored = pathlib.Path(text), pathlib.Path(folder) / f"{text}{store.SUFFIX}"
     is_name = path.name == text and stored.is_file()
-    if is_name and path.exists():
+    if is_name and (_holds_objects(path) if path.is_dir() else path.exists()):
         raise CongraspError(
             f"'{text}' is a {'folder' if path.is_dir() else 'file'} here, and an object in {folder}.",
             f"Pass ./{text} or {stored}.",
@@ -174,6 +174,14 @@ def located(text: str, folder: str = "objects") -> pathlib.Path:
         f"There is no object '{text}' in {folder}, and no file or folder of that name.",
         "Name an object of the folder, an object file, a mesh, or FAMILY:SEED such as mug:7.",
     )
+
+
+def _holds_objects(folder: pathlib.Path) -> bool:
+    """True if a folder holds object files or meshes, or is one of folders with meshes."""
+    try:
+        return bool(objects_at(folder))
+    except CongraspError:
+        return any(file.suffix.lower() in SUFFIXES for file in folder.iterdir())
 
 
 def find_object(text: str, folder: str = "objects") -> GraspObject:

@@ -16,9 +16,10 @@ Up = Literal["auto", "y", "z"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches"}
 _PLAUSIBLE = (0.01, 0.6)  # m, longest side for which metres are assumed
-_POSSIBLE = (0.005, 1.0)  # m, longest side that a unit of the user may give
+LONGEST = 1.0
+"""Longest side that a unit of the user may give, m."""
+_POSSIBLE = (0.005, LONGEST)  # m
 _LIKELY = (0.02, 0.4)  # m, longest side for which a unit is proposed
-_SCAN = 10.0  # m, longest scan with its surroundings
 _THINNEST = 2e-4  # m
 _SCALES = ((0.01, 1000.0, "mm"), (1.0, 100.0, "cm"), (1000.0, 1.0, "m"))
 """Upper end of the lengths (m) shown in a unit, number of these units in a metre, and the unit."""
@@ -77,11 +78,6 @@ def check_options(options: ImportOptions) -> None:
         raise CongraspError("--material and --density both say how dense it is.", "Leave one of them out.")
     if options.cache_dir:
         can_cache(pathlib.Path(options.cache_dir), "--cache-dir")
-
-
-def rough_unit(longest: float, unit: Unit) -> float:
-    """Metres per unit of a scan of some length; where the unit is not given, of metres or millimetres."""
-    return METRES.get(unit) or (1.0 if longest < _SCAN else 0.001)
 
 
 def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: float, notes: list[str]) -> float:

@@ -3,11 +3,12 @@
 import numpy as np
 import trimesh
 from scipy.ndimage import binary_propagation, distance_transform_edt, label
-from scipy.spatial import cKDTree
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import connected_component_labels
+from trimesh.proximity import closest_point
 
 from congrasp.services.assets.objects.fidelity import voxels
+from congrasp.services.assets.objects.options import LONGEST
 
 MAX_FACES = 20_000
 """Triangles beyond which a mesh is reduced before anything else is done with it."""
@@ -15,9 +16,10 @@ OPENING = 0.01
 """Width of an opening that no finger enters, m."""
 _REDUCED = 200_000  # triangles above which a mesh is reduced before other checks
 _FEW = 0.05  # share of a mesh that may be missing
-_TABLE, _FLAT = 0.3, 0.08  # a table's least width, m, and its greatest thickness, of its width
-_CRACK = 1e-4  # of the mesh's size: vertices nearer than this are one, if that closes the mesh
+_FLAT = 0.08  # of its width: greatest thickness of a table
+_SMALLEST = 0.03  # m: least length of what is left of a scan without its table
 _FINS = 10  # rings of triangles that may stand out from a closed surface
+_NEAR = 0.01  # of the size: how far they may
 _APART = 0.02  # of the mesh's size: bodies whose boxes are nearer than this belong together
 
 
@@ -44,8 +46,9 @@ def reduced(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[
     keys = (bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)) ^ (bits[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F))
     keys ^= (bits[:, 2] * np.uint64(0x165667B19E3779F9)) >> np.uint64(7)
     _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
-    vertices, faces = _welded(vertices[first], merged.reshape(-1)[faces])
-    small = with_few_faces(trimesh.Trimesh(vertices, faces, process=False))
+    vertices, faces = vertices[first], merged.reshape(-1)[faces]
+    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    small = with_few_faces(trimesh.Trimesh(vertices, faces[proper], process=False))
     notes.append(f"its {before:,} triangles were reduced to {len(small.faces):,}: a hand does not feel the rest")
     return np.asarray(small.vertices), np.asarray(small.faces)
 
@@ -58,27 +61,11 @@ def merged(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> trimesh
     apart = trimesh.Trimesh(vertices, faces, process=False)
     mesh = apart.copy()
     mesh.merge_vertices()
-    if not (apart.is_watertight or mesh.is_watertight):
-        whole = trimesh.Trimesh(*_welded(mesh.vertices, mesh.faces), process=False)
-        if whole.is_watertight:
-            notes.append("cracks in its surface, narrower than 0.01 % of it, were closed")
-            mesh = whole
     if len(mesh.faces):
         mesh.update_faces(mesh.nondegenerate_faces())
         mesh = without_repeats(mesh, notes)
         mesh.remove_unreferenced_vertices()
     return apart if apart.is_watertight and not mesh.is_watertight else mesh
-
-
-def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh (V, 3), (F, 3) whose vertices nearer than `_CRACK` of its size are one, without triangles that vanish."""
-    tree = cKDTree(vertices)
-    pairs = tree.query_pairs(_CRACK * float(np.linalg.norm(tree.maxes - tree.mins)), output_type="ndarray")
-    labels = connected_component_labels(pairs, len(vertices))
-    _, first, labels = np.unique(labels, return_index=True, return_inverse=True)
-    faces = labels.reshape(-1)[faces]
-    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return vertices[first], faces[proper]
 
 
 def with_few_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -116,14 +103,16 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 
 def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> trimesh.Trimesh:
-    """A scan without its table: a flat body that is wide by `_TABLE` and by far, with all others above it.
+    """A scan longer than `LONGEST` without its table: a flat body, the longest and wide by far.
+
+    The rest, without debris, must be as long as `_SMALLEST` and lie on one side of the table; else the scan is kept.
 
     Args:
       mesh: the scan, in any unit.
-      metres: metres per unit, roughly.
+      metres: metres per unit.
       notes: a table is appended.
     """
-    if mesh.scale * metres < _TABLE:
+    if mesh.extents.max() * metres <= LONGEST:
         return mesh
     labels = connected_component_labels(mesh.edges, len(mesh.vertices))
     low, high = (
@@ -133,20 +122,21 @@ def without_table(mesh: trimesh.Trimesh, metres: float, notes: list[str]) -> tri
     is_table = labels == np.linalg.norm(high - low, axis=-1).argmax()
     if is_table.all():
         return mesh
-    table, others = mesh.vertices[is_table], mesh.vertices[~is_table]
-    axes = np.linalg.svd(table - table.mean(0), full_matrices=False)[2]
-    (low, high), (least, most) = (((points @ axes.T).min(0), (points @ axes.T).max(0)) for points in (table, others))
-    size, thick = high - low, (high - low)[2]
-    flat = thick < _FLAT * size[1] and size[1] * metres > _TABLE
-    within = (low <= least)[:2].all() and (most <= high)[:2].all() and (most - least)[:2].max() < size[1] / 2
-    one_side = least[2] > low[2] - thick or most[2] < high[2] + thick
-    if not (flat and within and one_side):
-        return mesh
-    notes.append(
-        f"a flat body {size[1] / (most - least)[:2].max():.1f} times as wide as the rest was left out: a table"
-    )
     rest = trimesh.Trimesh(mesh.vertices, mesh.faces[~is_table[mesh.faces[:, 0]]], process=False)
     rest.remove_unreferenced_vertices()
+    said: list[str] = []
+    rest = largest_body(rest, said)
+    table = mesh.vertices[is_table]
+    axes = np.linalg.svd(table - table.mean(0), full_matrices=False)[2]
+    (low, high), (least, most) = (((p @ axes.T).min(0), (p @ axes.T).max(0)) for p in (table, rest.vertices))
+    size, wide = high - low, float((most - least)[:2].max())
+    flat = size[2] < _FLAT * size[1] and wide < size[1] / 2
+    within = (low <= least)[:2].all() and (most <= high)[:2].all()
+    middle = (low + high)[2] / 2
+    beside = least[2] > middle or most[2] < middle
+    if not (flat and within and beside and rest.extents.max() * metres >= _SMALLEST):
+        return mesh
+    notes += [f"a flat body {size[1] / wide:.1f} times as wide as the rest was left out: a table", *said]
     return rest
 
 
@@ -242,15 +232,25 @@ def closed(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 
 
 def _without_fins(mesh: trimesh.Trimesh) -> trimesh.Trimesh | None:
-    """The mesh without triangles at a free edge, and those at the edges that this frees; None unless that closes it."""
-    faces = np.asarray(mesh.faces)
+    """The mesh without triangles at a free edge, and those at the edges that this frees.
+
+    None unless that closes it, and all that is left out lies within `_NEAR` of the rest.
+    """
+    faces, removed = np.asarray(mesh.faces), list[np.ndarray]()
     for _ in range(_FINS):
         _, group, counts = np.unique(_codes(faces_to_edges(faces)), return_inverse=True, return_counts=True)
         free = (counts[group.reshape(-1)] == 1).reshape(-1, 3).any(1)
         if not free.any():
             rest = trimesh.Trimesh(mesh.vertices, faces, process=False)
             rest.remove_unreferenced_vertices()
-            return rest if rest.is_watertight and rest.area > (1 - _FEW) * mesh.area else None
+            if not (removed and rest.is_watertight and rest.area > (1 - _FEW) * mesh.area):
+                return None
+            corners = mesh.vertices[np.concatenate(removed)]
+            points = np.concatenate(
+                [corners, (corners + np.roll(corners, 1, 1)) / 2, corners.mean(1, keepdims=True)], axis=1
+            )
+            return rest if closest_point(rest, points.reshape(-1, 3))[1].max() < _NEAR * mesh.scale else None
+        removed.append(faces[free])
         faces = faces[~free]
     return None
 

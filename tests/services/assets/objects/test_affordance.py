@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from congrasp.common.errors import CongraspError
 from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects import affordance
@@ -67,6 +68,16 @@ def test_a_part_may_be_a_patch_of_the_surface(box, folder, tmp_path, kind):
     depth = box.points[:, 0].max() - box.points[:, 0]
     found = on_part_mesh(box, tmp_path / "part.ply")
     assert found[depth < 1e-3].all() and not found[depth > 0.005].any()
+
+
+def test_a_part_whose_triangles_lack_vertices_is_refused(box, tmp_path):
+    points = "".join(f"property float {axis}\n" for axis in "xyz")
+    header = (
+        f"ply\nformat ascii 1.0\nelement vertex 3\n{points}element face 1\nproperty list uchar int vertex_indices\n"
+    )
+    (tmp_path / "part.ply").write_text(f"{header}end_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n")
+    with pytest.raises(CongraspError, match=r"part\.ply has triangles without vertices"):
+        on_part_mesh(box, tmp_path / "part.ply")
 
 
 def test_the_command_stores_the_new_object(box, folder, tmp_path, capsys):
