@@ -69,7 +69,7 @@ def test_what_was_acknowledged_survives_the_death_of_learner_and_actors_together
     started = [cluster.start_actor(name) for name in "ab"]
     cluster.wait_for_updates(4)
     cluster.wait(lambda status: status["queue"]["length"])
-    for process in (*started, learner):
+    for process in (learner, *started):  # the learner first, with what is in its queue
         process.kill()
     learner.wait(5)
     learner = cluster.start_learner()

@@ -175,7 +175,7 @@ def test_errors_name_the_fault_of_a_trajectory(block, tmp_path):
         ("0,0,0,1,0,0,0  # the start\n0,0,1,1,0,0,0,9\n", 2),
         ("0,0,0,1,0,0,0\n0,0,one,1,0,0,0\n", 2),
         ("1e308,0,0,1,0,0,0\n0,0,0.1,1,0,0,0\n", 1),
-        ("0,1;0;0,2;1;0;0;0\n", 1),
+        ("0,1;0;0,2;1;0;0\n", 1),
     ):
         path.write_text(text)
         with pytest.raises(CongraspError, match=rf"line {line} of .*path\.csv is not 7 finite numbers"):
