@@ -176,7 +176,7 @@ def _check(teacher: PolicyBundle, spec: PolicySpec, task: TaskConfig) -> None:
             f"{what} does not observe what this task shows.",
             "Take the task from the teacher: 'congrasp train --teacher', without other --task.… settings of its own.",
         )
-    for name in ("control", "control_dt", "approach_steps", "dynamic_center"):
+    for name in ("control", "control_dt", "dynamic_center"):  # the time is observed as a share of the episode
         if getattr(teacher.task, name) != getattr(task, name):
             raise CongraspError(
                 f"{what} learnt with another '{name}' than this task's.", f"Leave out --task.{name.replace('_', '-')}."

@@ -144,4 +144,5 @@ def test_the_command_line_s_teacher_is_the_whole_task(teacher, monkeypatch):
     assert config.name == "quickstart-student" and config.task.method == "student"
     assert (config.task.observation, config.task.sensing, config.task.hand) == ("tracked", TRACKERS, "allegro")
     assert config.task.surface_points == TASK.surface_points
+    assert config.task.approach_steps == 2 * TASK.approach_steps
     Distillation(policy_spec(config.task, config.network), config)
