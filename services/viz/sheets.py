@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from congrasp.common.errors import CongraspError, need_package
+from congrasp.common.errors import CongraspError, need_package, os_errors_as
 from congrasp.common.io.files import write_atomically
 from congrasp.services.record.palette import INK
 
@@ -95,7 +95,7 @@ def save_video(
     need_package("A video", "imageio_ffmpeg")
     import imageio_ffmpeg
 
-    try:
+    with os_errors_as(f"{path} could not be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
         writer = imageio_ffmpeg.write_frames(
             str(path), size, fps=frame_rate, quality=8, macro_block_size=2, output_params=[*encoding]
@@ -106,5 +106,3 @@ def save_video(
         for frame in frames:
             writer.send(np.ascontiguousarray(frame))
         writer.close()
-    except OSError as error:
-        raise CongraspError(f"{path} could not be written: {error.strerror or error}.") from None
