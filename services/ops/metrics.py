@@ -35,7 +35,8 @@ def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
     ProcessCollector(registry=registry)
     for collector in collectors:
         registry.register(collector)
-    with os_errors_as(f"The metrics cannot be served at {host}:{port}", "Pass another --metrics-port."):
+    what = f"The metrics cannot be served at {host}:{port} on this machine"
+    with os_errors_as(what, "Pass another --metrics-port."):
         server, thread = start_http_server(port, host, registry)
     try:
         yield

@@ -193,17 +193,6 @@ class TrainingWindow:
                 )
             return known.episode
 
-    def curve(self, name: str) -> Curve:
-        """A curve by its name.
-
-        Raises:
-          CongraspError: there is none of this name.
-        """
-        with self._lock:
-            if name not in self._curves:
-                raise CongraspError(f"There is no curve '{name}'.", "Choose one of the page's list.")
-            return self._curves[name]
-
     def view(self, names: Sequence[str] = (), points: int = 300) -> dict[str, Any]:
         """The state of the run for a page, as JSON, with the named curves."""
         with self._lock:
