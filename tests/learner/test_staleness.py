@@ -4,7 +4,7 @@ import heapq
 import itertools
 import math
 import statistics
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import hypothesis.strategies as st
 import pytest
@@ -305,11 +305,8 @@ def test_threads_cannot_overdraw():
             if staleness.grant((name, "1"), str(i)):
                 granted.append(i)
 
-    threads = [threading.Thread(target=ask, args=(str(i),), daemon=True) for i in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(10)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(ask, map(str, range(8))))
     assert len(granted) == 50 == staleness.counters()["running"]
 
 
