@@ -1,7 +1,9 @@
 """Errors that a user can act on: one line that names the input and the remedy."""
 
+import contextlib
 import importlib.util
 import re
+from collections.abc import Iterator
 
 _LONGEST = 2000  # characters: a line may quote input from elsewhere
 # Controls, line separators, lone surrogates, and marks that change the direction of the text around them.
@@ -27,6 +29,15 @@ class CongraspError(Exception):
     def __init__(self, what: str, remedy: str = ""):
         text = printable(f"{what} {remedy}".strip())
         super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}")
+
+
+@contextlib.contextmanager
+def os_errors_as(what: str, remedy: str = "") -> Iterator[None]:
+    """Raises an error of the system, such as a full disk or a port out of range, as a CongraspError with its reason."""
+    try:
+        yield
+    except (OSError, OverflowError) as error:
+        raise CongraspError(f"{what}: {getattr(error, 'strerror', None) or error}.", remedy) from None
 
 
 _EXTRAS = {

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.files import sync_directory, write_atomically
 from congrasp.common.io.inputs import open_file
 from congrasp.common.wire.codec import Message, decode, encode
@@ -56,13 +56,11 @@ class Checkpoints:
         message = Message({**flatten(jax.device_get(tree)), _META: text}, {"version": version})
         write_atomically(path, encode(message))
         link = self._directory / f".{_LATEST}.{os.getpid()}.tmp"
-        try:
+        with os_errors_as(f"{self._directory / _LATEST} could not be set"):
             link.unlink(missing_ok=True)
             link.symlink_to(path.name)
             link.replace(self._directory / _LATEST)
             sync_directory(self._directory)
-        except OSError as error:
-            raise CongraspError(f"{self._directory / _LATEST} could not be set: {error.strerror}.") from None
         for old in self.files()[KEPT:]:
             if old != path:
                 with contextlib.suppress(OSError):
@@ -128,10 +126,8 @@ def set_aside(path: pathlib.Path) -> pathlib.Path:
     """
     others = (path.with_name(f"{path.name}{_ASIDE}{number or ''}") for number in itertools.count())
     target = next(other for other in others if not os.path.lexists(other))
-    try:
+    with os_errors_as(f"{path} cannot be renamed to {target.name}"):
         return path.rename(target)
-    except OSError as error:
-        raise CongraspError(f"{path} cannot be renamed to {target.name}: {error.strerror}.") from None
 
 
 def _update(path: pathlib.Path) -> int:
@@ -142,11 +138,8 @@ def _update(path: pathlib.Path) -> int:
 
 def _read(path: pathlib.Path) -> tuple[Mapping[str, Any], dict[str, Any]]:
     """Reads arrays and metadata of a checkpoint; raises a CongraspError with the reason if it is not intact."""
-    try:
-        with open_file(path) as file:
-            data = file.read()
-    except OSError as error:
-        raise CongraspError(f"It cannot be read: {error.strerror}.") from None
+    with os_errors_as("It cannot be read"), open_file(path) as file:
+        data = file.read()
     message = decode(data, max_bytes=len(data))
     if message.meta.get("version") != _update(path):
         raise CongraspError("Its header has another update than the file's name.")

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from typing import BinaryIO
 
 from congrasp.common.config import RunConfig, run_config_from_json, to_json
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
 from congrasp.common.policy import bundle as bundles
@@ -213,11 +213,9 @@ def note_version(run_dir: pathlib.Path, version: int) -> None:
       CongraspError: it could not be written.
     """
     path = run_dir / _VERSION_FILE
-    try:
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT, 0o644), "wb", 0) as file:
-            file.write(f"{version:020d}\n".encode())
-    except OSError as error:
-        raise CongraspError(f"{path} could not be written: {error.strerror}.") from None
+    how = os.O_WRONLY | os.O_CREAT
+    with os_errors_as(f"{path} could not be written"), open(os.open(path, how, 0o644), "wb", 0) as file:
+        file.write(f"{version:020d}\n".encode())
 
 
 def published_version(run_dir: pathlib.Path) -> int:

@@ -74,6 +74,16 @@ def paper_policy(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 @pytest.fixture(scope="session")
+def mano(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """A file of MANO's layout."""
+    from tests.mano_file import mano_pickle
+
+    path = tmp_path_factory.mktemp("mano") / "MANO_RIGHT.pkl"
+    path.write_bytes(mano_pickle())
+    return path
+
+
+@pytest.fixture(scope="session")
 def shared_objects() -> pathlib.Path:
     """Folder of the 24 scanned objects, which lies beside the repository where it is present."""
     folder = ROOT.parent / "shared" / "objects"

@@ -1,5 +1,6 @@
 """Random but valid scenes, goals and surfaces for tests of the task."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -89,6 +90,14 @@ def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:
     values["fingers"] = FingersGoal(np.arange(len(HAND.fingers)) < rng.integers(2, len(HAND.fingers), (batch, 1)))
     values["force"] = ForceGoal(rng.uniform(1.0, 8.0, batch).astype(np.float32))
     return state, surface, Goal(values, active(*(block for c in CONSTRAINTS for block in c.blocks), batch=batch))
+
+
+def lone_scene(task: TaskConfig, *blocks: str, **goals: dict[str, np.ndarray]) -> Scene:
+    """The first environment of a scene, with other goal arrays of some constraints, and these blocks active."""
+    state, surface, goal = (jax.tree.map(lambda array: array[:1], part) for part in scene(0))
+    for name, arrays in goals.items():
+        goal = goal.replace(name, **arrays)
+    return scene_of(task, state, surface, dataclasses.replace(goal, active=active(*blocks, batch=1)))
 
 
 def active(*blocks: str, batch: int = 4) -> dict[str, np.ndarray]:

@@ -1,9 +1,10 @@
-"""Mass properties of pieces as MuJoCo computes them: a reference for the project's own."""
+"""Bodies of known measures, and mass properties of pieces as MuJoCo computes them."""
 
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+import trimesh
 
 from congrasp.common.objects import shapes
 from congrasp.common.objects.mjcf import GEOM_TYPES
@@ -25,3 +26,21 @@ def mujoco_mass_properties(pieces: Sequence[Piece], densities: Sequence[float]) 
     model = spec.compile()
     turn = shapes.matrix(model.body_iquat[1])
     return model.body_mass[1], model.body_ipos[1], turn @ np.diag(model.body_inertia[1]) @ turn.T
+
+
+def block(sides: Sequence[float], center: Sequence[float] = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    """A block with sides (3,) around a centre (3,)."""
+    return trimesh.creation.box(sides).apply_translation(center)
+
+
+def ell() -> trimesh.Trimesh:
+    """An L of two legs of 2 x 2 cm, 8 cm long, as one closed body of 56 cm^3."""
+    outline = np.array([[0, 0], [0.08, 0], [0.08, 0.02], [0.02, 0.02], [0.02, 0.08], [0, 0.08]])
+    caps = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
+    faces = [face[::-1] for face in caps] + [[6 + i for i in face] for face in caps]
+    for i in range(6):
+        j = (i + 1) % 6
+        faces += [[i, j, 6 + j], [i, 6 + j, 6 + i]]
+    mesh = trimesh.Trimesh([[*xy, z] for z in (0.0, 0.02) for xy in outline], faces)
+    assert mesh.is_volume
+    return mesh

@@ -50,7 +50,6 @@ class Pool:
           task: timing and collision settings.
           objects: at most `PRIMITIVE_SLOTS` primitive pieces each; meshes add geoms to the model.
         """
-        spec = scene_spec(hand, task)
         pieces = empty_slots()
         slots = len(pieces)
         self._owners: list[int] = []
@@ -58,12 +57,7 @@ class Pool:
             meshes = [piece for piece in obj.pieces if piece.kind == "mesh"]
             pieces += meshes
             self._owners += [n] * len(meshes)
-        shared = dataclasses.replace(objects[0], pieces=tuple(pieces))
-        body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
-        body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which other objects may not have
-        finish_spec(spec, hand)
-        self.model: mujoco.MjModel = spec.compile()
-        geoms = np.array([self.model.geom(f"object_{i}").id for i in range(len(pieces))])
+        self.model, geoms = _model(hand, task, dataclasses.replace(objects[0], pieces=tuple(pieces)))
         self._slots, self._meshes = geoms[:slots], geoms[slots:]
 
     def leaves(self, objects: Sequence[GraspObject]) -> dict[str, np.ndarray]:
@@ -100,6 +94,16 @@ class Pool:
         fill_primitives(model, self._slots, obj)
         fill_body(model, data, obj)
         return {name: getattr(model, name).copy() for name in LEAVES}
+
+
+def _model(hand: Hand, task: TaskConfig, shared: GraspObject) -> tuple[mujoco.MjModel, np.ndarray]:
+    """Compiles the model of a scene with an object whose fields others replace; and the geoms (S,) of its pieces."""
+    spec = scene_spec(hand, task)
+    body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
+    body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which other objects may not have
+    finish_spec(spec, hand)
+    model: mujoco.MjModel = spec.compile()
+    return model, np.array([model.geom(f"object_{i}").id for i in range(len(shared.pieces))])
 
 
 def empty_slots() -> list[Piece]:
@@ -191,15 +195,9 @@ class Catalogue:
           example: any object; rows of others replace it in every environment.
           mesh_slots: most mesh pieces of an object.
         """
-        spec = scene_spec(hand, task)
         primitives = empty_slots()
         meshes = [Piece("mesh", (0.0, 0.0, 0.0), vertices=_PLACEHOLDER)] * mesh_slots
-        shared = dataclasses.replace(example, pieces=(*primitives, *meshes))
-        body = add_object(spec, shared, contype=OBJECT_CONTYPE, conaffinity=HAND_CONTYPE, contact=object_contact(task))
-        body.simple = 0  # MuJoCo's shortcut for a diagonal inertia, which other objects may not have
-        finish_spec(spec, hand)
-        self.model: mujoco.MjModel = spec.compile()
-        self.geoms = np.array([self.model.geom(f"object_{i}").id for i in range(len(shared.pieces))])
+        self.model, self.geoms = _model(hand, task, dataclasses.replace(example, pieces=(*primitives, *meshes)))
         """(S,) geoms of the object: primitive slots, then mesh slots."""
         self._primitives, self._meshes = self.geoms[: len(primitives)], self.geoms[len(primitives) :]
         self._body = self.model.body("object").id

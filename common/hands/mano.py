@@ -118,9 +118,9 @@ def mano_axes(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
     return np.stack([twist, np.cross(bend, twist), bend], -2).reshape(15, 3, 3)
 
 
-def mano_hand(model: ManoModel, betas: np.ndarray | None = None) -> Hand:
-    """Returns the hand of a MANO model, of its mean shape or with shape parameters (up to 10,)."""
-    joints, tips = model.skeleton(betas)
+def mano_hand(model: ManoModel) -> Hand:
+    """Returns the hand of a MANO model, of its mean shape."""
+    joints, tips = model.skeleton()
     axes = mano_axes(joints, tips).reshape(5, 3, 3, 3)
     anchors, ends = (joints[1:] - joints[0]).reshape(5, 3, 3), tips - joints[0]
     links: list[Link] = []

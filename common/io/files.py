@@ -47,9 +47,9 @@ def check_free(path: pathlib.Path, *, force: bool = False) -> None:
         raise CongraspError(f"{path} exists already.", "Pass another path with --out, or --force to replace it.")
 
 
-def check_output(option: str, path: pathlib.Path, is_folder: bool | None = None) -> None:
+def check_output(option: str, path: pathlib.Path, *, is_folder: bool) -> None:
     """Raises a CongraspError if a path can be neither a new file nor a new folder, or is the other one of these."""
-    if is_folder is not None and path.exists() and path.is_dir() != is_folder:
+    if path.exists() and path.is_dir() != is_folder:
         found, remedy = ("file", "Pass a folder; it need not exist.") if is_folder else ("folder", "Pass a file in it.")
         raise CongraspError(f"{option} is the {found} {path}.", remedy)
     parent = path if path.is_dir() else next(folder for folder in path.absolute().parents if folder.exists())
@@ -85,7 +85,7 @@ def can_cache(folder: pathlib.Path, setting: str) -> bool:
     """True if files can be written to a cache; otherwise the first call logs why, and the setting that moves it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        check_output("the cache", folder)
+        check_output("the cache", folder, is_folder=True)
     except (OSError, CongraspError):
         _log.warning("Nothing can be cached in %s, so that it is computed again each time. Set %s.", folder, setting)
         return False

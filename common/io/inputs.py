@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 
 LONGEST_NAME = 100
 """Longest name of a file or folder, in characters."""
@@ -98,14 +98,11 @@ def read_file(path: pathlib.Path, largest: int, remedy: str = "") -> bytes:
     Raises:
       CongraspError: it cannot be read, is larger, or is not a regular file (a pipe would block).
     """
-    try:
-        with open_file(path, remedy) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size > largest:
-                raise CongraspError(f"{path} has {size} bytes; the limit is {largest}.", remedy)
-            return file.read(size)
-    except OSError as error:
-        raise CongraspError(f"{path} cannot be read: {error.strerror}.", remedy) from None
+    with os_errors_as(f"{path} cannot be read", remedy), open_file(path, remedy) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > largest:
+            raise CongraspError(f"{path} has {size} bytes; the limit is {largest}.", remedy)
+        return file.read(size)
 
 
 def open_file(path: pathlib.Path, remedy: str = "") -> BinaryIO:

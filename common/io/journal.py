@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import os_errors_as
 from congrasp.common.io.inputs import open_file
 
 AUDIT = "audit"
@@ -41,12 +41,10 @@ class Journal:
         """
         self._path, self._warn = path, warn
         self._lock = threading.Lock()
-        try:
+        with os_errors_as(f"The journal {path} cannot be opened"):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._cut, self._after = _end_of(path)
             self._file = path.open("ab", buffering=0)
-        except OSError as error:
-            raise CongraspError(f"The journal {path} cannot be opened: {error.strerror}.") from None
         self._lost, self._refused = int(self._cut), False
 
     def write(self, **entry: Any) -> None:
@@ -105,29 +103,26 @@ def read_journal(path: pathlib.Path, is_entry: Callable[[dict[str, Any]], bool] 
     entries: list[dict[str, Any] | None] = []
     lost = damaged = missing = unchecked = run = 0
     before, cut = "", False
-    try:
-        with open_file(path) as file:
-            while line := file.readline(_MAX_LINE):
-                if not line.strip(b"\n"):
-                    continue
-                cut = not line.endswith(b"\n")
-                entry, check = _parse(line)
-                if entry is None or not is_entry(entry):
-                    run += 1
-                    entries.append(None)
-                    continue
-                after = entry.pop("after", None)
-                unchecked += after is None
-                if after not in (None, before) and not run:
-                    missing += 1
-                    entries.append(None)
-                before = check
-                # The disk took a part of the first line that it refused: `lost` counts that one, too.
-                refused = min(number(entry.pop("lost", 0)), MAX_NUMBER)
-                lost, damaged, run = lost + refused, damaged + max(0, run - bool(refused)), 0
-                entries.append(entry)
-    except OSError as error:
-        raise CongraspError(f"The journal {path} cannot be read: {error.strerror}.") from None
+    with os_errors_as(f"The journal {path} cannot be read"), open_file(path) as file:
+        while line := file.readline(_MAX_LINE):
+            if not line.strip(b"\n"):
+                continue
+            cut = not line.endswith(b"\n")
+            entry, check = _parse(line)
+            if entry is None or not is_entry(entry):
+                run += 1
+                entries.append(None)
+                continue
+            after = entry.pop("after", None)
+            unchecked += after is None
+            if after not in (None, before) and not run:
+                missing += 1
+                entries.append(None)
+            before = check
+            # The disk took a part of the first line that it refused: `lost` counts that one, too.
+            refused = min(number(entry.pop("lost", 0)), MAX_NUMBER)
+            lost, damaged, run = lost + refused, damaged + max(0, run - bool(refused)), 0
+            entries.append(entry)
     cut = cut and run > 0
     return JournalLines(entries, lost + cut, damaged + run - cut, missing + (not entries), unchecked)
 

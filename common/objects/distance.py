@@ -91,14 +91,6 @@ def distance_field(objects: Sequence[GraspObject]) -> DistanceField:
     return jax.device_put(DistanceField(np.stack(values), origin, cell.astype(np.float32), shape))
 
 
-def primitive_distance(pieces: Sequence[Piece], points: Array) -> Array:
-    """Exact signed distances (n,) in metres of points (n, 3) of the object frame from primitive pieces.
-
-    The value is that of the nearest piece; inside several pieces at once it is understated.
-    """
-    return _least(_slots(pieces), jnp.asarray(points, jnp.float32))
-
-
 class _Slots(NamedTuple):
     """Primitive pieces of one kind, in S slots of which the first are used."""
 
@@ -125,7 +117,10 @@ def _slots(pieces: Sequence[Piece]) -> dict[str, _Slots]:
 
 @jax.jit
 def _least(pieces: dict[str, _Slots], points: Array) -> Array:
-    """Least distance (n,) of points (n, 3) from the pieces in use."""
+    """Exact signed distance (n,) in m of points (n, 3) of the object frame from the nearest piece in use.
+
+    Inside several pieces at once it is understated.
+    """
     distance = {"box": _box, "cylinder": _cylinder, "capsule": _capsule, "ellipsoid": _ellipsoid}
     least = jnp.full(len(points), jnp.inf)
     for kind, slots in pieces.items():

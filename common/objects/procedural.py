@@ -17,8 +17,6 @@ from congrasp.common.runtime.parallel import parallel_map
 FAMILIES: tuple[str, ...] = tuple(BUILDERS)
 BASIC_FAMILIES = tuple(BASIC)
 HOUSEHOLD_FAMILIES = tuple(HOUSEHOLD)
-PRIMITIVE_FAMILIES = tuple(family for family in BASIC_FAMILIES if family not in ("ring", "bowl", "cup"))
-"""Basic families whose objects have no mesh pieces."""
 GROUPS = {
     "basic": BASIC_FAMILIES,
     "household": HOUSEHOLD_FAMILIES,

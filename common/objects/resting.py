@@ -16,6 +16,7 @@ _PER_KIND = 4
 _LEAST_LIKELY = 0.02
 _STILL = 1e-3  # m/s
 _SPEED_SECONDS = 0.025
+_SECONDS = 0.25  # of settling
 _FREE_SECONDS = 0.5  # time after which an unstable object is recognised by its speed
 _DROPS = (
     (0.03, 1.5e-6),
@@ -94,10 +95,10 @@ def settle(obj: GraspObject, pose: np.ndarray, seconds: float) -> Settled:
     return TableScene(obj).settle(pose, seconds)
 
 
-def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
+def rest_poses(obj: GraspObject) -> np.ndarray:
     """Poses (R, 7), 1 <= R <= 8, in which the object rests on the table, most likely first.
 
-    Physics settles the quasi-static poses for `seconds`, or a few times as long if needed. Poses are dropped if they do
+    Physics settles the quasi-static poses for 0.25 s, or a few times as long if needed. Poses are dropped if they do
     not come to rest, if a small tilt would lower them, or if they end in an earlier pose. If none remains, the most
     likely one is simulated until the object rests.
     """
@@ -107,7 +108,7 @@ def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
     downs: list[np.ndarray] = []
     for pose in candidates:
         for _ in range(_ROUNDS):
-            settled = scene.settle(pose, seconds, overdamped=True)
+            settled = scene.settle(pose, _SECONDS, overdamped=True)
             pose = settled.pose
             down = -shapes.matrix(pose[3:])[2]
             if any(down @ other > _SAME_NORMAL for other in downs):
@@ -118,8 +119,8 @@ def rest_poses(obj: GraspObject, seconds: float = 0.25) -> np.ndarray:
                 downs.append(down)
                 break
     if not found:
-        tumbled = scene.settle(candidates[0], 20 * seconds)
-        found.append(scene.settle(tumbled.pose, 20 * seconds, overdamped=True).pose)
+        tumbled = scene.settle(candidates[0], 20 * _SECONDS)
+        found.append(scene.settle(tumbled.pose, 20 * _SECONDS, overdamped=True).pose)
     poses = np.array(found)
     poses[:, :2] = 0.0
     return poses

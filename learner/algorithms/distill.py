@@ -94,16 +94,7 @@ class Distillation:
         params = jax.tree.map(jnp.asarray, initial.params)
         params["actor"] = {**params["actor"], "log_std": self._teacher.params["actor"]["log_std"]}
         optimizer = _transform(self._config.max_grad_norm).init(params["actor"])
-        return TrainState(
-            params=params,
-            optimizer=optimizer,
-            key=jax.random.PRNGKey(seed),
-            observation=initial.observation,
-            value=initial.value,
-            version=0,
-            transitions=0,
-            privileged=initial.privileged,
-        )
+        return TrainState.begin(seed, optimizer, initial._replace(params=params))
 
     def policy(self, state: TrainState) -> LearnedPolicy:
         """Returns parameters and normalisers."""

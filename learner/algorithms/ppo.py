@@ -82,19 +82,10 @@ class PPO:
         rate = self._config.learning_rate * (1.0 if initial is None else _TRAINED_RATE)
         initial = initial or random_policy(seed, self._spec)
         params = jax.tree.map(jnp.asarray, initial.params)
-        privileged = initial.privileged
-        if privileged is None and self._spec.privileged:
-            privileged = normalizer.empty((self._spec.privileged_size,))
-        return TrainState(
-            params=params,
-            optimizer=jax.jit(_optimizer(rate, self._config.max_grad_norm).init)(params),
-            key=jax.random.PRNGKey(seed),
-            observation=initial.observation,
-            value=initial.value,
-            version=0,
-            transitions=0,
-            privileged=privileged,
-        )
+        if initial.privileged is None and self._spec.privileged:
+            initial = initial._replace(privileged=normalizer.empty((self._spec.privileged_size,)))
+        optimizer = jax.jit(_optimizer(rate, self._config.max_grad_norm).init)(params)
+        return TrainState.begin(seed, optimizer, initial._replace(params=params))
 
     def policy(self, state: TrainState) -> LearnedPolicy:
         """Returns parameters and normalisers."""

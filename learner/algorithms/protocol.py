@@ -21,7 +21,6 @@ from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.bundle import PolicySpec, full_layout
 from congrasp.common.policy.network import Params
 from congrasp.common.policy.normalizer import Statistics
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.privileged import extra
 from congrasp.common.task.types import Array
 from congrasp.common.wire.messages import RECORDED, TAUGHT, WORLDS, RolloutForm, Schema
@@ -65,6 +64,12 @@ class TrainState(NamedTuple):
     """Number of environment steps consumed so far, by all ranks."""
     privileged: Statistics | None = None
     """Statistics of the critic's privileged inputs (P,), on the host; None without inputs."""
+
+    @classmethod
+    def begin(cls, seed: int, optimizer: Any, policy: LearnedPolicy) -> "TrainState":
+        """Returns the state before the first update of a policy."""
+        key = jax.random.PRNGKey(seed)
+        return cls(optimizer=optimizer, key=key, version=0, transitions=0, **policy._asdict())
 
 
 class Algorithm(Protocol):
@@ -114,21 +119,18 @@ class NonFiniteUpdate(PhysicsError):
 
 def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> RolloutForm:
     """Returns the form of a run's rollouts, with the arrays of `schema` for its algorithm."""
+    task = config.task
+    seen_by_teacher = sum(size for _, size in full_layout(task)) + extra(get_hand(task.hand))
     return RolloutForm(
         steps=config.rollout_steps,
         worlds=config.environments,
         observation=sum(size for _, size in spec.layout),
         action=spec.action_size,
         half=config.half_observations,
-        teacher=0 if TAUGHT.keys().isdisjoint(schema) else _teacher_inputs(config.task),
+        teacher=0 if TAUGHT.keys().isdisjoint(schema) else seen_by_teacher,
         privileged=spec.privileged_size,
         arrays=schema,
     )
-
-
-def _teacher_inputs(task: TaskConfig) -> int:
-    """Size of `common.task.privileged.observe_for_teacher`'s rows."""
-    return sum(size for _, size in full_layout(task)) + extra(get_hand(task.hand))
 
 
 def collate(rollouts: Sequence[Mapping[str, Array]], schema: Schema) -> dict[str, Array]:

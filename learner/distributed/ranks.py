@@ -22,7 +22,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.errors import CongraspError, TransportError, os_errors_as
 from congrasp.common.runtime.stages import stage
 from congrasp.common.wire.codec import MAX_MESSAGE, Message, decode, encode
 from congrasp.learner.distributed.collectives import AXIS
@@ -337,12 +337,8 @@ class Ranks:
 
 def _gather(count: int, bind: str, port: int, deadline: float) -> dict[int, _Link]:
     """On rank 0: accepts the links of all others."""
-    try:
+    with os_errors_as(f"Rank 0 cannot listen at port {port}", "Choose another --coordinator HOST:PORT."):
         server = socket.create_server((bind, port))
-    except OSError as error:
-        raise CongraspError(
-            f"Rank 0 cannot listen at port {port}: {error.strerror}.", "Choose another --coordinator HOST:PORT."
-        ) from None
     links: dict[int, _Link] = {}
     with server:
         while len(links) < count - 1:

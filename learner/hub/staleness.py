@@ -202,13 +202,6 @@ class StalenessManager:
         return self._batch
 
     @property
-    def running(self) -> int:
-        """Number of outstanding tickets."""
-        with self._lock:
-            self._expire()
-            return len(self._tickets)
-
-    @property
     def queued(self) -> int:
         """Number of accepted rollouts queued for an update."""
         return self._counters.accepted - self._counters.consumed - self._counters.dropped

@@ -64,7 +64,8 @@ class Robot:
         deep = np.flatnonzero(data.contact.dist < 0.0)
         if not len(deep):
             return ""
-        return " with ".join(sorted((self._called(int(g)) for g in data.contact.geom[deep[0]]), key=_scene_last))
+        scene = ("the table", "the object")  # named last
+        return " with ".join(sorted((self._called(int(g)) for g in data.contact.geom[deep[0]]), key=scene.__contains__))
 
     def _called(self, geom: int) -> str:
         """Describes the body of a geom."""
@@ -78,11 +79,6 @@ class Robot:
         """Bodies of the arm, the base first."""
         names = [self.model.body(i).name for i in range(self.model.nbody)]
         return [i for i, name in enumerate(names) if name not in (_TABLE, _OBJECT) and not name.startswith(_HAND)]
-
-
-def _scene_last(name: str) -> bool:
-    """True for table and object."""
-    return name in ("the table", "the object")
 
 
 def default_mount(hand: Hand) -> Pose:

@@ -63,7 +63,6 @@ class _Meter:
 
     def __init__(self, seconds: float, deadline: float, stop: threading.Event, notify: Callable[[str], None]):
         self.metrics: list[dict[str, Any]] = []
-        self.late = False
         self._seconds, self._stop, self._notify = seconds, stop, notify
         self._began = self._notified = time.monotonic()
         self._deadline = self._began + deadline
@@ -78,10 +77,7 @@ class _Meter:
             if status["update"] >= _WARM_UPDATES:
                 self.metrics.append(status)
         span = self.metrics[-1]["time"] - self.metrics[0]["time"] if self.metrics else 0.0
-        if span >= self._seconds and len(self.metrics) > _LEAST_UPDATES:
-            self._stop.set()
-        elif now > self._deadline:
-            self.late = True
+        if (span >= self._seconds and len(self.metrics) > _LEAST_UPDATES) or now > self._deadline:
             self._stop.set()
         if now - self._notified > 10.0:
             self._notified = now

@@ -64,17 +64,8 @@ UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PATH = (
-    errno.ENOENT,
-    errno.ENOTDIR,
-    errno.EISDIR,
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.ENAMETOOLONG,
-    errno.ELOOP,
-    errno.EEXIST,
-)
+_PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError, FileExistsError)
+_PATH_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -119,10 +110,9 @@ def _said_of(error: OSError) -> str:
     if error.errno in _FULL:
         where = f"{error.filename} could not be written" if error.filename else "A file could not be written"
         return f"{where}: {error.strerror}. Free space and start again."
-    if error.errno in _PATH and error.filename:
-        return str(
-            CongraspError(f"{error.filename} cannot be used: {error.strerror}.", "Check the path and its permissions.")
-        )
+    if error.filename and (isinstance(error, _PATH) or error.errno in _PATH_NUMBERS):
+        what = f"{error.filename} cannot be used: {error.strerror}."
+        return str(CongraspError(what, "Check the path and its permissions."))
     if error.errno == errno.ENOENT and "temporary directory" in str(error):
         return "There is no folder for temporary files that can be written. Set TMPDIR to one."
     if error.errno == errno.EIO:
@@ -177,13 +167,13 @@ def _check_files(arguments: Sequence[str]) -> None:
 def _check_outputs(call: Any) -> None:
     """Raises a CongraspError for an output that cannot be written, or a picture of another format, before the work.
 
-    An output is a folder if its default has no suffix; one without a default may be either.
+    An output is a folder if its default has no suffix. A command that computes the default of --out checks it itself.
     """
     for name, path in call.keywords.items():
         if name in _OUTPUTS and isinstance(path, pathlib.Path):
             default = inspect.signature(call.args[0]).parameters[name].default
-            is_folder = not default.suffix if default else None if name == "out" else name == "pictures"
-            check_output(f"--{name}", path, is_folder)
+            if default or name != "out":
+                check_output(f"--{name}", path, is_folder=not default.suffix if default else name == "pictures")
             is_png = name == "png" or (default and default.suffix == ".png")
             if is_png and path.suffix.lower() not in ("", ".png"):
                 raise CongraspError(f"--{name} is {path}, but the picture is a PNG.", "End its name in .png.")

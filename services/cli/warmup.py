@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import tyro
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.files import cache_folder, check_output, write_atomically
 from congrasp.common.runtime.engines import PhysicsName
 
@@ -88,21 +88,18 @@ def export_caches(path: pathlib.Path) -> None:
     """
     temporary = path.absolute().with_name(f".{path.name}.tmp")
     try:
-        with tarfile.open(temporary, "w") as archive:
-            manifest = tarfile.TarInfo(_MANIFEST)
-            text = json.dumps(_machine()).encode()
-            manifest.size = len(text)
-            archive.addfile(manifest, io.BytesIO(text))
-            for name, folder in _folders().items():
-                for file in sorted(folder.rglob("[!.]*")):
-                    if file.is_file() and not file.is_symlink():
-                        with contextlib.suppress(FileNotFoundError):  # another process may tidy up meanwhile
-                            archive.add(file, f"{name}/{file.relative_to(folder)}", recursive=False)
-        temporary.replace(path)
-    except OSError as error:
-        raise CongraspError(
-            f"{path} could not be written: {error.strerror}.", "Free space or pass another path."
-        ) from None
+        with os_errors_as(f"{path} could not be written", "Free space or pass another path."):
+            with tarfile.open(temporary, "w") as archive:
+                manifest = tarfile.TarInfo(_MANIFEST)
+                text = json.dumps(_machine()).encode()
+                manifest.size = len(text)
+                archive.addfile(manifest, io.BytesIO(text))
+                for name, folder in _folders().items():
+                    for file in sorted(folder.rglob("[!.]*")):
+                        if file.is_file() and not file.is_symlink():
+                            with contextlib.suppress(FileNotFoundError):  # another process may tidy up meanwhile
+                                archive.add(file, f"{name}/{file.relative_to(folder)}", recursive=False)
+            temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 

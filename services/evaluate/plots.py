@@ -14,7 +14,7 @@ from congrasp.services.evaluate.scores import ERRORS, Row
 from congrasp.services.evaluate.table import RATE, Table, paper_rate, percent, row_title
 from congrasp.services.evaluate.tables import NOISE
 from congrasp.services.record.palette import INK
-from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, save, style
+from congrasp.services.viz.plots import COLOURS, QUIET, new_figure, panel_grid, save, style
 
 _TITLES = {
     spec.column or spec.name: (f"{constraint.title.capitalize()} error", spec.unit or "share")
@@ -27,7 +27,6 @@ _NOISES = {
     "depth": "Pose: depth that it sinks into the object",
     "jitter": "Trajectory: normal error of every waypoint",
 }
-_COLUMNS = 4
 _LARGEST = 64 << 20  # limit of a JSON file in bytes
 
 
@@ -177,14 +176,9 @@ def _success(rows: Sequence[Row]) -> Any:
 def _errors(rows: Sequence[Row]) -> Any:
     """Draws cumulative distributions of the errors, one panel each."""
     shown = [name for name in _TITLES if any(name in row.quantiles for row in rows)]
-    columns = min(_COLUMNS, len(shown))
-    lines = -(-len(shown) // columns)
-    figure = new_figure(3.6 * columns, 0.6 + 2.8 * lines, "Errors of successful episodes: share of episodes below")
-    grid = figure.subplots(lines, columns, squeeze=False)
-    for axes in grid.flat[len(shown) :]:
-        axes.set_axis_off()
+    figure, grid = panel_grid(len(shown), 2.8, "Errors of successful episodes: share of episodes below")
     labels = _labels(rows)
-    for axes, name in zip(grid.flat, shown, strict=False):
+    for axes, name in zip(grid, shown, strict=True):
         title, unit = _TITLES[name]
         for i, row in enumerate(rows):
             if not (found := row.quantiles.get(name)):

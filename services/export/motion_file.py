@@ -17,7 +17,7 @@ from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.spec import Hand, capsule_ends
 from congrasp.common.io.files import check_free, write_atomically
@@ -362,7 +362,7 @@ def export_motions(
     for motion in motions:
         _check(motion)
     module = importlib.import_module(f"congrasp.services.export.{kind}")
-    try:
+    with os_errors_as(f"{path} cannot be written", "Pass another with --out."):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as workplace:
             module.write(pathlib.Path(workplace, path.name), motions, **({"camera": True} if camera else {}))
@@ -371,10 +371,6 @@ def export_motions(
                 check_free(target, force=force)
             for file, target in written:
                 file.replace(target)
-    except OSError as error:
-        raise CongraspError(
-            f"{path} cannot be written: {error.strerror or error}.", "Pass another with --out."
-        ) from None
 
 
 def default_name(motion: GraspMotion, kind: str) -> pathlib.Path:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import os_errors_as
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.motion_file import GraspMotion, joint_trajectory, robot_joints, save_motion
@@ -114,13 +114,11 @@ def save_recording(path: pathlib.Path, episode: Message) -> None:
     Raises:
       CongraspError: the file cannot be written.
     """
-    try:
+    with os_errors_as(f"{path} could not be written"):
         writer = LogWriter(path.parent, f".{path.stem}", run=str(episode.meta["object"]))
         writer.write(*episode_entries("grasp", episode, time.time_ns(), 0, JsonChannels()))
         writer.close()
         writer.files[-1].rename(path)
-    except OSError as error:
-        raise CongraspError(f"{path} could not be written: {error.strerror}.") from None
 
 
 def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:

@@ -9,7 +9,7 @@ from typing import Any
 from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.errors import TransportError, os_errors_as
 
 _TICKETS = ("granted", "redeemed", "returned", "expired")
 _GAUGES = {
@@ -35,13 +35,9 @@ def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
     ProcessCollector(registry=registry)
     for collector in collectors:
         registry.register(collector)
-    try:
+    what = f"The metrics cannot be served at {host}:{port} on this machine"
+    with os_errors_as(what, "Pass another --metrics-port."):
         server, thread = start_http_server(port, host, registry)
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise CongraspError(
-            f"The metrics cannot be served at {host}:{port} ({reason}).", "Pass another --metrics-port."
-        ) from None
     try:
         yield
     finally:

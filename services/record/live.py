@@ -15,7 +15,7 @@ import time
 import urllib.parse
 from typing import Any
 
-from congrasp.common.errors import CongraspError, need_package
+from congrasp.common.errors import need_package, os_errors_as
 from congrasp.services.record.writer import Channel, Entry
 
 _HOST, _LOOPBACK = "127.0.0.1", ("127.0.0.1", "localhost", "::1")
@@ -66,12 +66,8 @@ class LiveServer:
         # Behind the gate, at an address of the loopback interface that other sites in a browser do not know.
         inside = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}.{secrets.randbelow(254) + 1}"
         inside = inside if sys.platform == "linux" else _HOST
-        try:
+        with os_errors_as(f"The live view cannot listen on {_HOST}:{port}", "Pass another port with --live."):
             outside = socket.create_server((_HOST, port))
-        except (OSError, OverflowError) as error:
-            raise CongraspError(
-                f"The live view cannot listen on {_HOST}:{port} ({error}).", "Pass another port with --live."
-            ) from None
         self._server = foxglove.start_server(
             name="congrasp", host=inside, port=0, context=self._context, server_listener=Listener()
         )

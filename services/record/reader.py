@@ -27,7 +27,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.inputs import open_file, parse_json
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.record.scene import EPISODE_SCHEMA, check_episode
@@ -254,17 +254,14 @@ def read_records(
       CongraspError: the file cannot be opened, or is not an MCAP file.
     """
     dropped = Dropped()
-    try:
-        with open_file(path) as file:
-            start = file.read(len(MCAP0_MAGIC))
-            if not MCAP0_MAGIC.startswith(start):
-                raise CongraspError(f"{path} is not an MCAP file.", "Pass a file written by 'congrasp record'.")
-            for schema, channel, message in read_messages(file, dropped):
-                if wanted(channel.topic):
-                    name = schema.name if schema else ""
-                    yield Record(channel.topic, name, channel.message_encoding, message.log_time, message.data)
-    except OSError as error:
-        raise CongraspError(f"{path} cannot be read: {error.strerror}.") from None
+    with os_errors_as(f"{path} cannot be read"), open_file(path) as file:
+        start = file.read(len(MCAP0_MAGIC))
+        if not MCAP0_MAGIC.startswith(start):
+            raise CongraspError(f"{path} is not an MCAP file.", "Pass a file written by 'congrasp record'.")
+        for schema, channel, message in read_messages(file, dropped):
+            if wanted(channel.topic):
+                name = schema.name if schema else ""
+                yield Record(channel.topic, name, channel.message_encoding, message.log_time, message.data)
     if text := str(dropped):
         warn(f"{path} is {text}.")
 

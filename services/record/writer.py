@@ -19,7 +19,7 @@ from google.protobuf.message import Message as Protobuf
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.wire.codec import finite
 
 OPAQUE = "x-safetensors"
@@ -223,10 +223,8 @@ class LogWriter:
         Raises:
           CongraspError: the directory cannot be created.
         """
-        try:
+        with os_errors_as(f"The folder {directory} cannot be created"):
             directory.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise CongraspError(f"The folder {directory} cannot be created: {error.strerror}.") from None
         self._directory, self._name, self._run = directory, name, run
         self._max_bytes, self._max_ns, self._open_file = max_bytes, round(1e9 * max_seconds), open_file
         self._number = 0

@@ -43,13 +43,12 @@ Held = Callable[[GraspRequest, str], int]
 class PolicyGrasping:
     """A policy of a file or of a run in training; every grasp uses its newest weights."""
 
-    def __init__(self, source: Source, name: str, *, threads: int = 0):
+    def __init__(self, source: Source, name: str):
         """Loads the policy; compiles nothing yet.
 
         Args:
           source: source of its weights.
           name: its name on the page.
-          threads: threads of the physics; 0 for one per core.
 
         Raises:
           CongraspError: the source has no policy yet.
@@ -63,7 +62,7 @@ class PolicyGrasping:
         self._trouble = ""
         self.hand = get_hand(first.spec.hand)
         self.task = first.task.evaluated()
-        self._attempts = Attempts(self.hand, self.task, first, threads=threads or cores())
+        self._attempts = Attempts(self.hand, self.task, first, threads=cores())
         self._compiled, self._free = False, threading.Lock()
 
     def newest(self) -> dict[str, Any]:

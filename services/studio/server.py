@@ -15,7 +15,7 @@ import urllib.parse
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.ops.logs import log
 
@@ -141,14 +141,9 @@ class PageServer:
         Raises:
           CongraspError: the port is busy, or there is no such interface.
         """
-        try:
+        remedy = "Choose another --port, or end the process that uses it."
+        with os_errors_as(f"The page cannot be offered at {host}:{port}", remedy):
             self._server = _Server((host, port), _Handler)
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise CongraspError(
-                f"The page cannot be offered at {host}:{port} ({reason}).",
-                "Choose another --port, or end the process that uses it.",
-            ) from None
         self.routes, self._server.page = routes, self
         self.host, self.port = host, int(self._server.server_address[1])
         self._named = set(names)

@@ -5,6 +5,7 @@ It accepts log messages and the learner's status from any receiver, and is indep
 
 import bisect
 import collections
+import contextlib
 import dataclasses
 import pathlib
 import threading
@@ -16,7 +17,7 @@ import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from mcap.reader import make_reader
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
@@ -191,17 +192,6 @@ class TrainingWindow:
                     f"There is no episode of the actor '{actor}' yet.", "Wait: actors send one from time to time."
                 )
             return known.episode
-
-    def curve(self, name: str) -> Curve:
-        """A curve by its name.
-
-        Raises:
-          CongraspError: there is none of this name.
-        """
-        with self._lock:
-            if name not in self._curves:
-                raise CongraspError(f"There is no curve '{name}'.", "Choose one of the page's list.")
-            return self._curves[name]
 
     def view(self, names: Sequence[str] = (), points: int = 300) -> dict[str, Any]:
         """The state of the run for a page, as JSON, with the named curves."""
@@ -437,24 +427,20 @@ def _within(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, by
 
 def _by_index(file: pathlib.Path, begin: int, end: int) -> list[tuple[int, str, bytes]] | None:
     """Does the work of `_within` by the index of a finished file; None if it is unfinished, or damaged where read."""
-    try:
-        with file.open("rb") as stream:
-            if (summary := intact_summary(stream)) is None or (statistics := summary.statistics) is None:
-                return None
-            if statistics.message_start_time > end or statistics.message_end_time < begin:
-                return []
-            topics = [channel.topic for channel in summary.channels.values() if is_episode(channel.topic)]
-            messages = (
-                make_reader(stream, validate_crcs=True).iter_messages(topics, starting_at=begin, ending_before=end)
-                if topics
-                else ()
-            )
-            return [
-                (message.log_time, channel.topic, message.data)
-                for schema, channel, message in messages
-                if schema is not None and schema.name == EPISODE_SCHEMA
-            ]
-    except DAMAGE:
-        return None
-    except OSError as error:
-        raise CongraspError(f"{file} cannot be read: {error.strerror}.") from None
+    with os_errors_as(f"{file} cannot be read"), contextlib.suppress(*DAMAGE), file.open("rb") as stream:
+        if (summary := intact_summary(stream)) is None or (statistics := summary.statistics) is None:
+            return None
+        if statistics.message_start_time > end or statistics.message_end_time < begin:
+            return []
+        topics = [channel.topic for channel in summary.channels.values() if is_episode(channel.topic)]
+        messages = (
+            make_reader(stream, validate_crcs=True).iter_messages(topics, starting_at=begin, ending_before=end)
+            if topics
+            else ()
+        )
+        return [
+            (message.log_time, channel.topic, message.data)
+            for schema, channel, message in messages
+            if schema is not None and schema.name == EPISODE_SCHEMA
+        ]
+    return None

@@ -61,7 +61,7 @@ def hand_sheet(hand: Hand, *, size: tuple[int, int] = (400, 400)) -> np.ndarray:
     """The hand open, half closed and closed (columns), from the palm, the thumb's side and in between (rows)."""
     placed = _poses(hand)
     points = np.concatenate([_points(shapes) for shapes in placed.values()])
-    thumb = np.sign(upright(hand).apply(hand.keypoints[len(hand.links)])[1])
+    thumb = np.sign(_side(hand)[1])
     images, labels = [], []
     for view, azimuth in {"palm": 0.0, "between": 50.0, "thumb's side": 95.0}.items():
         angle = thumb * np.radians(azimuth)

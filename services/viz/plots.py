@@ -150,6 +150,17 @@ def new_figure(width: float, height: float, title: str) -> Any:
     return figure
 
 
+def panel_grid(count: int, height: float, title: str) -> tuple[Any, list[Any]]:
+    """A figure of `count` panels, of a height in inches, in rows of up to four; and their axes."""
+    columns = min(_COLUMNS, count)
+    rows = -(-count // columns)
+    figure = new_figure(3.6 * columns, 0.6 + height * rows, title)
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for unused in axes[count:]:
+        unused.set_axis_off()
+    return figure, axes[:count]
+
+
 def style(axes: Any, title: str, x: str, y: str) -> None:
     """Sets title, labels and the plain frame of one plot."""
     axes.set_title(title, loc="left", color=INK, fontsize=10)
@@ -203,13 +214,8 @@ def draw(title: str, panels: Sequence[Panel], runs: Runs) -> Any:
     The label of a line names its run if there are several, its process if there are several, and its metric if the
     panel has two.
     """
-    columns = min(_COLUMNS, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = new_figure(3.6 * columns, 0.6 + 2.5 * rows, title)
-    grid = figure.subplots(rows, columns, squeeze=False)
-    for axes in grid.flat[len(panels) :]:
-        axes.set_axis_off()
-    for axes, panel in zip(grid.flat, panels, strict=False):
+    figure, grid = panel_grid(len(panels), 2.5, title)
+    for axes, panel in zip(grid, panels, strict=True):
         lines = [
             (_label(run, name, panel, runs), *curve)
             for run, series in runs.items()

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from congrasp.common.errors import CongraspError, need_package
+from congrasp.common.errors import CongraspError, need_package, os_errors_as
 from congrasp.common.io.files import write_atomically
 from congrasp.services.record.palette import INK
 
@@ -21,9 +21,9 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
 
     Args:
       images: (height, width, 3) uint8, all of one size.
-      labels: one for each picture.
+      labels: one for each picture; shrunk and cut until it fits, as is the title.
       columns: pictures in a row.
-      title: one line; shrunk until it fits.
+      title: one line.
 
     Returns:
       (H, W, 3) uint8.
@@ -39,12 +39,13 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
     sheet = Image.new("RGB", (columns * (width + _MARGIN) + _MARGIN, top + rows * (height + _LABEL) + _MARGIN), _PAPER)
     draw = ImageDraw.Draw(sheet)
     if title:
-        font = _font(title, 19, sheet.width - 2 * _MARGIN)
+        title, font = _fitted(title, 19, sheet.width - 2 * _MARGIN)
         draw.text((_MARGIN + 2, _TITLE // 2), title, INK, font, anchor="lm")
     for i, (image, label) in enumerate(zip(images, labels, strict=True)):
         x, y = _MARGIN + i % columns * (width + _MARGIN), top + i // columns * (height + _LABEL)
         sheet.paste(Image.fromarray(image), (x, y))
-        draw.text((x + 2, y + height + _LABEL // 2), label, _QUIET, _font(label, 14, width), anchor="lm")
+        label, font = _fitted(label, 14, width)
+        draw.text((x + 2, y + height + _LABEL // 2), label, _QUIET, font, anchor="lm")
     return np.asarray(sheet)
 
 
@@ -57,13 +58,16 @@ def stacked(sheets: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(wide)
 
 
-def _font(text: str, size: int, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The largest font up to a size in which a text fits a width in pixels."""
-    font = ImageFont.load_default(size)
-    while size > 8 and font.getlength(text) > width:
+def _fitted(text: str, size: int, width: int) -> tuple[str, ImageFont.FreeTypeFont | ImageFont.ImageFont]:
+    """A text and the largest font up to a size with which it fits a width in pixels; a longer one loses its middle."""
+    while (font := ImageFont.load_default(size)).getlength(text) > width and size > 8:
         size -= 1
-        font = ImageFont.load_default(size)
-    return font
+    half, shown = len(text) // 2, text
+    for cut in range(1, half):
+        if font.getlength(shown) <= width:
+            break
+        shown = f"{text[: half - cut]}…{text[half + cut :]}"
+    return shown, font
 
 
 def png_of(image: np.ndarray) -> bytes:
@@ -95,7 +99,7 @@ def save_video(
     need_package("A video", "imageio_ffmpeg")
     import imageio_ffmpeg
 
-    try:
+    with os_errors_as(f"{path} could not be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
         writer = imageio_ffmpeg.write_frames(
             str(path), size, fps=frame_rate, quality=8, macro_block_size=2, output_params=[*encoding]
@@ -106,5 +110,3 @@ def save_video(
         for frame in frames:
             writer.send(np.ascontiguousarray(frame))
         writer.close()
-    except OSError as error:
-        raise CongraspError(f"{path} could not be written: {error.strerror or error}.") from None

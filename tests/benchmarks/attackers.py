@@ -5,7 +5,6 @@ the project's own peers do to be polite holds it back. It prints a line when it 
 """
 
 import contextlib
-import json
 import pathlib
 import socket
 import subprocess
@@ -21,6 +20,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.keys import FLOWS, Keys
 from congrasp.common.transport.ports import free_port, shifted
 from congrasp.common.wire.codec import Message, encode
+from tests.bare_zenoh import bare_session
 
 _SILENT = 300  # connections
 _HUGE = 60 << 20  # bytes
@@ -82,7 +82,7 @@ def throttled(endpoint: str, rate: float) -> Iterator[str]:
 def unread(endpoint: str, run: str, query: bytes) -> None:
     """Sends queries to a policy server and never reads an answer: the thread that should is asleep."""
     stopped: Callback[zenoh.Reply] = Callback(lambda reply: time.sleep(_FOREVER), indirect=False)
-    with _session(endpoint, 0) as session:
+    with bare_session("client", connect=endpoint) as session:
         print("began", flush=True)
         while True:
             session.get(Keys(run).act_for("unread"), stopped, payload=query, timeout=_FOREVER)
@@ -92,7 +92,7 @@ def unread(endpoint: str, run: str, query: bytes) -> None:
 def greedy(endpoint: str, run: str, query: bytes) -> None:
     """Pulls all the weights of a learner 83 times a second, and every further chunk that it announces."""
     request = encode(Message(meta={"newer_than": -1}))
-    with _session(endpoint, 1) as session:
+    with bare_session("client", connect=shifted(endpoint, 1)) as session:
         print("began", flush=True)
 
         def pull() -> None:
@@ -133,7 +133,7 @@ def silent(endpoint: str, run: str, query: bytes) -> None:
 def huge(endpoint: str, run: str, query: bytes) -> None:
     """Sends 60 MB to a policy server, or to the key that the file holds, four at a time."""
     payload, key = bytes(_HUGE), query.decode() or Keys(run).act_for("huge")
-    sessions = [_session(endpoint, 0) for _ in range(4)]
+    sessions = [bare_session("client", connect=endpoint) for _ in range(4)]
     print("began", flush=True)
 
     def send(session: zenoh.Session) -> None:
@@ -147,15 +147,6 @@ def huge(endpoint: str, run: str, query: bytes) -> None:
 
 
 KINDS: dict[str, Callable[[str, str, bytes], None]] = {kind.__name__: kind for kind in (unread, greedy, silent, huge)}
-
-
-def _session(endpoint: str, flow: int) -> zenoh.Session:
-    """A session with the port of a flow, of which Zenoh's own defaults bound nothing."""
-    config = zenoh.Config()
-    settings = {"mode": "client", "connect/endpoints": [shifted(endpoint, flow)], "scouting/multicast/enabled": False}
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
 
 
 def _whole(session: zenoh.Session, key: str, request: bytes) -> None:

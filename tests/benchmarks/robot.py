@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import functools
-import importlib.util
 import json
 import os
 import pathlib
@@ -16,7 +15,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import zenoh
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 from zenoh.handlers import RingChannel
@@ -32,8 +30,9 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import goal_of
 from congrasp.common.task.types import Surface
 from congrasp.common.transport.ports import free_port
+from tests.bare_zenoh import bare_session
+from tests.examples import EXAMPLES, example
 
-EXAMPLES = pathlib.Path(__file__).resolve().parents[2] / "examples"
 JOINTS, POSE = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped"
 CLOUD, FIELD, FLOAT32 = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/PointField", 7
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -41,15 +40,6 @@ SEED = 1_000_000
 """Of the object."""
 _DROP = 0.03
 """m below its height at the end of the lift from which on an object counts as dropped."""
-
-
-def example(name: str) -> Any:
-    """Imports a program of `examples/`."""
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 class DepthCamera:
@@ -113,11 +103,8 @@ class Rig:
         self._surface, self._camera, self._episodes = obj.points[: task.surface_points], None, 0
         position, quaternion = self.robot.request.wrist
         self._base = np.asarray(position), Rotation.from_quat(quaternion, scalar_first=True)
-        self._endpoint, config = f"tcp/127.0.0.1:{free_port()}", zenoh.Config()
-        settings = {"mode": "peer", "listen/endpoints": [self._endpoint], "scouting/multicast/enabled": False}
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
-        self._session = zenoh.open(config)
+        self._endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self._session = bare_session("peer", listen=self._endpoint)
         topics = ("joint_command", "wrist_command")
         self._heard = {topic: self._session.declare_subscriber(topic, RingChannel(1)) for topic in topics}
         self._node: subprocess.Popen[bytes] | None = None

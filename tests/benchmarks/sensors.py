@@ -10,7 +10,8 @@ from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.task.config import TaskConfig
-from tests.benchmarks.robot import SEED, example
+from tests.benchmarks.robot import SEED
+from tests.examples import example
 
 _FORCES = ("contact_force", "contact_position", "contact_found")
 _VELOCITIES = ("q_velocity", "u_velocity", "object_velocity", "object_angular_velocity")

@@ -26,6 +26,7 @@ from tests.benchmarks.dexgraspbench_hands import BENCHMARK_HANDS, benchmarked, m
 from tests.benchmarks.dexgraspbench_replay import replayed
 from tests.docs.test_docs import ROOT
 from tests.episodes import episode
+from tests.services.export.test_motion import posed
 
 T = 6
 HAND = get_hand("allegro")
@@ -114,24 +115,17 @@ def benchmark_model(fingers, palm, *, root=True):
 
 def motion_of(hand, *, seed=0) -> GraspMotion:
     """A wild motion of a hand beside a small ball: any wrist, any fingers, the object moves."""
-    rng = np.random.default_rng(seed)
-    arrays = dataclasses.replace(motion_of_episode(episode(T)), hand=hand.name, **hand_arrays(hand))
-    q = rng.uniform(hand.lower, hand.upper, (T, len(hand.joints)))
-    wrist, place = Rotation.random(T, rng=rng), rng.normal(scale=0.3, size=(T, 3))
-    local = [mujoco_link_poses(hand, angles) for angles in q]
+    still = dataclasses.replace(motion_of_episode(episode(T)), hand=hand.name, **hand_arrays(hand))
+    motion = posed(still, lambda q: mujoco_link_poses(hand, q), seed)
+    wrist = Rotation.from_quat(motion.wrist_quaternion, scalar_first=True)
     ball = trimesh.creation.icosphere(2, 0.02)
     return dataclasses.replace(
-        arrays,
+        motion,
         metrics={"held": 1.0},
-        joint_position=q,
-        joint_target=q,
-        wrist_position=place,
-        wrist_quaternion=wrist.as_quat(scalar_first=True),
-        link_position=np.stack([wrist[t].apply(local[t][0]) + place[t] for t in range(T)]),
+        joint_target=motion.joint_position,
         link_quaternion=np.tile([1.0, 0, 0, 0], (T, len(hand.links), 1)),
         link_force=np.zeros((T, len(hand.links), 3)),
-        object_position=place + wrist.apply([0.3, 0.0, 0.0]),
-        object_quaternion=Rotation.random(T, rng=rng).as_quat(scalar_first=True),
+        object_position=motion.wrist_position + wrist.apply([0.3, 0.0, 0.0]),
         object_vertices=np.asarray(ball.vertices, np.float32),
         object_faces=np.asarray(ball.faces, np.int32),
         goal={},

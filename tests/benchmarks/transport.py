@@ -19,7 +19,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-import zenoh
 from zenoh import CongestionControl
 from zenoh.handlers import FifoChannel
 
@@ -34,6 +33,7 @@ from congrasp.learner.hub.admission import Admission, Ranges
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
+from tests.bare_zenoh import bare_session
 from tests.rollouts import SCHEMA, Learner, bundle, learner_hub
 
 _FORM = RolloutForm(steps=20, worlds=340, observation=534, action=26, half=True)
@@ -177,7 +177,7 @@ def _through_the_hub(senders: int, seconds: float, *, write_ahead: bool = False)
 def _through_queries(senders: int, seconds: float) -> float:
     """MB/s through bare Zenoh queries."""
     endpoint = f"tcp/127.0.0.1:{free_port(1)}"
-    with _session("peer", listen=endpoint) as session:
+    with bare_session("peer", listen=endpoint) as session:
         queryable = session.declare_queryable(_RUN, FifoChannel(8))
 
         def receive() -> int:
@@ -279,19 +279,9 @@ def _ask(endpoint: str, _: pathlib.Path, number: int) -> None:
             for _reply in session.get(_RUN, FifoChannel(4), payload=data, congestion_control=CongestionControl.BLOCK):
                 pass
 
-    with _session("client", connect=endpoint) as session, ThreadPoolExecutor(2) as pool:
+    with bare_session("client", connect=endpoint) as session, ThreadPoolExecutor(2) as pool:
         for sending in [pool.submit(send) for _ in range(2)]:
             sending.result()
-
-
-def _session(mode: str, **endpoints: str) -> zenoh.Session:
-    """A bare Zenoh session."""
-    settings: dict[str, Any] = {f"{way}/endpoints": [endpoint] for way, endpoint in endpoints.items()}
-    settings |= {"mode": mode, "scouting/multicast/enabled": False, "transport/shared_memory/enabled": False}
-    config = zenoh.Config()
-    for name, value in settings.items():
-        config.insert_json5(name, json.dumps(value))
-    return zenoh.open(config)
 
 
 def _push(address: str, _: pathlib.Path, number: int) -> None:

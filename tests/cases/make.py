@@ -1,4 +1,4 @@
-"""Writes the binary inputs of the cases next to their descriptions: `python tests/cases/make.py`."""
+"""Writes the binary inputs of the cases next to their descriptions: `python -m tests.cases.make`."""
 
 import json
 import pathlib
@@ -8,6 +8,8 @@ import zipfile
 
 import numpy as np
 import trimesh
+
+from tests.solids import ell
 
 HERE = pathlib.Path(__file__).parent
 BOX = trimesh.creation.box((0.04, 0.06, 0.1))
@@ -87,17 +89,6 @@ def ply(header: str, rows: np.ndarray) -> bytes:
         f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\n{names}end_header\n".encode()
         + "\n".join(" ".join(f"{x:.3f}" for x in row) for row in rows).encode()
     )
-
-
-def ell() -> trimesh.Trimesh:
-    """An L of two legs of 2 x 2 cm, 8 cm long, as one body of 56 cm^3."""
-    outline = np.array([[0, 0], [0.08, 0], [0.08, 0.02], [0.02, 0.02], [0.02, 0.08], [0, 0.08]])
-    caps = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
-    faces = [face[::-1] for face in caps] + [[6 + i for i in face] for face in caps]
-    for i in range(6):
-        j = (i + 1) % 6
-        faces += [[i, j, 6 + j], [i, 6 + j, 6 + i]]
-    return trimesh.Trimesh([[*xy, z] for z in (0.0, 0.02) for xy in outline], faces)
 
 
 def collada(mesh: trimesh.Trimesh) -> bytes:

@@ -16,7 +16,7 @@ from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy import network
-from congrasp.common.policy.bundle import PolicyBundle, full_layout, mean_action, policy_spec
+from congrasp.common.policy.bundle import full_layout, mean_action, policy_spec
 from congrasp.common.task import camera
 from congrasp.common.task.config import SensingConfig, TaskConfig
 from congrasp.common.task.constraints import known
@@ -24,10 +24,10 @@ from congrasp.common.task.privileged import extra
 from congrasp.common.task.sensing import draw_sensors
 from congrasp.common.task.types import Goal, Surface
 from congrasp.learner.algorithms.distill import Distillation
-from congrasp.learner.algorithms.protocol import random_policy
 from congrasp.services.export.policy import export_policy
 from tests.compiled import Compiled
 from tests.exported_policies import difference
+from tests.policies import random_bundle
 
 HAND = get_hand("allegro")
 rotations = Compiled(module)
@@ -135,12 +135,7 @@ def test_images_come_at_their_rate_or_once():
 
 @functools.cache
 def bundle():
-    """An untrained policy whose actions depend on its cloud."""
-    spec = policy_spec(TASK, NETWORK)
-    policy = random_policy(1, spec)
-    actor = jax.tree.map(np.array, policy.params["actor"])
-    actor["network"]["output"]["kernel"] *= 100.0
-    return PolicyBundle(spec, TASK, {**policy.params, "actor": actor}, policy.observation, policy.value, 1, "t", 0)
+    return random_bundle(TASK, NETWORK, 100.0)
 
 
 def cloud_block():
@@ -182,22 +177,15 @@ def test_bundles_and_exports_keep_the_cloud_s_layers(tmp_path):
 def test_a_student_learns_what_only_its_cloud_shows(tmp_path):
     """A teacher of the full state acts by where the object is; the student's one informative input is the cloud."""
     full = dataclasses.replace(TASK, observation="full")
-    spec = policy_spec(full, NETWORK)
-    policy = random_policy(2, spec)
-    actor = jax.tree.map(np.array, policy.params["actor"])
-    actor["network"]["output"]["kernel"] *= 30.0
-    actor["log_std"] = np.full(spec.action_size, np.log(0.2), np.float32)
-    path = tmp_path / "teacher.safetensors"
-    bundles.save(
-        PolicyBundle(spec, full, {**policy.params, "actor": actor}, policy.observation, policy.value, 1, "t", 0), path
-    )
+    teacher, path = random_bundle(full, NETWORK, 30.0, seed=2, std=0.2), tmp_path / "teacher.safetensors"
+    bundles.save(teacher, path)
     run = RunConfig(task=TASK, network=NETWORK, algorithm="distill", updates=1000)
     run = dataclasses.replace(
         run, distill=dataclasses.replace(run.distill, teacher=str(path), minibatches=4, learning_rate=3e-3)
     )
     student, block = Distillation(policy_spec(TASK, NETWORK), run), cloud_block()
     size = sum(width for _, width in full_layout(TASK))
-    assert sum(width for _, width in spec.layout) == size
+    assert sum(width for _, width in teacher.spec.layout) == size
 
     def batch(seed):
         rng = np.random.default_rng(seed)

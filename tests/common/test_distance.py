@@ -1,6 +1,7 @@
 """Signed distance: primitives against closed forms and known points, grids against exact queries, meshes and caches."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from congrasp.common.objects import procedural, shapes
-from congrasp.common.objects.distance import MARGIN, DistanceField, distance_field, primitive_distance
+from congrasp.common.objects.distance import MARGIN, DistanceField, _least, _slots, distance_field
 from congrasp.common.objects.spec import GraspObject, Piece
 
 DIAGONAL = (0.9238795325112867, 0.0, 0.0, 0.3826834323650898)  # 45 degrees about z
@@ -37,6 +38,10 @@ def at(field: DistanceField, points: np.ndarray, index: int = 0) -> np.ndarray:
 
 
 _at = jax.jit(DistanceField.at)
+
+
+def primitive_distance(pieces: Sequence[Piece], points: np.ndarray) -> np.ndarray:
+    return np.asarray(_least(_slots(pieces), points.astype(np.float32)))
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from congrasp.common.task.reward import keypoint_weights, reward_terms, terms
 from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.types import Surface
 from congrasp.services.grasp.parse import read_request
-from tests.scenes import HAND, L, active, evaluated, scene, scene_of
+from tests.scenes import HAND, L, active, evaluated, lone_scene, scene, scene_of
 
 FINGERS = get_constraint("fingers")
 HEADING = get_constraint("heading")
@@ -42,11 +42,7 @@ def pinch(on: bool = True):
 
     Palm, thumb, index, middle and ring finger touch it; index and middle with 3 and 5 N.
     """
-    state, surface, goal = (jax.tree.map(lambda array: array[:1], part) for part in scene(0))
-    goal = dataclasses.replace(
-        goal.replace("fingers", allowed=PINCH), active=active(*(["fingers"] if on else []), batch=1)
-    )
-    made = scene_of(TASK, state, surface, goal)
+    made = lone_scene(TASK, *["fingers"] * on, fingers={"allowed": PINCH})
     nearest = np.zeros((1, len(HAND.keypoints), 3), np.float32)
     nearest[..., 0] = 0.2
     nearest[0, THUMB_TIP] = [0.001, 0.0, 0.0]

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,7 +18,7 @@ from congrasp.common.task.reward import reward_terms, terms
 from congrasp.common.task.sampling.bank import Draw
 from congrasp.common.task.types import Surface
 from congrasp.services.grasp.parse import read_request
-from tests.scenes import HAND, L, active, evaluated, scene, scene_of
+from tests.scenes import HAND, L, evaluated, lone_scene
 
 FORCE = get_constraint("force")
 TASK = TaskConfig(constraints=("heading", "force"))
@@ -28,14 +27,7 @@ THUMB, INDEX, MIDDLE = 3, 6, 9
 
 def pressing(on: bool = True, limit: float = 3.0):
     """Thumb, index and middle finger press with 5, 2 and 20 N; the limit is 3 N."""
-    state, surface, goal = (jax.tree.map(lambda array: array[:1], part) for part in scene(0))
-    goal = goal.replace("force", limit=np.array([limit], np.float32))
-    made = scene_of(
-        TASK,
-        state,
-        surface,
-        dataclasses.replace(goal, active=active(*(["force_limit"] if on else []), batch=1)),
-    )
+    made = lone_scene(TASK, *["force_limit"] * on, force={"limit": np.array([limit], np.float32)})
     force = np.zeros((1, L, 3), np.float32)
     force[0, THUMB, 0], force[0, INDEX, 1], force[0, MIDDLE] = 5.0, -2.0, (12.0, 0.0, 16.0)
     touching = np.isin(np.arange(L), (THUMB, INDEX, MIDDLE))[None]

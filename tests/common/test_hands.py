@@ -19,7 +19,6 @@ from congrasp.common.hands.spec import link_origin
 from congrasp.common.objects import procedural
 from congrasp.common.objects.pool import scale_objects
 from congrasp.common.task.config import TaskConfig
-from tests.mano_file import mano_pickle
 from tests.task import start_of
 
 ROBOTS = ("allegro", "sharpa")
@@ -38,11 +37,8 @@ ORIGIN = {"allegro": (0.0, 0.0, 0.095), "sharpa": (0.0, 0.0, 0.0)}  # of the mak
 
 
 @pytest.fixture(params=["human", "mano", *ROBOTS])
-def hand(request, tmp_path_factory, monkeypatch):
-    file = tmp_path_factory.getbasetemp() / "hands.pkl"
-    if not file.exists():
-        file.write_bytes(mano_pickle())
-    monkeypatch.setenv(VARIABLE, str(file))
+def hand(request, mano, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(mano))
     get_hand.cache_clear()
     yield get_hand(request.param)
     get_hand.cache_clear()

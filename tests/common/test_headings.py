@@ -197,7 +197,6 @@ def test_feasible_keeps_what_stays_above_the_table():
     np.testing.assert_array_equal(
         feasible(headings, FLAT, Outline(np.zeros((1, 1, 3)), np.array([0.004]), ANY)), [1, 1, 1, 0, 1, 1, 0]
     )
-    np.testing.assert_array_equal(feasible(headings, FLAT, steepest_up=1.0), [1, 0, 1, 1, 1, 0, 1])
     upside_down = np.array([0, 0, 0.05, 0, 1.0, 0, 0])
     np.testing.assert_array_equal(feasible(headings, upside_down)[[0, 3]], [0, 1])
 

@@ -10,6 +10,7 @@ import sys
 import textwrap
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -144,13 +145,8 @@ def test_workers_answer_at_the_same_time(pair):
     server, client = pair
     together = threading.Barrier(3)
     server.serve(KEYS.act, lambda key, m: Message(meta={"n": together.wait(60)}), workers=3)
-    seen = []
-    ask = lambda: seen.append(client.query(KEYS.act, Message(), timeout=60).meta["n"])  # noqa: E731
-    threads = [threading.Thread(target=ask, daemon=True) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
+    with ThreadPoolExecutor(3) as pool:
+        seen = pool.map(lambda _: client.query(KEYS.act, Message(), timeout=60).meta["n"], range(3))
     assert sorted(seen) == [0, 1, 2]
 
 

@@ -35,7 +35,7 @@ class A2C:
     def init(self, seed, initial=None):
         initial = initial or random_policy(seed, self._spec)
         optimizer = OPTIMIZER.init(initial.params)
-        return TrainState(initial.params, optimizer, jax.random.PRNGKey(seed), initial.observation, initial.value, 0, 0)
+        return TrainState.begin(seed, optimizer, initial)
 
     def policy(self, state):
         return LearnedPolicy(state.params, state.observation, state.value)

@@ -11,12 +11,13 @@ from congrasp.common.config import DistillConfig, NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.policy import bundle as bundles
-from congrasp.common.policy.bundle import PolicyBundle, PolicySpec, mean_action, policy_spec
+from congrasp.common.policy.bundle import PolicySpec, mean_action, policy_spec
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.privileged import extra, student_action
 from congrasp.learner.algorithms.distill import Distillation
-from congrasp.learner.algorithms.protocol import NonFiniteUpdate, random_policy
+from congrasp.learner.algorithms.protocol import NonFiniteUpdate
 from congrasp.services.train.presets import TRACKERS
+from tests.policies import random_bundle
 
 NETWORK = NetworkConfig(hidden=(32,), encoder=4)
 TASK = TaskConfig(hand="allegro", constraints=("heading",), surface_points=64)
@@ -25,13 +26,7 @@ WORLDS, STEPS = 32, 8
 
 def save_teacher(path):
     """Its actions depend on what it sees, and spread by 0.5 in one entry and 0.1 in the others."""
-    spec = policy_spec(TASK, NETWORK)
-    policy = random_policy(1, spec)
-    actor = jax.tree.map(np.array, policy.params["actor"])
-    actor["network"]["output"]["kernel"] *= 30.0
-    actor["log_std"] = np.log(np.where(np.arange(spec.action_size) == 0, 0.5, 0.1)).astype(np.float32)
-    params = {**policy.params, "actor": actor}
-    bundles.save(PolicyBundle(spec, TASK, params, policy.observation, policy.value, 1, "t", 0), path)
+    bundles.save(random_bundle(TASK, NETWORK, 30.0, std=[0.5] + [0.1] * 21), path)
 
 
 @pytest.fixture(scope="module")

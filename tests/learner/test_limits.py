@@ -6,15 +6,9 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.limits import RateLimit
+from tests.waits import Clock
 
 A, B = "congrasp/r/rollout/0.a", "congrasp/r/rollout/1.b"
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self):
-        return self.now
 
 
 def test_useless_requests_empty_a_certificates_bucket_and_time_fills_it():

@@ -3,13 +3,14 @@
 import dataclasses
 import json
 import os
+import pathlib
+import tempfile
 
 import numpy as np
 import pytest
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
-from congrasp.common.hands.files import hand_text, read_hand
+from congrasp.common.hands.files import read_hand
 from congrasp.common.io.inputs import distinct_names, file_name, read_file, safe_name
 from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
@@ -23,7 +24,55 @@ from congrasp.services.record.reader import read_records
 from tests.episodes import episode
 from tests.limits import limited
 
+CLAW = pathlib.Path(__file__).parents[1] / "hands" / "claw.json"
 NAN, INF = float("nan"), float("inf")
+LOADERS = {
+    "object": store.load,
+    "set": stored_sets.load,
+    "hand": read_hand,
+    "motion": load_motion,
+    "policy": bundles.load,
+}
+
+
+def _saved(save, *arguments):
+    """Bytes of a file that a function writes, to a path or an open file."""
+    with tempfile.TemporaryDirectory() as folder:
+        save(path := pathlib.Path(folder, "a.npz"), *arguments)
+        return path.read_bytes()
+
+
+OBJECT = _saved(lambda path: store.save(generate(0, "box"), path))
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "why"),
+    [
+        ("object", None, "There is no object file"),
+        ("object", OBJECT[:-5] + bytes([OBJECT[-5] ^ 1]) + OBJECT[-4:], "cannot be read as an object: .*checksum"),
+        ("object", OBJECT[: len(OBJECT) // 2], "cannot be read as an object"),
+        ("object", encode(Message({}, {"kind": "bundle", "format": 1})), "not an object of this version"),
+        ("object", encode(Message({}, {"kind": "object", "format": 1})), "lacks an array or a field"),
+        ("set", None, "cannot be read"),
+        ("set", b"not a set", "cannot be read as a constraint set"),
+        ("set", OBJECT, "not a constraint set"),
+        ("hand", None, "cannot be read"),
+        ("hand", b"not json", "is not JSON"),
+        ("motion", None, "cannot be read: No such file"),
+        ("motion", b"PK nothing", r"not a grasp motion \(it is not an NPZ file, or was cut\)"),
+        ("motion", _saved(np.savez, np.zeros(3)), "not a grasp motion"),
+        ("motion", _saved(lambda path: np.savez(path, meta=np.array({"a": 1}, object))), "not a grasp motion"),
+        ("policy", None, "cannot be read"),
+        ("policy", policy_file(None).read_bytes()[:-5], "is damaged"),
+    ],
+)
+def test_absent_cut_and_foreign_files_are_named(tmp_path, kind, data, why):
+    path = tmp_path / "a.npz"
+    if data is not None:
+        path.write_bytes(data)
+    with pytest.raises(CongraspError, match=why) as raised:
+        LOADERS[kind](path)
+    assert str(path) in str(raised.value) and "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("name", ["mug", "mug_7", "Becher groß (2)", "x" * 100, "v1.2-b+c"])
@@ -147,14 +196,27 @@ def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, par
             "more than 64 couplings",
         ),
         (lambda h: h["links"][1]["joints"][0].update(name="hold"), "the name 'hold' is taken"),
+        (lambda h: h["links"][1]["joints"][0].update(axis=[0.0, 2.0, 0.0]), "not a unit vector"),
+        (lambda h: h["links"].insert(1, h["links"].pop(2)), "parent 'palm' of|must precede"),
+        (lambda h: h["links"].append(h["links"][-1]), "more than once"),
+        (lambda h: h["links"].pop(0), "first link must be the palm"),
+        (lambda h: h.update(links=3), "not a hand"),
+        (lambda h: h.update(thumb="palm"), "the thumb must be a link with a tip"),
+        (lambda h: h.update(open_pose={"elbow": 1.0}), "is not a joint"),
+        (lambda h: h.update(closed_pose={"left_root": 3.0}), "outside its limits in the closed pose"),
+        (lambda h: h.update(format=2), "format 2"),
+        (lambda h: h.update(wings=2), "'wings'|wings"),
+        (lambda h: h.clear(), "has the format None"),
     ],
 )
 def test_hands_with_values_that_none_has_are_named(tmp_path, change, why):
-    fields = json.loads(hand_text(get_hand("human")))
+    fields = json.loads(CLAW.read_text())
     change(fields)
-    (tmp_path / "a.json").write_text(json.dumps(fields))
-    with pytest.raises(CongraspError, match=why):
-        read_hand(tmp_path / "a.json")
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(fields))
+    with pytest.raises(CongraspError, match=why) as raised:
+        read_hand(path)
+    assert str(path) in str(raised.value) and "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -216,12 +278,3 @@ def test_constraint_sets_with_values_that_none_has_are_named(tmp_path):
             stored_sets.load(path)
     path.write_bytes(encode(made))
     assert stored_sets.load(path).meta == made.meta
-
-
-LOADERS = {
-    "object": store.load,
-    "set": stored_sets.load,
-    "hand": read_hand,
-    "motion": load_motion,
-    "policy": bundles.load,
-}

@@ -43,6 +43,7 @@ _TUBE = 0.01  # radius around the approach that must be free in front of the sur
 _MARGIN = 0.01  # distance of an approach from the avoid region; closing fingers of this thickness must not meet it
 _BACK = 0.015  # greatest distance back from the table: to a hand whose centre is 5 mm inside the surface
 _FARTHEST_BACK = 0.03  # the same for objects without an alternative: to 1 cm over the surface
+_RISE = 0.1  # largest upward component of a direction
 _FACING = 0.5  # least cosine between a surface's inward normal and a prescribed direction
 _ROLLS = 4
 _BATCH = 320
@@ -255,12 +256,10 @@ def feasible(
     rest_pose: np.ndarray,
     outline: Outline = CENTER,
     width: np.ndarray | float = 0.0,
-    *,
-    steepest_up: float = 0.1,
 ) -> np.ndarray:
     """(H,) bool: headings that can be followed while the object rests on the table in a resting pose.
 
-    The approach must come from above or level (its direction rises by at most `steepest_up` per metre), and the hand
+    The approach must come from above or level (its direction rises by at most 0.1 per metre), and the hand
     must be above the table at the heading position in one of the poses that are open wide enough for the object
     (`actors.initial` lifts the start of an approach over the table). All headings of a thin object may be infeasible:
     see `clear_table`.
@@ -270,10 +269,9 @@ def feasible(
       rest_pose: (7,) the object's pose, with the table's top at z = 0.
       outline: outline of the hand.
       width: (H,) widths of the object along the cross-finger axes (`local_width`), m.
-      steepest_up: largest upward component of a direction.
     """
     room, direction_z = _room(headings, rest_pose, outline, width)
-    return (direction_z <= steepest_up) & (room >= 0)
+    return (direction_z <= _RISE) & (room >= 0)
 
 
 def within_reach(

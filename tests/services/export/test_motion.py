@@ -49,24 +49,24 @@ ANGLES = ("ros2", "lerobot")
 
 def posed(motion: GraspMotion, link: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], seed: int) -> GraspMotion:
     """A wild motion of the same hand: any wrist, any fingers within their limits, any object pose."""
-    rng = np.random.default_rng(seed)
-    q = rng.uniform(*motion.joint_limits.T, (T, len(motion.joint_names)))
-    wrist, place = Rotation.random(T, rng=rng), rng.normal(scale=0.3, size=(T, 3))
+    rng, count = np.random.default_rng(seed), len(motion.time)
+    q = rng.uniform(*motion.joint_limits.T, (count, len(motion.joint_names)))
+    wrist, place = Rotation.random(count, rng=rng), rng.normal(scale=0.3, size=(count, 3))
     local = [link(angles) for angles in q]
-    position = np.stack([wrist[t].apply(local[t][0]) + place[t] for t in range(T)])
+    position = np.stack([wrist[t].apply(local[t][0]) + place[t] for t in range(count)])
     own = [Rotation.from_quat(quaternion, scalar_first=True) for _, quaternion in local]
-    turns = [(wrist[t] * own[t]).as_quat(scalar_first=True) for t in range(T)]
+    turns = [(wrist[t] * own[t]).as_quat(scalar_first=True) for t in range(count)]
     return dataclasses.replace(
         motion,
-        time=motion.control_dt * np.arange(T),
+        time=motion.control_dt * np.arange(count),
         joint_position=q,
         joint_target=q + 0.01,
         wrist_position=place,
         wrist_quaternion=wrist.as_quat(scalar_first=True),
         link_position=position,
         link_quaternion=np.stack(turns),
-        object_position=rng.normal(scale=0.2, size=(T, 3)),
-        object_quaternion=Rotation.random(T, rng=rng).as_quat(scalar_first=True),
+        object_position=rng.normal(scale=0.2, size=(count, 3)),
+        object_quaternion=Rotation.random(count, rng=rng).as_quat(scalar_first=True),
     )
 
 

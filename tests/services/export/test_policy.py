@@ -1,7 +1,6 @@
 """An exported policy answers as the Flax policy does, says what its numbers mean, and runs without JAX."""
 
 import dataclasses
-import importlib.util
 import json
 import pathlib
 import subprocess
@@ -32,10 +31,10 @@ from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surf
 from congrasp.services.client.limits import JointLimits, Limiter
 from congrasp.services.export import policy as exports
 from congrasp.services.train.command import untrained
+from tests.examples import EXAMPLES, example
 from tests.exported_policies import difference
 
-ROOT = pathlib.Path(__file__).resolve().parents[3]
-EXAMPLE = ROOT / "examples" / "onnx_grasp.py"
+EXAMPLE = EXAMPLES / "onnx_grasp.py"
 
 
 @pytest.fixture(scope="module")
@@ -106,10 +105,8 @@ def test_the_example_grasps_with_onnxruntime_alone(pretrained_onnx: pathlib.Path
 
 def example_grasp(path: pathlib.Path) -> tuple[Any, Any]:
     """The example as a module, and its grasp with a policy's file."""
-    spec: Any = importlib.util.spec_from_file_location("onnx_grasp", EXAMPLE)
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
-    return example, example.Grasp(onnxruntime.InferenceSession(path))
+    module = example("onnx_grasp")
+    return module, module.Grasp(onnxruntime.InferenceSession(path))
 
 
 def observed(example: Any, grasp: Any, task: TaskConfig) -> np.ndarray:

@@ -59,19 +59,11 @@ def test_a_set_equals_the_bank_of_training(constraint_sets):
         np.testing.assert_allclose(arrays["trajectory/position"][:, :, -1], arrays["pose/position"], atol=1e-4)
 
 
-def test_files_round_trip_and_others_are_refused(constraint_sets, file, tmp_path):
+def test_files_round_trip(constraint_sets, file):
     read = stored_sets.load(file)
     assert file.name == "mug_2.constraints.safetensors" and dict(read.meta) == dict(constraint_sets[2].meta)
     for name, array in constraint_sets[2].arrays.items():
         np.testing.assert_array_equal(read.arrays[name], array)
-    store.save(MUG, tmp_path / "object.safetensors")
-    with pytest.raises(CongraspError, match="not a constraint set"):
-        stored_sets.load(tmp_path / "object.safetensors")
-    (tmp_path / "text").write_text("not a set")
-    with pytest.raises(CongraspError, match="cannot be read as a constraint set"):
-        stored_sets.load(tmp_path / "text")
-    with pytest.raises(CongraspError, match="cannot be read"):
-        stored_sets.load(tmp_path / "absent")
 
 
 def test_show_prints_and_draws_a_file(file, tmp_path, capsys, monkeypatch):

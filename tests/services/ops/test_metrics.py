@@ -9,8 +9,8 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 from unittest import mock
 
 import pytest
@@ -81,18 +81,15 @@ def test_a_server_counts_answers_and_batches_from_many_threads():
     metrics, port = ServerMetrics(), free_port()
     metrics.health = lambda: {"ready": True, "version": 5, "queue": 2}
 
-    def answer():
+    def answer(number):
         for _ in range(100):
             metrics.answer("answered", 0.004)
             metrics.answer("overloaded", 0.0)
             metrics.batch(3)
 
-    threads = [threading.Thread(target=answer) for _ in range(4)]
     with exposed(port, "127.0.0.1", metrics):
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(30)
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(answer, range(4)))
         found = scrape(port)
     assert found["congrasp_policy_queries_total", "answered"] == 400 == found["congrasp_policy_batch_bucket", "4.0"]
     assert found["congrasp_policy_queries_total", "overloaded"] == 400

@@ -17,6 +17,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.record.live import LiveServer
 from congrasp.services.record.recorder import Converter, LogBudget
 from tests.episodes import episode
+from tests.waits import Clock
 
 KEYS = Keys("r")
 ROOT = pathlib.Path(__file__).resolve().parents[3]
@@ -24,13 +25,6 @@ ROOT = pathlib.Path(__file__).resolve().parents[3]
 
 def metrics(**values):
     return Message({}, {"time": 1.0, "values": values})
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self):
-        return self.now
 
 
 def test_ever_new_names_cost_a_bounded_schema_and_the_others_nothing():

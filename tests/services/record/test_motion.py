@@ -90,18 +90,3 @@ def test_the_file_alone_suffices_for_the_kinematics():
         np.testing.assert_allclose(turns[link].apply(origin) + places[link], position[link], atol=1e-6)
         expected = Rotation.from_quat(quaternion[link], scalar_first=True)
         assert (turns[link] * expected.inv()).magnitude() < 1e-5
-
-
-def test_what_is_no_motion_is_named(tmp_path):
-    path = tmp_path / "a.npz"
-    with pytest.raises(CongraspError, match="cannot be read: No such file"):
-        load_motion(path)
-    path.write_bytes(b"PK nothing")
-    with pytest.raises(CongraspError, match=r"not a grasp motion \(it is not an NPZ file, or was cut\)"):
-        load_motion(path)
-    np.savez(path, a=np.zeros(3))
-    with pytest.raises(CongraspError, match="not a grasp motion"):
-        load_motion(path)
-    np.savez(path, meta=np.array({"a": 1}, object))
-    with pytest.raises(CongraspError, match="not a grasp motion"):
-        load_motion(path)

@@ -14,6 +14,7 @@ from congrasp.common.request import GraspRequest
 from congrasp.services.client.guard import Guard, Ticker
 from congrasp.services.client.limits import JointLimits
 from congrasp.services.client.policy import Answer
+from tests.waits import Clock
 
 FINGERS = 2
 OPEN = np.array([0.3, -0.3])
@@ -53,16 +54,6 @@ class ScriptedPolicy:
 
     def close(self):
         pass
-
-
-class Clock:
-    """Seconds that pass when they are told to."""
-
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
 
 
 def guarded(policy, clock, limits=LIMITS, request=REQUEST, **options):

@@ -1,8 +1,6 @@
 """The examples' loops keep a simulated robot to its limits while their policy server is killed and comes back."""
 
 import contextlib
-import importlib.util
-import pathlib
 import time
 
 import psutil
@@ -12,24 +10,19 @@ import congrasp
 from congrasp.common.policy import bundle as bundles
 from tests.base_install import steady_server
 from tests.benchmarks.robot import SEED, Rig
+from tests.examples import example
 from tests.task import HAND, TASK, policy
 
-EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "robot_loop.py"
 SECONDS = 120.0
 """That a server has to start."""
 
 
-@pytest.fixture(scope="module")
-def example():
-    spec = importlib.util.spec_from_file_location("robot_loop", EXAMPLE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+LOOP = example("robot_loop")
 
 
 @pytest.fixture
-def robot(example):
-    return example.MujocoRobot(HAND, TASK, SEED, congrasp.JointLimits.of_hand(HAND))
+def robot():
+    return LOOP.MujocoRobot(HAND, TASK, SEED, congrasp.JointLimits.of_hand(HAND))
 
 
 def test_the_node_follows_a_server_and_opens_without_one(robot, tmp_path):
@@ -45,16 +38,16 @@ def test_the_node_follows_a_server_and_opens_without_one(robot, tmp_path):
     assert robot.beyond <= 0.0 and robot.strongest <= 1.0 + 1e-6
 
 
-def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(example, robot, tmp_path):
+def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(robot, tmp_path):
     bundles.save(policy(), tmp_path / "policy.safetensors")
     limits = congrasp.JointLimits.of_hand(HAND)
     robot.reset()
-    server = example.Server(tmp_path / "policy.safetensors")
+    server = LOOP.Server(tmp_path / "policy.safetensors")
     try:
         client = congrasp.PolicyClient(server.url, hand=HAND.name, timeout=0.2, wait=SECONDS)
         client.metadata()
         with congrasp.Guard(client, limits, HAND.q_open, stale=0.1, hold=0.3, fallback="open") as guard:
-            grasps, ticker, counters = example.Grasps(robot, guard, TASK), congrasp.Ticker(100.0), guard.counters
+            grasps, ticker, counters = LOOP.Grasps(robot, guard, TASK), congrasp.Ticker(100.0), guard.counters
 
             def step_until(done):
                 deadline = time.monotonic() + SECONDS

@@ -3,9 +3,6 @@
 import array
 import contextlib
 import functools
-import importlib.util
-import json
-import pathlib
 import re
 import sys
 import time
@@ -26,9 +23,10 @@ from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.objects import procedural
 from congrasp.common.transport.ports import free_port
 from congrasp.services.client.policy import Answer
+from tests import examples
+from tests.bare_zenoh import bare_session
 from tests.waits import eventually
 
-EXAMPLE = pathlib.Path(__file__).resolve().parents[3] / "examples" / "ros2_node.py"
 OUTPUTS = {"joint_command": "sensor_msgs/msg/JointState", "wrist_command": "geometry_msgs/msg/PoseStamped"}
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 HAND = get_hand("allegro")
@@ -38,13 +36,7 @@ BASE, BASE_TURN = np.array([0.1, -0.2, 0.3]), Rotation.from_euler("XYZ", [0.4, -
 
 @pytest.fixture(scope="module")
 def example():
-    sys.path.insert(0, str(EXAMPLE.parent))  # of a script, where its `ros2_bus` is
-    spec = importlib.util.spec_from_file_location("ros2_node", EXAMPLE)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    sys.path.remove(str(EXAMPLE.parent))
-    return module
+    return examples.example("ros2_node")
 
 
 class SteadyPolicy:
@@ -195,13 +187,12 @@ def schema(kind):
 def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
     """The robot's messages are written and read by mcap-ros2-support, the node's by rosbags."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    config = zenoh.Config()
-    settings = {"mode": "peer", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False}
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
     write = {k: serialize_dynamic(*schema(k))[schema(k)[0]] for k in set(example.INPUTS.values())}
     read = {k: generate_dynamic(*schema(k))[schema(k)[0]] for k in set(OUTPUTS.values())}
-    with zenoh.open(config) as robot, node_of(example, example.ZenohBus(endpoint), age=0.4) as (node, policy, obj):
+    with (
+        bare_session("peer", listen=endpoint) as robot,
+        node_of(example, example.ZenohBus(endpoint), age=0.4) as (node, policy, obj),
+    ):
         heard = {t: robot.declare_subscriber(t, zenoh.handlers.RingChannel(1)) for t in OUTPUTS}
         silent = []
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from congrasp.common.errors import CongraspError
+
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 RESULTS = ROOT / "test-results"
 SIZE = {"width": 1280, "height": 760}
@@ -19,13 +21,16 @@ ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftsh
 
 @contextlib.contextmanager
 def chromium() -> Iterator[Any]:
-    """Chromium, drawing without a graphics card; the test skips without one."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
-    with playwright.sync_playwright() as running:
+    """Chromium, drawing without a graphics card; raises a CongraspError if it or its package is absent."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ModuleNotFoundError:
+        raise CongraspError("The package playwright is not installed.", "Run 'make install'.") from None
+    with sync_playwright() as running:
         own = pathlib.Path(running.chromium.executable_path)
         found = next(filter(None, map(shutil.which, BROWSERS)), None) or (str(own) if own.exists() else None)
         if found is None:
-            pytest.skip("there is no browser here (tests/install_browser.sh installs one)")
+            raise CongraspError("There is no browser here.", "Run tests/install_browser.sh.")
         started = running.chromium.launch(executable_path=found, args=ARGUMENTS)
         yield started
         started.close()
@@ -33,8 +38,12 @@ def chromium() -> Iterator[Any]:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
-    """`chromium`, once for all tests."""
-    with chromium() as started:
+    """`chromium`, once for all tests, which skip without it."""
+    with contextlib.ExitStack() as stack:
+        try:
+            started = stack.enter_context(chromium())
+        except CongraspError as error:
+            pytest.skip(str(error))
         yield started
 
 

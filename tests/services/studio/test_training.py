@@ -176,8 +176,8 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
     window.load()
     assert [row["id"] for row in window.view()["actors"]] == ["a003", "a004"]
     assert window.episode("a004").meta["object"] == "thing-4"
-    assert window.curve("episode/success").values[DIP] == 0.1
-    assert window.curve("episode/success").times[DIP] == BEGIN + 10 * DIP
+    curve = window._curves["episode/success"]
+    assert curve.values[DIP] == 0.1 and curve.times[DIP] == BEGIN + 10 * DIP
     # A run that is over is shown whole: its last state, and no learner is missed.
     view = window.view()
     assert view["phase"] == "recorded" and view["last"]["update"] == 39 and view["last"]["success"] == 0.78

@@ -262,6 +262,9 @@ def test_a_sheet_keeps_its_pictures_and_shrinks_long_titles() -> None:
     assert (
         (sheet[44:64, 10:40] == 0).all() and (sheet[44:64, 50:80] == 80).all() and (sheet[88:108, 10:40] == 160).all()
     )
+    wide = [np.zeros((20, 100, 3), np.uint8)] * 2
+    labels = contact_sheet(wide, ["tendon_of_a_joint_and_of_another_one_and_more -0.35"] * 2, 2)[30:54]
+    assert (labels[:, 114:120] == labels[0, 0]).all() and (labels[:, 12:112] != labels[0, 0]).any()
     with pytest.raises(CongraspError, match="3 pictures and 1 labels"):
         contact_sheet(images, ["a"], 2)
 

@@ -7,17 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.captures.dexycb import OBJECTS
-from tests.mano_file import content, mano_pickle, skeleton
+from tests.mano_file import content, skeleton
 from tests.services.assets.captures import known
 
 MUG = OBJECTS.index("025_mug") + 1
-
-
-@pytest.fixture(scope="module")
-def mano(tmp_path_factory):
-    path = tmp_path_factory.mktemp("mano") / "MANO_RIGHT.pkl"
-    path.write_bytes(mano_pickle())
-    return path
 
 
 def write(case, root, session, *, meta=None, change=lambda poses: None):

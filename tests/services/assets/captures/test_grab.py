@@ -7,15 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.captures.human import MEAN_WRIST
-from tests.mano_file import content, mano_pickle, skeleton
+from tests.mano_file import content, skeleton
 from tests.services.assets.captures import known
-
-
-@pytest.fixture(scope="module")
-def mano(tmp_path_factory):
-    path = tmp_path_factory.mktemp("mano") / "MANO_RIGHT.pkl"
-    path.write_bytes(mano_pickle())
-    return path
 
 
 def write(case, root, wrist, *, labels=None, change=lambda data: None):

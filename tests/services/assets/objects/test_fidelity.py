@@ -5,14 +5,9 @@ import pytest
 import trimesh
 
 from congrasp.services.assets.objects.fidelity import fidelity, interior, voxels
+from tests.solids import block
 
 SIDES = np.array([0.04, 0.06, 0.08])
-
-
-def block(sides=SIDES, center=(0.0, 0.0, 0.0)):
-    mesh = trimesh.creation.box(sides)
-    mesh.apply_translation(center)
-    return mesh
 
 
 def compared(mesh, pieces, closed=True):
@@ -26,14 +21,14 @@ def test_a_convex_mesh_and_itself():
 
 
 def test_a_piece_that_is_larger_all_around():
-    errors = compared(block(), [block(SIDES + 0.004)])
+    errors = compared(block(SIDES), [block(SIDES + 0.004)])
     np.testing.assert_allclose(errors.volume, np.prod(1 + 0.004 / SIDES) - 1, atol=3e-3)
     # From a corner it is 2 mm along each of three axes; the spacing of the rays is 0.3 mm.
     np.testing.assert_allclose(errors.surface, 0.002 * np.sqrt(3), atol=5e-4)
 
 
 def test_a_part_that_is_missing():
-    errors = compared(block(), [block(SIDES - [0, 0, 0.01], (0, 0, -0.005))])
+    errors = compared(block(SIDES), [block(SIDES - [0, 0, 0.01], (0, 0, -0.005))])
     np.testing.assert_allclose(errors.volume, -0.01 / 0.08, atol=3e-3)
     np.testing.assert_allclose(errors.surface, 0.01, atol=5e-4)
 
@@ -41,14 +36,14 @@ def test_a_part_that_is_missing():
 def test_pieces_that_overlap_count_once_and_pieces_that_touch_have_no_surface_between():
     upper = block((0.04, 0.06, 0.05), (0, 0, 0.015))
     for lower in (block((0.04, 0.06, 0.05), (0, 0, -0.015)), block((0.04, 0.06, 0.03), (0, 0, -0.025))):
-        errors = compared(block(), [upper, lower])
+        errors = compared(block(SIDES), [upper, lower])
         np.testing.assert_allclose(errors.volume, 0, atol=1e-6)
         assert errors.surface < 1e-6
 
 
 def test_a_body_inside_of_the_mesh_is_no_surface():
-    mesh = trimesh.util.concatenate([block(), block(SIDES / 2)])
-    errors = compared(mesh, [block()])
+    mesh = trimesh.util.concatenate([block(SIDES), block(SIDES / 2)])
+    errors = compared(mesh, [block(SIDES)])
     np.testing.assert_allclose(errors.volume, 0, atol=1e-6)
     assert errors.surface < 1e-6
 
@@ -58,7 +53,7 @@ def test_a_slot_counts_if_the_ball_gets_in(width, counts):
     half = (0.04 - width) / 2
     sides = [block((half, 0.06, 0.08), (sign * (half + width) / 2, 0, 0)) for sign in (-1, 1)]
     slotted = trimesh.util.concatenate([*sides, block((0.04, 0.06, 0.02), (0, 0, -0.03))])
-    errors = compared(slotted, [block()])
+    errors = compared(slotted, [block(SIDES)])
     if counts:  # the middle of the slot's floor lies 6 cm below the filled top, its walls up to 14 mm from the sides
         assert 0.014 < errors.surface < 0.031
     else:
@@ -97,9 +92,9 @@ def test_wires_between_the_rays_have_exact_volumes():
 
 
 def test_an_open_mesh_has_no_volume_to_compare_with():
-    mesh = block()
+    mesh = block(SIDES)
     mesh.update_faces(np.arange(12) > 1)
-    errors = compared(mesh, [block()], closed=False)
+    errors = compared(mesh, [block(SIDES)], closed=False)
     assert errors.volume is None
     # One side is missing in the mesh: its middle is half of its shorter edge away.
     assert 0.015 < errors.surface < 0.035

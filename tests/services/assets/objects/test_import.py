@@ -16,6 +16,7 @@ from congrasp.common.objects.store import digest
 from congrasp.services.assets.objects import decompose, meshes
 from congrasp.services.assets.objects.named import find_sources, objects_of
 from congrasp.services.assets.objects.options import ImportOptions
+from tests.solids import block, ell
 
 SLOW = pytest.mark.slow
 SIDES = np.array([0.04, 0.06, 0.08])
@@ -26,15 +27,9 @@ def options(tmp_path):
     return ImportOptions(cache_dir=str(tmp_path / "cache"))
 
 
-def block(sides=SIDES, center=(0.0, 0.0, 0.0)):
-    mesh = trimesh.creation.box(sides)
-    mesh.apply_translation(center)
-    return mesh
-
-
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb"])
 def test_mass_properties_of_a_block(tmp_path, options, quick_import, suffix):
-    block(center=(0.5, 0.1, -0.2)).export(tmp_path / f"block.{suffix}")
+    block(SIDES, (0.5, 0.1, -0.2)).export(tmp_path / f"block.{suffix}")
     (obj,) = objects_of(tmp_path / f"block.{suffix}", options)
     assert (obj.name, obj.family, [piece.kind for piece in obj.pieces]) == ("block", "imported", ["mesh"])
     # 192 cm^3 of 500 kg/m^3; I = m/12 (b^2 + c^2).
@@ -51,7 +46,7 @@ def test_mass_properties_of_a_block(tmp_path, options, quick_import, suffix):
 
 
 def test_pieces_and_halves_of_a_block(tmp_path, options):
-    block().export(tmp_path / "block.stl")
+    block(SIDES).export(tmp_path / "block.stl")
     (obj,) = objects_of(tmp_path / "block.stl", options)
     assert abs(obj.volume_error) < 1e-3
     assert obj.surface_error < 1e-4
@@ -63,7 +58,7 @@ def test_pieces_and_halves_of_a_block(tmp_path, options):
 
 def test_an_unchanged_mesh_comes_from_the_cache(tmp_path, options, quick_import, monkeypatch):
     path = tmp_path / "block.stl"
-    block().export(path)
+    block(SIDES).export(path)
     (first,) = objects_of(path, options)
     with monkeypatch.context() as patch:
         patch.setattr(meshes, "_build", lambda *_: pytest.fail("built again"))
@@ -99,7 +94,7 @@ def test_imports_are_parallel_and_fail_alone(tmp_path, options, quick_import, mo
 
 
 def test_an_unexpected_error_reaches_the_caller(tmp_path, options, monkeypatch):
-    block().export(tmp_path / "a.stl")
+    block(SIDES).export(tmp_path / "a.stl")
     monkeypatch.setattr(meshes, "_build", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         list(meshes.import_sources(find_sources(tmp_path), options))
@@ -117,27 +112,13 @@ def hull_alone(monkeypatch):
 
 
 def test_an_open_mesh_counts_its_hull(tmp_path, options, hull_alone):
-    mesh = block()
+    mesh = block(SIDES)
     mesh.update_faces(np.arange(12) > 1)
     mesh.export(tmp_path / "open.stl")
     (obj,) = objects_of(tmp_path / "open.stl", options)
     assert any("surface is open" in note and "convex hull" in note for note in obj.notes)
     assert (obj.volume_error, obj.notes[-1].endswith("because the mesh is open")) == (None, True)
     np.testing.assert_allclose(obj.mass, 0.096, rtol=1e-4)
-
-
-def ell():
-    """An L of two blocks, as one closed mesh."""
-    outline = np.array([[0, 0], [0.08, 0], [0.08, 0.02], [0.02, 0.02], [0.02, 0.08], [0, 0.08]])
-    caps = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]
-    vertices = [[*xy, z] for z in (0.0, 0.02) for xy in outline]
-    faces = [face[::-1] for face in caps] + [[6 + i for i in face] for face in caps]
-    for i in range(6):
-        j = (i + 1) % 6
-        faces += [[i, j, 6 + j], [i, 6 + j, 6 + i]]
-    mesh = trimesh.Trimesh(vertices, faces)
-    assert mesh.is_volume
-    return mesh
 
 
 def folder_of(path, mesh, *pieces):
@@ -168,7 +149,7 @@ def test_coarse_pieces_are_replaced(tmp_path, options):
 def test_close_pieces_are_kept(tmp_path, options, monkeypatch):
     monkeypatch.setattr(meshes, "cut_to_hold", lambda obj: obj)
     monkeypatch.setattr(decompose, "decompose", lambda *_, **__: pytest.fail("cut"))
-    (obj,) = objects_of(folder_of(tmp_path / "block", block(), block(SIDES - [0, 0, 0.0024])), options)
+    (obj,) = objects_of(folder_of(tmp_path / "block", block(SIDES), block(SIDES - [0, 0, 0.0024])), options)
     np.testing.assert_allclose(np.sort(np.ptp(obj.pieces[0].vertices, axis=0)), [0.04, 0.06, 0.0776], rtol=1e-5)
     assert obj.notes[-1].startswith("its own 1 convex piece stands for it: their surface is at most 1.2 mm off")
 

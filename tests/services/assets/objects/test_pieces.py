@@ -2,18 +2,12 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_VERTICES
 from congrasp.services.assets.objects import decompose
 from congrasp.services.assets.objects.fidelity import fidelity
-
-
-def block(sides, center):
-    mesh = trimesh.creation.box(sides)
-    mesh.apply_translation(center)
-    return mesh
+from tests.solids import block
 
 
 def prism(outline, depth):
