@@ -14,9 +14,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import congrasp
+from congrasp.actors.initial import InitialConditions
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects.named import ObjectAt
 from congrasp.services.assets.objects.options import ImportOptions
@@ -30,8 +32,8 @@ from congrasp.services.dataset.shards import (
     table,
 )
 from congrasp.services.evaluate.episodes import Episodes
-from congrasp.services.evaluate.experiment import Experiment, Variation
-from congrasp.services.evaluate.plan import plan_row
+from congrasp.services.evaluate.experiment import Experiment
+from congrasp.services.evaluate.plan import batches, plan_row
 from congrasp.services.evaluate.pools import Pool, Pools, listed_pools, prepared
 
 FORMAT = 1
@@ -69,7 +71,7 @@ class Recipe:
     @functools.cached_property
     def template(self) -> Experiment:
         """The experiment of each shard, without its objects."""
-        episodes = max(self.shares.values()) * min(self.shard, len(self.objects))
+        episodes = self.per_object * min(self.shard, len(self.objects))
         return dataclasses.replace(self.experiment, episodes=episodes)
 
     @functools.cached_property
@@ -127,12 +129,15 @@ def make(
         for pool in ready:
             own = pool.experiment
             columns = grasp_columns(own.hand, own.task)
-            counts: dict[str, collections.Counter[str]] = {}
+            counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
             rows: list[dict[str, np.ndarray]] = [{c.name: np.zeros((0, *c.shape), c.kind) for c in columns}]
             if pool.real:
-                running = running or stack.enter_context(own.simulator())
-                for asked, part in _episodes(running, pool, recipe.shares):
-                    rows.append(_counted(part, recipe.keep, counts.setdefault(asked, collections.Counter())))
+                if running:
+                    running.replace_objects(own.scaled, own.field)
+                else:
+                    running = stack.enter_context(own.simulator())
+                for part in _episodes(running, pool, recipe.shares):
+                    rows.append(_counted(part, recipe.keep, counts))
                     done += len(part["episode"])
                     progress(done)
             said = {**recipe.about, "shard": own.pool, "counts": counts, "left_out": pool.left_out}
@@ -141,33 +146,52 @@ def make(
             shards.write(own.pool, table(columns, found, said), of_objects)
 
 
-def _episodes(running: Episodes, pool: Pool, shares: Mapping[str, int]) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """Yields columns of the real objects' episodes, batch by batch, and their constraints.
+def _begun(pool: Pool, shares: Mapping[str, int]) -> tuple[list[InitialConditions], dict[str, np.ndarray]]:
+    """Initial conditions of the real objects' episodes under each set of constraints, and columns (E,) of all of them.
 
     Each object has its share of episodes of the constraints that it allows.
     """
-    own = pool.experiment
+    own, begun = pool.experiment, list[InitialConditions]()
+    names = np.array([obj.name for obj in own.scaled])
+    columns: dict[str, list[np.ndarray]] = {"constraints": [], "object": [], "episode": []}
     for asked, share in shares.items():
-        variation = Variation(asked)
+        bank = own.bank_for(asked)
         try:
-            plan = plan_row(own.task, variation.bank(own), own.scaled, asked, share * len(own.scaled))
+            plan = plan_row(own.task, bank, own.scaled, asked, share * len(own.scaled))
         except CongraspError:
             continue  # no object allows them
-        kept = plan.episodes.numbers < share
+        kept = (plan.episodes.numbers < share) & (plan.episodes.objects < pool.real)
         plan = plan._replace(episodes=jax.tree.map(lambda x, kept=kept: x[kept], plan.episodes))
-        names, first = np.array([obj.name for obj in own.scaled])[plan.episodes.objects], 0
-        for batch, count in own.batches(running, variation, plan, plan.total):
-            of = slice(first, first + count)
-            rows = {name: column[:count] for name, column in grasp_rows(own.task, asked, batch).items()}
-            rows |= {"object": names[of], "episode": plan.episodes.numbers[of]}
-            yield asked, {name: column[plan.episodes.objects[of] < pool.real] for name, column in rows.items()}
-            first += count
+        for conditions, count in batches(own.hand, own.task, bank, plan, own.seed, share * len(own.scaled)):
+            begun.append(jax.tree.map(lambda x, count=count: x[:count], conditions))
+        columns["constraints"].append(np.full(plan.total, asked))
+        columns["object"].append(names[plan.episodes.objects])
+        columns["episode"].append(plan.episodes.numbers)
+    return begun, {name: np.concatenate(parts) for name, parts in columns.items() if parts}
+
+
+def _episodes(running: Episodes, pool: Pool, shares: Mapping[str, int]) -> Iterator[dict[str, np.ndarray]]:
+    """Yields columns of the real objects' episodes, batch by batch; a batch holds episodes under any constraints."""
+    begun, known = _begun(pool, shares)
+    if not begun:
+        return
+    conditions = jax.tree.map(lambda *parts: jnp.concatenate(parts), *begun)
+    total = len(known["episode"])
+    for start in range(0, total, running.batch):
+        chosen = np.arange(start, start + running.batch).clip(max=total - 1)
+        of = {name: column[chosen] for name, column in known.items()}
+        batch = running.run(jax.tree.map(lambda x, chosen=chosen: x[chosen], conditions), stressed=running.stressable)
+        rows = grasp_rows(pool.experiment.task, of["constraints"], batch) | of
+        yield {name: column[: total - start] for name, column in rows.items()}
 
 
 def _counted(
-    rows: Mapping[str, np.ndarray], keep: Sequence[str], counts: collections.Counter[str]
+    rows: Mapping[str, np.ndarray], keep: Sequence[str], counts: Mapping[str, collections.Counter[str]]
 ) -> dict[str, np.ndarray]:
-    """Counts all rows by their outcomes; returns those to keep."""
+    """Counts all rows by their constraints and outcomes; returns those to keep."""
     kept = np.all([np.ones(len(rows["episode"]), bool), *(rows[name] for name in keep)], 0)
-    counts.update(episodes=len(kept), kept=int(kept.sum()), **{name: int(rows[name].sum()) for name in VERDICTS})
+    for asked in dict.fromkeys(rows["constraints"].tolist()):
+        of = rows["constraints"] == asked
+        outcomes = {name: int(rows[name][of].sum()) for name in VERDICTS}
+        counts[asked].update(episodes=int(of.sum()), kept=int(kept[of].sum()), **outcomes)
     return {name: column[kept] for name, column in rows.items()}

@@ -106,12 +106,11 @@ def object_columns() -> list[Column]:
     ]
 
 
-def grasp_rows(task: TaskConfig, asked: str, batch: Batch) -> dict[str, np.ndarray]:
-    """Columns (B, ...) of a batch of episodes under the constraints `asked`, without those of object and episode."""
+def grasp_rows(task: TaskConfig, asked: np.ndarray, batch: Batch) -> dict[str, np.ndarray]:
+    """Columns (B, ...) of a batch of episodes under the constraints `asked` (B,), without those that a plan knows."""
     start, state, features = batch.conditions.reset_state, *batch.final
-    values, names = batch.sample.values, asked.removesuffix(ALIGNED).split("+")
+    values, names = batch.sample.values, [one.removesuffix(ALIGNED).split("+") for one in asked.tolist()]
     rows: dict[str, Any] = {
-        "constraints": np.full(len(start.q), asked),
         "mass": values["mass_kg"],
         "start_q": start.q,
         "start_wrist": _in_object(
@@ -129,9 +128,9 @@ def grasp_rows(task: TaskConfig, asked: str, batch: Batch) -> dict[str, np.ndarr
         **{name: values.get(name, np.full(len(start.q), np.nan)) for name in _MEASURES},
     }
     for constraint in known(task):
-        requested = 1.0 if constraint.name in names else np.nan
+        requested = np.array([1.0 if constraint.name in own else np.nan for own in names], np.float32)
         rows |= {
-            f"goal_{constraint.name}_{name}": requested * np.asarray(array, np.float32)
+            f"goal_{constraint.name}_{name}": (requested * np.asarray(array, np.float32).T).T
             for name, array in batch.conditions.goal[constraint.name]._asdict().items()
         }
         rows |= {spec.name: requested * values[spec.name] for spec in constraint.errors}

@@ -73,6 +73,7 @@ def test_what_is_shipped_is_installed_and_can_be_loaded():
     assert {path.stem for path in module._FOLDER.glob("*.safetensors")} == {
         "allegro-camera",
         "allegro-student",
+        "human-student",
         *(f"{hand}{kind}" for hand in pretrained_hands() for kind in ("", "-reference")),
     }
     for hand in pretrained_hands():

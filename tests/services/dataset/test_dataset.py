@@ -30,8 +30,8 @@ ROOT = pathlib.Path(__file__).resolve().parents[3]
 
 
 def arguments(out: pathlib.Path, *more: str) -> list[str]:
-    """Four episodes of each of two objects, a shard each."""
-    own = ["dataset", "box:2-3", "--out", str(out), "--per-object", "4", "--shard", "1"]
+    """Four episodes of each of two objects, a shard each, in batches of three and one."""
+    own = ["dataset", "box:2-3", "--out", str(out), "--per-object", "4", "--shard", "1", "--batch", "3"]
     return [*own, "--constraints", "heading", "affordance", "--keep", "all", "--physics", "native", *more]
 
 
@@ -150,7 +150,7 @@ def test_only_requested_outcomes_are_kept_and_all_are_counted(whole, columns, tm
     ("more", "words"),
     [
         (("--seed", "1"), "another dataset: its seed is 0, not 1.*--out"),
-        (("--batch", "1"), "its batch is 2, not 1"),
+        (("--batch", "1"), "its batch is 3, not 1"),
         (("--part", "4/3"), "--part is '4/3'"),
         (("--constraints", "levitation"), "levitation"),
         (("--shard", "100000"), "--shard"),
