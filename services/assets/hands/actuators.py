@@ -148,6 +148,9 @@ def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[tuple[int, int,
             found.append((a, b, -own / other, float(data[0]) / other))
         elif kind == mujoco.mjtEq.mjEQ_CONNECT:
             notes.append("closed loops of links are opened (import a URDF whose joints mimic one another)")
+        elif kind == mujoco.mjtEq.mjEQ_JOINT or kind == mujoco.mjtEq.mjEQ_TENDON:
+            what = model.joint(one).name if kind == mujoco.mjtEq.mjEQ_JOINT else model.tendon(one).name
+            notes.append(f"an equality of '{what}' that does not couple two joints is dropped ('couplings')")
     return found
 
 

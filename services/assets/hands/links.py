@@ -17,6 +17,7 @@ import trimesh
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.meshes import MAX_FACES
 from congrasp.common.hands.spec import Capsule, Solid, vector
+from congrasp.common.io.inputs import distinct_names
 from congrasp.services.assets.hands.compile import LEAST
 
 _CALLED = ("palm", "hand")
@@ -47,10 +48,8 @@ class Tree:
     """Link of each body."""
     ends: tuple[int, ...]
     """Last link of each finger."""
-
-    def name(self, link: int) -> str:
-        """Name of a link for a hand file."""
-        return "palm" if link == self.palm else identifier(self.model.body(link).name, f"body_{link}")
+    names: dict[int, str]
+    """Name of each link for a hand file."""
 
     def above(self, link: int) -> int:
         """The link that carries one other than the palm."""
@@ -109,7 +108,9 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
     for link in groups:
         if link != palm and depth[link] > depth.get(last.get(root[link], palm), 0):
             last[root[link]] = link
-    return Tree(model, data, palm, groups, owner, tuple(last.values()))
+    called = ["palm", *(identifier(names[link], f"body_{link}") for link in groups if link != palm)]
+    numbered = dict(zip(groups, distinct_names(called), strict=True))
+    return Tree(model, data, palm, groups, owner, tuple(last.values()), numbered)
 
 
 def _to_palm(data: mujoco.MjData, palm: int) -> None:
