@@ -142,7 +142,7 @@ def _key(source: Source, options: ImportOptions) -> str:
     settings = dataclasses.replace(options, cache_dir="")
     content = hashlib.sha256(f"{_DRAWS} {source.name} {settings}".encode())
     for file in source.files():
-        content.update(f" {file.path.name} {file.role} {file.part} ".encode())
+        content.update(f" {file.path.name} {file.role} {file.part} ".encode(errors="surrogateescape"))
         content.update(hashlib.sha256(file.path.read_bytes()).digest())
     return content.hexdigest()[:24]
 
