@@ -314,7 +314,8 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     _complete_inertias(robot, notes)
     assets, shared, lacking = dict[str, bytes](), dict[tuple[pathlib.Path | None, str], str](), dict[str, None]()
     for link in robot.iter("link"):
-        for shape in (*link.findall("visual"), *link.findall("collision")):
+        for i, shape in enumerate((*link.findall("visual"), *link.findall("collision"))):
+            shape.set("name", f"shape {i} of {link.get('name')}")  # for errors; those of the file may be equal
             for mesh in shape.iter("mesh"):
                 file = _mesh_file(path, mesh.get("filename", ""))
                 used = file, mesh.get("scale", "")  # MuJoCo shares a mesh among shapes of one name and scale
