@@ -31,7 +31,7 @@ _KINDS: dict[mujoco.mjtGeom, Literal["box", "cylinder", "capsule", "ellipsoid"]]
 }
 _FLAT = 1.6  # a broader link gets several parallel capsules
 _PLAUSIBLE = (0.002, 0.15)  # half extent of an inertia's box, m
-_THIN = 1e-5  # m, thickness below which points have no box of their own
+_THIN = 1e-4  # m, thickness below which points have no box of their own
 _BARE = 0.005  # radius of a link without any geometry, m
 
 
@@ -269,7 +269,8 @@ def bare(*centers: np.ndarray) -> list[np.ndarray]:
 def fit_capsules(points: np.ndarray) -> tuple[Capsule, ...]:
     """Fits capsules along the longest side of the points' box (n, 3); several in parallel if it is flat."""
     if np.linalg.matrix_rank(points - points.mean(0), tol=_THIN) < 3:
-        points = np.concatenate([points + d for d in _THIN * np.concatenate([np.eye(3), -np.eye(3)])])
+        few = np.unique(points.round(5), axis=0)
+        points = np.concatenate([few + d for d in _THIN * np.concatenate([np.eye(3), -np.eye(3)])])
     to_box, extents = trimesh.bounds.oriented_bounds(points)
     order = np.argsort(extents)[::-1]
     length, breadth, height = np.maximum(extents[order], 1e-3)
