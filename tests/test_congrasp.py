@@ -96,6 +96,15 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
         congrasp.grasp(mesh, fingers="thumb index", attempts=4, policy=paper_policy)
 
 
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [({"policy": "none.safetensors"}, "none.safetensors cannot be read"), ({"attempts": 0}, "There are 0 attempts")],
+)
+def test_a_grasp_names_a_missing_policy_and_no_attempts(options, fault):
+    with pytest.raises(congrasp.CongraspError, match=fault):
+        congrasp.grasp("mug:7", **options)
+
+
 @pytest.mark.slow
 def test_the_first_example_of_grasp_runs_on_the_policy_that_comes_with_congrasp(capsys: pytest.CaptureFixture) -> None:
     assert congrasp.grasp.__doc__ is not None

@@ -92,6 +92,9 @@ def get_hand(reference: str) -> Hand:
         return read_hand(own[reference])
     if reference.endswith(SUFFIX):
         return read_hand(pathlib.Path(reference))
+    if reference.lower().endswith((".urdf", ".xml")):
+        what = f"{reference} is a robot description, not a hand file."
+        raise CongraspError(what, f"Pass the file that 'congrasp hands import {reference}' writes.")
     raise CongraspError(
         f"There is no hand '{reference}'.", f"Choose one of: {', '.join(sorted({*HANDS, *own}))}; or name a hand file."
     )

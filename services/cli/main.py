@@ -71,9 +71,11 @@ _PATH_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP)
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `congrasp` script; ends the process with the command's exit code."""
     alone = arguments is None  # no other code uses this process
-    for stream in (sys.stdout, sys.stderr) if alone else ():
-        if isinstance(stream, io.TextIOWrapper):  # characters that its encoding lacks become escapes
+    for name in ("stdout", "stderr") if alone else ():
+        if isinstance(stream := getattr(sys, name), io.TextIOWrapper):  # characters it lacks become escapes
             stream.reconfigure(errors="backslashreplace")
+        elif stream is None:  # the shell closed it
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     follow_parent()
     debug = "--debug" in arguments
@@ -115,6 +117,8 @@ def _said_of(error: OSError) -> str:
         return str(CongraspError(what, "Check the path and its permissions."))
     if error.errno == errno.ENOENT and "temporary directory" in str(error):
         return "There is no folder for temporary files that can be written. Set TMPDIR to one."
+    if error.errno == errno.ENOENT and not error.filename:
+        return "The working folder does not exist any more. Change to another."
     if error.errno == errno.EIO:
         return "A file could not be read or written, because its disk failed. Try another path."
     raise error

@@ -29,6 +29,7 @@ _READ = (*_MEASURED, "q_target", "u_target")
 _POINTS = ("cloud", "surface_points", "surface_avoid", "surface_normals")
 NORMALS, CAMERA = "surface_normals", "camera_position"
 """Names of the normals at the points of a query, and of the position of the camera."""
+_SIZE, _TURN = 1.0, 10.0  # m, median deviation of points; rad
 _LONGEST = 64  # largest history of a policy, control steps
 
 
@@ -263,6 +264,8 @@ class Packer:
         self._meta = {"constraints": list(constraints), "layout": layout["digest"]}
         needs = layout["constraints"]
         known = {name: own for name, own in constraints.items() if name in needs}
+        if plain := [name for name, own in known.items() if not isinstance(own, Mapping)]:
+            raise RefusedError(f"The constraint '{plain[0]}' is no mapping from its fields to arrays.")
         goals = {f"{name}_{field}": value for name, own in known.items() for field, value in own.items()}
         fields = {**episode, **{name: _numbers(name, value) for name, value in goals.items()}}
         _require([field for name in known for field in needs[name]], fields)
@@ -321,13 +324,14 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
         raise RefusedError(f"The request lacks {' and '.join(lacking)}.", "A control loop starts from measured poses.")
     if request.above:
         raise RefusedError("The request is for a hand from above.", "Give the heading's direction to a control loop.")
-    position, quaternion = request.object_pose or (None, None)
+    wrist, turn = _pair("wrist", request.wrist)
+    position, quaternion = _pair("object_pose", request.object_pose)
     given = {
         "q_initial": request.q,
         "q_target": request.q,
         "u_target": np.zeros(6),
-        "base_position": request.wrist[0],
-        "base_quaternion": request.wrist[1],
+        "base_position": wrist,
+        "base_quaternion": turn,
         "object_position_initial": position,
         "object_quaternion_initial": quaternion,
         "cloud": request.cloud,
@@ -336,7 +340,29 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
         "surface_normals": request.normals,
         "camera_position": request.camera,
     }
-    return {name: _numbers(name, value) for name, value in given.items() if value is not None}
+    fields = {name: _numbers(name, value) for name, value in given.items() if value is not None}
+    _check_units(fields)
+    return fields
+
+
+@np.errstate(invalid="ignore")  # of points that are not finite, which the first `act` refuses
+def _check_units(fields: Mapping[str, np.ndarray]) -> None:
+    """Raises a RefusedError for points in mm or cm, by their median, and for angles in degrees."""
+    for name in ("surface_points", "cloud"):
+        points = fields.get(name)
+        if points is not None and points.size and (size := np.median(np.abs(points - np.median(points, 0)))) > _SIZE:
+            raise RefusedError(f"The field '{name}' has half of its points beyond {size:.3g} m.", "Give it in metres.")
+    if (turn := np.abs(fields["q_initial"]).max(initial=0.0)) > _TURN:
+        raise RefusedError(f"The field 'q' has an angle of {turn:.4g}.", "Give it in radians.")
+
+
+def _pair(name: str, pose: Pose | None) -> tuple[Any, Any]:
+    """Position and quaternion of a pose; None for both without one."""
+    try:
+        position, quaternion = (None, None) if pose is None else pose
+    except (TypeError, ValueError):
+        raise RefusedError(f"'{name}' is no pair of a position and a quaternion.") from None
+    return position, quaternion
 
 
 def _with_own_normals(state: State, episode: Mapping[str, np.ndarray]) -> State:
@@ -403,8 +429,8 @@ def mirrored_request(request: GraspRequest) -> GraspRequest:
         cloud=_vectors(request.cloud),
         normals=_vectors(request.normals),
         camera=_vectors(request.camera),
-        wrist=request.wrist and _pose(request.wrist),
-        object_pose=request.object_pose and _pose(request.object_pose),
+        wrist=_pose("wrist", request.wrist),
+        object_pose=_pose("object_pose", request.object_pose),
     )
 
 
@@ -418,7 +444,7 @@ def _answer(answer: Answer) -> Answer:
     return answer._replace(u_target=mirror.wrist(answer.u_target), action=mirror.wrist(answer.action))
 
 
-def _pose(pose: Pose) -> Pose:
-    """A mirrored pose."""
-    position, quaternion = pose
-    return mirror.vector(position), mirror.quaternion(quaternion)
+def _pose(name: str, pose: Pose | None) -> Pose | None:
+    """A mirrored pose, if there is one."""
+    position, quaternion = _pair(name, pose)
+    return None if pose is None else (mirror.vector(position), mirror.quaternion(quaternion))

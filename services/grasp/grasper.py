@@ -103,6 +103,8 @@ class Grasper:
           arm: the arm that must be able to execute the motion.
           left: grasps with the left hand; the policy's right hand grasps the mirrored object (`common.mirror`).
         """
+        if attempts < 1:
+            raise CongraspError(f"There are {attempts} attempts.", "Make one or more.")
         self._arm = arm
         self._hand, self._left = get_hand(policy.spec.hand), left
         self.hand = get_hand(self._hand.name + LEFT) if left else self._hand
@@ -324,7 +326,7 @@ def grasp(
       CongraspError: the object cannot be imported, or a constraint cannot be read or met.
     """
     file = policy_file(None if policy is None else pathlib.Path(policy), right_name(hand)[0])
-    grasper = _grasper(file, file.stat().st_mtime_ns, hand, attempts, seed)
+    grasper = _grasper(file, file.stat().st_mtime_ns if file.exists() else 0, hand, attempts, seed)
     obj = mesh if isinstance(mesh, GraspObject) else one_object(pathlib.Path(mesh), options or ImportOptions("guess"))
     request = read_request(obj, grasper.hand, grasper.task.trajectory_points, **constraints)
     return grasper.grasp(obj, request, progress)

@@ -29,6 +29,7 @@ _NO_PLACE = re.compile(
     r"(?:.* )?(?:[vawfnre]|(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*)"
 )
 _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.*")  # first word without a body
+_TIME = re.compile(r"t(?: ?\[.*|_m?s)?|(?:.*[\W_])?(?:time|timestamp|stamp|secs?|seconds)(?:[\W_].*)?")
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
@@ -169,9 +170,10 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
 
     Raises:
       CongraspError: the file has more than `largest` bytes or cannot be read, a line is not seven finite numbers, a
-        header names no position or quaternion, or several, or quaternions are not of length one.
+        header names no position or quaternion, or several, quaternions are not of length one, or its time runs back.
     """
     columns, width, metres, named, titled, mark = list(range(7)), 7, 1.0, False, False, ""
+    clock, last = None, -np.inf
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
@@ -192,6 +194,7 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
                     advice = "Name them x, y, z, qw, qx, qy, qz."
                     if found := _columns(names, titled=titled):
                         (columns, width, metres), named, mark = found, True, _mark(text)
+                        clock = next((place for place, name in enumerate(names) if _TIME.fullmatch(name)), None)
                     titled = titled or (any(names) and not comment)
                     continue
             if comment or not text.strip(" ,;\t"):
@@ -203,6 +206,11 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
             row = [value for value in values if value is not None and abs(value) < HUGE]
             if len(cells) < width or any(cells[width:]) or len(row) < 7:
                 raise ValueError(f"is not {width} finite numbers")
+            now = None if clock is None else _number(cells[clock])
+            if now is not None and now < last:
+                advice = "Sort the lines by time, and cut the file to one motion."
+                raise ValueError("is earlier than the line before")
+            last = last if now is None else now
         except (ValueError, csv.Error) as error:
             what = f"cannot be read: {error}" if isinstance(error, csv.Error) else error
             raise CongraspError(f"line {number} of {path} {what}.", advice) from None

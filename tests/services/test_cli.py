@@ -25,6 +25,7 @@ from congrasp.services.ops.logs import announced
 from tests.printed import errors
 
 ROOT = Path(__file__).parents[2]
+URDF = ROOT / "tests" / "hands" / "claw.urdf"
 
 
 def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -76,6 +77,7 @@ def test_help_names_every_command_and_every_command_exists():
         (["constraints", "import", "grab", "/", "--objects", "/dev/null"], "--objects is the file /dev/null. Pass a"),
         (["grasp", "mug:7", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["serve", "--hand", "paw"], "no hand 'paw'"),
+        (["serve", "--hand", str(URDF)], "claw.urdf is a robot description.*'congrasp hands import .*claw.urdf'"),
         (["serve", "--policy", "a", "--connect", "tcp/127.0.0.1:1"], "either a or"),
         (["serve", "--policy", "/nonexistent"], "cannot be read"),
         (["actor", "--connect", "nonsense"], "endpoint"),
@@ -205,6 +207,19 @@ def test_an_output_without_some_characters_gets_escapes():
     )
     done = subprocess.run(command, env=env, capture_output=True, timeout=60, check=False)
     is_one_line(done.returncode, done.stderr.decode(), r"no folder .*\\xfc")
+
+
+@pytest.mark.parametrize(
+    ("shell", "code", "words"),
+    [
+        ("exec {} -m congrasp objects list --families >&-", 0, ""),
+        ("mkdir a && cd a && rmdir ../a && exec {} -m congrasp objects generate --out b", 2, "working folder does not"),
+    ],
+)
+def test_a_closed_output_and_a_removed_folder_are_no_faults_of_the_program(tmp_path, shell, code, words):
+    command = ["sh", "-c", shell.format(sys.executable)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr, done.stderr
 
 
 @pytest.mark.parametrize("late", [True, False])

@@ -44,6 +44,7 @@ DIP = 0.01
 CARRIED, STILL = 0.03, 0.01
 """Displacement of a carried object, and tolerance within which it counts as at rest, m."""
 BEYOND = 0.1
+_RESTING = 1e-6  # m, largest step of a wrist at rest
 _RADII = np.array([[0.010] * 3, *[[0.009, 0.0075, 0.0075]] * 3, [0.009, 0.0065, 0.0065]])
 """(5, 3) skin radius of each bone, as in GraspXL's MANO hand, m."""
 _ALONG = (0.25, 0.5, 0.75, 1.0)
@@ -167,7 +168,7 @@ def approach(
       The frame of the farthest distance, and waypoints (K, 3), (K, 4) from there to the grasp.
 
     Raises:
-      Dropped: the wrist starts too near, or its path is too complex.
+      Dropped: the wrist starts too near or does not move, or its path is too complex.
     """
     start = _farthest(position, far, present, frame)
     if far[start] < NEAREST:
@@ -175,6 +176,8 @@ def approach(
         raise Dropped(name, "starts too near", reason)
     frames = np.flatnonzero(present[start : frame + 1]) + start
     path, turns = _truncated(position[frames], rotation[frames], far[frames])
+    if np.linalg.norm(np.diff(path, axis=0), axis=-1).max(initial=0.0) <= _RESTING:
+        raise Dropped(name, "no approach", "the wrist does not move before the grasp")
     _check_complexity(name, path, turns)
     return start, *_resampled(path, turns, waypoints)
 
@@ -327,7 +330,7 @@ def _resampled(path: np.ndarray, turns: Rotation, waypoints: int) -> tuple[np.nd
     """K waypoints at equal distances along the path, with quaternions of continuous sign."""
     length = np.concatenate([[0.0], np.linalg.norm(np.diff(path, axis=0), axis=-1).cumsum()])
     # While the wrist rests the path length does not grow: the last of such frames is used.
-    keep = np.append(np.diff(length) > 1e-6, True)
+    keep = np.append(np.diff(length) > _RESTING, True)
     length, path, turns = length[keep], path[keep], turns[keep]
     wanted = np.linspace(length[0], length[-1], waypoints)
     position = np.stack([np.interp(wanted, length, axis) for axis in path.T], -1)

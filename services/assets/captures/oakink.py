@@ -34,15 +34,19 @@ def read(path: pathlib.Path, meshes: Meshes, model: ManoModel | None) -> Iterato
     """Yields the sequences of the folder that holds `anno`.
 
     Raises:
-      CongraspError: there is no list of sequences.
+      CongraspError: there is no list of sequences, or it has another layout.
     """
     root = next((folder for folder in (path, path / "image") if (folder / "anno").is_dir()), path)
     index = root / "anno" / "seq_all.json"
     if not index.is_file():
         raise CongraspError(f"There is no {index}.", "Pass the folder that holds OakInk-Image's 'anno'.")
+    try:
+        sequences = _sequences(read_json(index, _LARGEST_JSON, _REMEDY))
+    except (TypeError, ValueError):
+        raise CongraspError(f"{index} holds other rows than [sequence, subject, frame, camera].", _REMEDY) from None
     found = meshes.beside(root / "obj", path / "obj")
     names = _names(path)
-    for (name, _), frames in sorted(_sequences(read_json(index, _LARGEST_JSON, _REMEDY)).items()):
+    for (name, _), frames in sorted(sequences.items()):
         folder = root / "anno" / "general_info"
         yield read_or_drop(name, _sequence, name, frames, folder, found, model, names, path)
 

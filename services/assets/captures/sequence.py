@@ -92,6 +92,8 @@ def read_or_drop(name: str, read: Callable[..., Sequence], *arguments: Any) -> S
         return dropped
     except (CongraspError, OSError) as error:
         return Dropped(name, "unreadable", " ".join(str(error).split()))
+    except (AttributeError, LookupError, TypeError, ValueError) as error:  # values of other types than expected
+        return Dropped(name, "wrong layout", f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
 
 
 def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape: int | str) -> np.ndarray:
@@ -105,11 +107,14 @@ def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape:
       shape: expected sizes; a letter matches any. As many numbers in another shape count if all sizes are given.
 
     Raises:
-      Dropped: the array is missing, or has another shape.
+      Dropped: the array is missing, holds no numbers, or has another shape.
     """
     if key not in values:
         raise Dropped(name, "wrong layout", f"{where} has no '{key}'")
-    array = np.array(values[key], float)
+    try:
+        array = np.array(values[key], float)
+    except (TypeError, ValueError):
+        raise Dropped(name, "wrong layout", f"'{key}' of {where} holds no numbers") from None
     known = [size for size in shape if isinstance(size, int)]
     if len(known) == len(shape) and array.size == math.prod(known):
         return array.reshape(known)

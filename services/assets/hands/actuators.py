@@ -148,6 +148,9 @@ def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[tuple[int, int,
             found.append((a, b, -own / other, float(data[0]) / other))
         elif kind == mujoco.mjtEq.mjEQ_CONNECT:
             notes.append("closed loops of links are opened (import a URDF whose joints mimic one another)")
+        elif kind == mujoco.mjtEq.mjEQ_JOINT or kind == mujoco.mjtEq.mjEQ_TENDON:
+            what = model.joint(one).name if kind == mujoco.mjtEq.mjEQ_JOINT else model.tendon(one).name
+            notes.append(f"an equality of '{what}' that does not couple two joints is dropped ('couplings')")
     return found
 
 
@@ -266,7 +269,11 @@ class Drive:
             servo, scale = next((x for x in mine if j in x[0].joints), mine[0] if mine else (None, 1.0))
             kp, limit = self._gains(j, servo, scale, self._names[j])
             if servo and servo.reach and j in servo.joints:
-                lower, upper = max(lower, servo.reach[0]), min(upper, servo.reach[1])
+                reach = max(lower, servo.reach[0]), min(upper, servo.reach[1])
+                if reach[0] < reach[1]:
+                    lower, upper = reach
+                else:
+                    self.notes.append(f"the control range of '{self._names[j]}' is outside its limits, and is left out")
             followers = {j: 1.0} | {x.a: x.ratio for x in self.links if x.b == j}
             kv = self._damping(followers, kp)
             if damping > _SLOW * kp:

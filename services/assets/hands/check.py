@@ -182,15 +182,15 @@ def _joints(hand: Hand) -> list[Finding]:
             continue
         moved += 1
         if (verdict := _verdict(cosine, *_ALONG)) != "passed":
-            limit = hand.lower[j] if way[j] > 0 else hand.upper[j]
+            limit, follows = hand.lower[j] if way[j] > 0 else hand.upper[j], joint.name in followers
             found.append(
                 Finding(
                     "joint",
-                    verdict,
+                    "doubt" if follows else verdict,
                     f"closing '{joint.name}' moves the tip of '{hand.fingers[finger]}' {100 * path:.1f} cm, at a "
                     f"cosine of {cosine:.2f} to its opponent",
-                    "change its ratio or its leader in couplings"
-                    if joint.name in followers
+                    "change its ratio or its leader in couplings, unless it keeps a pad parallel"
+                    if follows
                     else f"turn its axis, or close it towards {limit:.2f} in closed_pose; omit it if it spreads",
                 )
             )

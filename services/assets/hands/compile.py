@@ -19,7 +19,7 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.confined import call_confined
-from congrasp.services.assets.objects.mesh_files import load_geometry
+from congrasp.services.assets.objects.mesh_files import SUFFIXES, load_geometry
 
 MEMORY = 3 << 30
 """Limit of the address space for reading a file, bytes."""
@@ -36,6 +36,9 @@ LEAST = 1e-3, 1e-7
 _BALL = 0.4 * 0.02**2  # kg m2 for each kg: inertia of a ball with the radius of a finger link
 _KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical")
 _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+_DECIMAL = re.compile(r"(?<!\S)[-+]?\d+\.?\d*(?!\S)")
+_TURN = 7.0  # rad, largest angle of a joint's frame
+_FLAT = 1e-6  # of a mesh's length: thickness below which it has no hull
 _START = 30  # s, for the child's imports on a busy machine
 _MOST_FILES = 300  # that a description names
 _COUNTS = re.compile(r"""\bcount\s*=\s*["']([^"']*)["']""")
@@ -50,7 +53,6 @@ _FINITE = (
     *("geom_size", "geom_quat", "mesh_vert", "dof_armature", "dof_damping", "actuator_biasprm"),
     "actuator_forcerange",
 )
-_NATIVE = (".stl", ".obj", ".msh")
 _FACES = 50_000  # most triangles of a mesh; MuJoCo's limit is 200,000, but two arms must fit into the memory
 _FEWER_FACES = 20_000  # of a mesh with more than that
 _REMEDY = "MuJoCo must be able to load it."
@@ -261,8 +263,11 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
     if missing:
         notes.append(_missing(missing))
     if bounded:
-        light = [model.body(i).name for i in np.flatnonzero(model.body_mass == LEAST[0])]
-        notes.append(f"links without mass get {1e3 * LEAST[0]:g} g ('<inertial>' in the file): {', '.join(light)}")
+        light, thin = model.body_mass == LEAST[0], (model.body_inertia == LEAST[1]).any(1)
+        given = (light, f"mass get {1e3 * LEAST[0]:g} g"), (thin & ~light, f"inertia get {1e6 * LEAST[1]:g} kg.mm²")
+        for links, text in given:
+            if names := ", ".join(model.body(i).name for i in np.flatnonzero(links)):
+                notes.append(f"links without {text} ('<inertial>' in the file): {names}")
     return model
 
 
@@ -309,7 +314,8 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     _complete_inertias(robot, notes)
     assets, shared, lacking = dict[str, bytes](), dict[tuple[pathlib.Path | None, str], str](), dict[str, None]()
     for link in robot.iter("link"):
-        for shape in (*link.findall("visual"), *link.findall("collision")):
+        for i, shape in enumerate((*link.findall("visual"), *link.findall("collision"))):
+            shape.set("name", f"shape {i} of {link.get('name')}")  # for errors; those of the file may be equal
             for mesh in shape.iter("mesh"):
                 file = _mesh_file(path, mesh.get("filename", ""))
                 used = file, mesh.get("scale", "")  # MuJoCo shares a mesh among shapes of one name and scale
@@ -328,13 +334,16 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
 
 
 def _check_joints(robot: ET.Element, notes: list[str]) -> None:
-    """Refuses missing links and limits in the wrong order.
+    """Refuses missing links, limits in the wrong order and frames in degrees.
 
     Removes limits of effort below zero, and mimics that MuJoCo would drop.
     """
     links = {link.get("name") for link in robot.findall("link")}
     kinds = {joint.get("name"): joint.get("type") for joint in robot.findall("joint")}
     for joint in robot.findall("joint"):
+        for angle in (x for origin in joint.findall("origin") for x in _DECIMAL.findall(origin.get("rpy", ""))):
+            if abs(float(angle)) > _TURN:
+                raise _Known(f"rpy of the joint '{joint.get('name', '')}' has {angle}. Write radians, not degrees")
         name, limit, mimic = joint.get("name", ""), joint.find("limit"), joint.find("mimic")
         if (kind := joint.get("type", "")) not in _KINDS:
             raise _Known(f"the type of the joint '{name}' is '{kind[:40]}'. Write one of: {', '.join(_KINDS)}")
@@ -380,7 +389,7 @@ def _complete_inertias(robot: ET.Element, notes: list[str]) -> None:
             raise _Known(f"the mass of the link '{link.get('name', '')[:40]}' is {weight:g}, below zero. Correct it")
         inertia = found[0].find("inertia")
         inertia = ET.SubElement(found[0], "inertia") if inertia is None else inertia
-        if not set(_INERTIA[:3]) <= inertia.attrib.keys():
+        if weight and not all(_value(inertia, name, link) for name in _INERTIA[:3]):
             inertia.attrib = dict.fromkeys(_INERTIA[:3], str(_BALL * weight))
             guessed.append(link.get("name", ""))
         for name in _INERTIA:
@@ -426,17 +435,19 @@ def _readable(file: pathlib.Path) -> tuple[bytes, str]:
     suffix = file.suffix.lower()
     if file.stat().st_size > MAX_FILE:
         return b"", ""
-    if suffix in _NATIVE and suffix != ".stl":
-        return file.read_bytes(), suffix[1:]
+    if suffix == ".msh":
+        return file.read_bytes(), "msh"
     try:
-        if suffix == ".stl":  # MuJoCo reads binary ones of exact size
-            mesh = load_geometry(file, "")
-        else:
-            scene = trimesh.load_scene(file)
-            # COLLADA states its unit. Its upward axis is ignored, as in ROS.
-            mesh = (scene.convert_units("meters") if suffix == ".dae" else scene).to_mesh()
+        known = suffix in SUFFIXES
+        scene = trimesh.Scene(load_geometry(file, "", skip_materials=True)) if known else trimesh.load_scene(file)
+        # COLLADA states its unit. Its upward axis is ignored, as in ROS.
+        mesh = (scene.convert_units("meters") if suffix == ".dae" else scene).to_mesh()
         if len(mesh.faces) > _FACES:
+            mesh.merge_vertices()
             mesh = mesh.simplify_quadric_decimation(face_count=_FEWER_FACES)
+        spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(0), compute_uv=False)
+        if spread[2] < _FLAT * spread[0]:  # MuJoCo would refuse the whole file
+            return b"", ""
         return trimesh.exchange.stl.export_stl(mesh), "stl"
     except Exception:  # readers of many formats raise arbitrary errors
         return b"", ""

@@ -17,6 +17,7 @@ import trimesh
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.meshes import MAX_FACES
 from congrasp.common.hands.spec import Capsule, Solid, vector
+from congrasp.common.io.inputs import distinct_names
 from congrasp.services.assets.hands.compile import LEAST
 
 _CALLED = ("palm", "hand")
@@ -30,6 +31,7 @@ _KINDS: dict[mujoco.mjtGeom, Literal["box", "cylinder", "capsule", "ellipsoid"]]
 }
 _FLAT = 1.6  # a broader link gets several parallel capsules
 _PLAUSIBLE = (0.002, 0.15)  # half extent of an inertia's box, m
+_THIN = 1e-4  # m, thickness below which points have no box of their own
 _BARE = 0.005  # radius of a link without any geometry, m
 
 
@@ -47,10 +49,8 @@ class Tree:
     """Link of each body."""
     ends: tuple[int, ...]
     """Last link of each finger."""
-
-    def name(self, link: int) -> str:
-        """Name of a link for a hand file."""
-        return "palm" if link == self.palm else identifier(self.model.body(link).name, f"body_{link}")
+    names: dict[int, str]
+    """Name of each link for a hand file."""
 
     def above(self, link: int) -> int:
         """The link that carries one other than the palm."""
@@ -109,7 +109,9 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
     for link in groups:
         if link != palm and depth[link] > depth.get(last.get(root[link], palm), 0):
             last[root[link]] = link
-    return Tree(model, data, palm, groups, owner, tuple(last.values()))
+    called = ["palm", *(identifier(names[link], f"body_{link}") for link in groups if link != palm)]
+    numbered = dict(zip(groups, distinct_names(called), strict=True))
+    return Tree(model, data, palm, groups, owner, tuple(last.values()), numbered)
 
 
 def _to_palm(data: mujoco.MjData, palm: int) -> None:
@@ -266,6 +268,9 @@ def bare(*centers: np.ndarray) -> list[np.ndarray]:
 
 def fit_capsules(points: np.ndarray) -> tuple[Capsule, ...]:
     """Fits capsules along the longest side of the points' box (n, 3); several in parallel if it is flat."""
+    if np.linalg.matrix_rank(points - points.mean(0), tol=_THIN) < 3:
+        few = np.unique(points.round(5), axis=0)
+        points = np.concatenate([few + d for d in _THIN * np.concatenate([np.eye(3), -np.eye(3)])])
     to_box, extents = trimesh.bounds.oriented_bounds(points)
     order = np.argsort(extents)[::-1]
     length, breadth, height = np.maximum(extents[order], 1e-3)

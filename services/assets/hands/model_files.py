@@ -17,6 +17,7 @@ from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.meshes import MAX_DISTANCE, Meshes, load_meshes, save_meshes
 from congrasp.common.hands.motors import fitting_scale, motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
+from congrasp.common.io.inputs import distinct_names
 from congrasp.services.assets.hands.actuators import Drive
 from congrasp.services.assets.hands.compile import LEAST, confined, robot_spec
 from congrasp.services.assets.hands.links import (
@@ -170,7 +171,7 @@ def _points(path: pathlib.Path, tree: Tree) -> dict[int, list[np.ndarray]]:
         size = float(np.ptp(some, axis=0).max()) if some else _LINK[1]
         if not _LINK[0] <= size <= _LINK[1]:
             remedy = _smaller_unit(size) if size > _LINK[1] else _TWICE
-            raise CongraspError(f"{path}: the link '{tree.name(link)}' is {length(size)} long{_NO_HAND}", remedy)
+            raise CongraspError(f"{path}: the link '{tree.names[link]}' is {length(size)} long{_NO_HAND}", remedy)
     return points
 
 
@@ -239,7 +240,7 @@ def _links(tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]) ->
     for link in tree.groups:
         found = points[link] or inertia_boxes(tree, link)
         if not points[link]:
-            (boxed if found else empty).append(tree.name(link))
+            (boxed if found else empty).append(tree.names[link])
         carried = [at[x] for x in tree.groups if x != tree.palm and tree.above(x) == link]
         shapes[link] = fit_capsules(np.array(found or bare(at[link], *carried)))
     tips = {link: far_end(shapes[link], at[link]) for link in tree.ends}
@@ -249,11 +250,11 @@ def _links(tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]) ->
     for link, bodies in tree.groups.items():
         mass = float(sum(tree.model.body_mass[body] for body in bodies))
         if mass <= 0:
-            notes.append(f"'{tree.name(link)}' has no mass: 1 g ('mass' in the hand file)")
+            notes.append(f"'{tree.names[link]}' has no mass: 1 g ('mass' in the hand file)")
         links.append(
             Link(
-                name=tree.name(link),
-                parent="" if link == tree.palm else tree.name(tree.above(link)),
+                name=tree.names[link],
+                parent="" if link == tree.palm else tree.names[tree.above(link)],
                 joints=tuple(_joint(tree, j, joints[j], drive) for j in tree.joints(link)),
                 capsules=shapes[link],
                 mass=max(mass, 1e-3),
@@ -270,7 +271,7 @@ def _links(tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]) ->
 
 def _meshes(tree: Tree, notes: list[str]) -> Meshes:
     """Visual meshes of each link, unless larger than a hand."""
-    found = {tree.name(link): link_mesh(tree, link) for link in tree.groups}
+    found = {tree.names[link]: link_mesh(tree, link) for link in tree.groups}
     drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
     if large := [name for name, (vertices, _) in drawn.items() if np.abs(vertices).max() > MAX_DISTANCE]:
         notes.append(f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and dropped: {', '.join(large)}")
@@ -280,8 +281,9 @@ def _meshes(tree: Tree, notes: list[str]) -> Meshes:
 def _joint_names(tree: Tree) -> dict[int, str]:
     """Names of the hand's joints in its order, distinct from those of links."""
     names = {j: identifier(tree.model.joint(j).name, f"joint_{j}") for link in tree.groups for j in tree.joints(link)}
-    taken = {tree.name(link) for link in tree.groups} | TAKEN_JOINTS
-    return {j: f"{name}_joint" if name in taken else name for j, name in names.items()}
+    taken = {*tree.names.values()} | TAKEN_JOINTS
+    named = distinct_names(f"{name}_joint" if name in taken else name for name in names.values())
+    return dict(zip(names, named, strict=True))
 
 
 def _levers(tree: Tree, tips: dict[int, np.ndarray]) -> dict[int, float]:

@@ -1,8 +1,8 @@
 """Mesh files: their kind by content, limits before they are read, and what the readers of trimesh leave to the caller.
 
-STL is read here, by its content and size. Before trimesh reads them, an OBJ's relative indices become absolute, and a
-GLB's integers the numbers that they stand for (`gltf`). Textures, materials and colours of the files are sampled at
-points of their surface.
+STL is read here, by its content and size. Before trimesh reads them, an OBJ's relative indices become absolute, a PLY's
+polygons triangles (`ply`), and a GLB's integers the numbers that they stand for (`gltf`). Textures, materials and
+colours of the files are sampled at points of their surface.
 """
 
 import array
@@ -24,6 +24,8 @@ from congrasp.common.objects.spec import COLOUR_POINTS, Colours
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.gltf import MAX_FACES, plain_glb
 from congrasp.services.assets.objects.options import Up
+from congrasp.services.assets.objects.ply import plain_ply
+from congrasp.services.assets.objects.polygons import cut_dented
 
 SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CONVERT = "Convert it to STL, OBJ, PLY or GLB."
@@ -36,6 +38,7 @@ _FOREIGN = pathlib.Path(__file__).with_name("foreign.toml")
 _STL_HEADER, _STL_TRIANGLE = 84, 50  # bytes
 _STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+_INDENT = re.compile(rb"(?m)^[ \t]+")
 _RELATIVE = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t/]-\d")
 _ZERO = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t]0+(?=[/\s]|$)")
 _COMMA = re.compile(rb"(?mi)^[ \t]*(v[ \t]+|vertex[ \t]+)?[-+]?\d+,\d+(?:e[-+]?\d+)?[ \t]")
@@ -43,8 +46,6 @@ _POINT = re.compile(rb"(?m)^[ \t]*v[ \t]")
 _POINTS = re.compile(rb"(?m)^[ \t]*v[ \t]+([^\n#]*)")
 _POLYGON = re.compile(rb"(?m)^[ \t]*f((?:[ \t]+\d[\d/]*){4,})[ \t\r]*$")
 _REMARK = re.compile(rb"(?m)^([ \t]*f[^\n#]*)#[^\n]*")
-_CORNERS, _CUT = 64, 20_000  # most corners of a dented polygon that is cut, and of all that have more than four
-_DENT = 0.01  # sine of the least turn of a corner against the others
 _FACE = re.compile(rb"(?m)^[ \t]*f[ \t][^\n#]*")
 _INDEX = re.compile(rb"[ \t](\d{1,18})")
 _NO_POINT = "a face refers to a point that is not in the file"
@@ -52,9 +53,6 @@ _START = 4096
 _MARK = b"\xef\xbb\xbf"  # of UTF-8
 _FARTHEST = 1e12  # largest coordinate in the file's unit, so that squares and products are finite
 _COARSE = 0.01  # of a mesh's size: largest rounding of its coordinates in single precision
-_PLY_HEADER = 1 << 16  # bytes
-_SIZES = {"char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2}
-_SIZES |= {"int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8}
 _UNSAID = (102, 102, 102)  # default colour of a material in trimesh
 
 
@@ -143,7 +141,7 @@ def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: li
         if kind == "stl":
             found: Any = _stl(data, notes)
         else:
-            prepared = {"ply": _checked_ply, "glb": plain_glb, "obj": _plain_obj}[kind](data, notes)
+            prepared = {"ply": plain_ply, "glb": plain_glb, "obj": _plain_obj}[kind](data, notes)
             files = _Files(path, notes)
             found = trimesh.load(io.BytesIO(prepared), file_type=kind, resolver=files, process=False, **options)
     except CongraspError as error:
@@ -331,6 +329,7 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
     data = data.removeprefix(_MARK)
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
+    data = _INDENT.sub(b"", data).replace(b"\t", b" ")
     if _ZERO.search(data):
         raise ValueError("a face has the index 0, but OBJ counts from 1")
     data = _REMARK.sub(rb"\1", re.sub(rb"\\\r?\n", b" ", data))
@@ -361,81 +360,17 @@ def _cut_polygons(data: bytes, notes: list[str]) -> bytes:
     if any(len(row) < 3 for row in numbers):
         raise ValueError("a point has fewer than three numbers")
     points = np.array([_number(word) for row in numbers for word in row]).reshape(-1, 3)
-    polygons: dict[int, list[tuple[re.Match[bytes], list[bytes]]]] = {}
-    for row in _POLYGON.finditer(data):
-        polygons.setdefault(len(corners := row[1].split()), []).append((row, corners))
-    cut, budget, uncut = list[tuple[re.Match[bytes], bytes]](), _CUT, 0
-    for count, some in sorted(polygons.items()):
-        words = re.sub(rb"/[\d/]*", b"", b" ".join(row[1] for row, _ in some)).split()
-        places = np.array([*map(int, words)]).reshape(-1, count) - 1
-        if places.max() >= len(points):
-            return data  # which is an error of its own
-        turns = _turns(points[places])
-        for i in np.flatnonzero((turns < -_DENT).any(1)):
-            row, corners = some[i]
-            triangles: list[list[int]] = []
-            if count == 4:
-                dents = np.flatnonzero(turns[i] < -_DENT)
-                order = [(int(dents[0]) + k) % 4 for k in range(4)]
-                triangles = [order[:3], [order[0], *order[2:]]] if len(dents) == 1 else []
-            elif count <= min(_CORNERS, budget):
-                budget -= count
-                triangles = _ears(points[places[i]])
-            uncut += not triangles
-            cut.append((row, b"\n".join(b"f " + b" ".join(corners[k] for k in ear) for ear in triangles) or row[0]))
-    if uncut:
-        notes.append(f"{uncut} of its dented polygons could not be cut and may be filled (export it as triangles)")
+    rows = list(_POLYGON.finditer(data))
+    corners = [row[1].split() for row in rows]
+    polygons = [[int(corner.partition(b"/")[0]) - 1 for corner in some] for some in corners]
+    if max(map(max, polygons)) >= len(points):
+        return data  # which is an error of its own
     ends, parts = 0, list[bytes]()
-    for row, text in sorted(cut, key=lambda one: one[0].start()):
-        parts += [data[ends : row.start()], text]
-        ends = row.end()
+    for i, triangles in sorted(cut_dented(points, polygons, notes).items()):
+        text = b"\n".join(b"f " + b" ".join(corners[i][k] for k in triangle) for triangle in triangles)
+        parts += [data[ends : rows[i].start()], text]
+        ends = rows[i].end()
     return b"".join([*parts, data[ends:]])
-
-
-def _normals(corners: np.ndarray) -> np.ndarray:
-    """Normals (n, 3) of polygons (n, k, 3), as long as twice their areas."""
-    spokes = corners - corners[:, :1]
-    return np.cross(spokes, np.roll(spokes, -1, 1)).sum(1)
-
-
-@np.errstate(all="ignore")
-def _turns(corners: np.ndarray) -> np.ndarray:
-    """(n, k) sines of the turns at the corners of polygons (n, k, 3), negative at dents."""
-    sides, normals = np.roll(corners, -1, 1) - corners, _normals(corners)
-    sides /= np.linalg.norm(sides, axis=-1, keepdims=True)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return np.einsum("nkd,nd->nk", np.cross(np.roll(sides, 1, 1), sides), normals)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross products (...) of vectors (..., 2)."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
-def _ears(corners: np.ndarray) -> list[list[int]]:
-    """Triangles of a polygon (n, 3), cut off ear by ear; none if it crosses itself.
-
-    Its points may coincide, as where a bridge leads to the outline of a hole.
-    """
-    (normal,) = _normals(corners[None])
-    axis = int(np.abs(normal).argmax())
-    first, second = ((axis + 1) % 3, (axis + 2) % 3)[:: 1 if normal[axis] > 0 else -1]
-    flat = corners[:, [first, second]]
-    left, found = np.arange(len(corners)), list[list[int]]()
-    while len(left) > 3:
-        here = flat[left]
-        ears = np.roll(here, 1, 0), here, np.roll(here, -1, 0)
-        others = np.ones((len(left), len(left)), bool)
-        for start, end in zip(ears, (*ears[1:], ears[0]), strict=True):
-            others &= _cross((end - start)[:, None], here - start[:, None]) >= 0
-            others &= (here != start[:, None]).any(-1)
-        free = np.flatnonzero((_cross(ears[1] - ears[0], ears[2] - ears[1]) > 0) & ~others.any(1))
-        if not len(free):
-            return []
-        i = int(free[0])
-        found.append([int(left[i - 1]), int(left[i]), int(left[(i + 1) % len(left)])])
-        left = np.delete(left, i)
-    return [*found, left.tolist()]
 
 
 def _absolute(index: bytes, count: int) -> bytes:
@@ -449,29 +384,6 @@ def _lacks_points(data: bytes) -> bool:
     """True if a face of an OBJ refers to a point after the last."""
     points = len(_POINT.findall(data))
     return any(int(index) > points for face in _FACE.findall(data) for index in _INDEX.findall(face))
-
-
-def _checked_ply(data: bytes, notes: list[str]) -> bytes:
-    """The data, if every element has at least the bytes of its numbers, a list those of its length; in text two."""
-    header, end, _ = data[:_PLY_HEADER].partition(b"end_header")
-    if not end:
-        raise ValueError(f"its header does not end within {_PLY_HEADER} bytes")
-    is_text, elements = b"ascii" in header, list[tuple[int, int]]()
-    for line in header.decode("latin-1").splitlines():
-        match line.split():
-            case ["element", "tristrips", count] if int(count):
-                raise ValueError("its triangles are strips, which MeshLab opens and exports as faces")
-            case ["element", _, count]:
-                elements.append((int(count), 0))
-            case ["property", *words]:
-                least = 2 if is_text else _SIZES[words[1] if words[0] == "list" else words[0]]
-                elements[-1] = elements[-1][0], elements[-1][1] + least
-    for rows, width in elements:
-        if rows < 0 or (rows and not width):
-            raise ValueError(f"it announces an element of {rows} rows without values")
-    if sum(rows * width for rows, width in elements) > len(data):
-        raise ValueError(f"it announces {max(elements)[0]} rows, but has {len(data)} bytes")
-    return data
 
 
 def sample_colours(

@@ -31,7 +31,7 @@ from congrasp.services.assets.objects.repair import encloses
 
 UNLABELLED = ("near half", "far half")
 """Parts of an object without part files."""
-_CACHE_VERSION = 13
+_CACHE_VERSION = 14
 _FAR = 100  # sizes of an object that its middle may be from the origin
 _DRAWS = 8  # changes the surface points of every object, and with them all measurements
 _PATIENCE = 600.0  # s beyond the limits of an object's decompositions
@@ -142,7 +142,7 @@ def _key(source: Source, options: ImportOptions) -> str:
     settings = dataclasses.replace(options, cache_dir="")
     content = hashlib.sha256(f"{_DRAWS} {source.name} {settings}".encode())
     for file in source.files():
-        content.update(f" {file.path.name} {file.role} {file.part} ".encode())
+        content.update(f" {file.path.name} {file.role} {file.part} ".encode(errors="surrogateescape"))
         content.update(hashlib.sha256(file.path.read_bytes()).digest())
     return content.hexdigest()[:24]
 

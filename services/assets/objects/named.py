@@ -232,10 +232,13 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
         return [_single(path)]
     if not path.is_dir():
         raise CongraspError(f"There is no file or folder {path}.", "Check the path.")
-    meshes = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+    meshes = _meshes_in(path)
     if not meshes:
         found = [source for folder in sorted(path.iterdir()) if folder.is_dir() for source in _nested(folder)]
         if not found:
+            if deeper := next((file for file in sorted(path.glob("*/*/*")) if file.suffix.lower() in SUFFIXES), None):
+                fault = f"The folder {path} holds meshes deeper inside alone, such as {deeper}."
+                raise CongraspError(fault, "Name the folders in which they are.")
             raise CongraspError(f"The folder {path} holds no STL, OBJ, PLY or GLB file.", CONVERT)
         return distinct(found)
     return distinct(_in_folder(path, meshes))
@@ -247,9 +250,14 @@ def distinct(sources: Sequence[Source]) -> list[Source]:
     return [dataclasses.replace(source, name=name) for source, name in zip(sources, names, strict=True)]
 
 
+def _meshes_in(folder: pathlib.Path) -> list[pathlib.Path]:
+    """The meshes directly in a folder, without hidden files, such as those that macOS adds."""
+    return sorted(x for x in folder.iterdir() if x.suffix.lower() in SUFFIXES and not x.name.startswith("."))
+
+
 def _nested(folder: pathlib.Path) -> list[Source]:
     """The objects of the meshes directly in a folder, without those of folders below it."""
-    meshes = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+    meshes = _meshes_in(folder)
     return _in_folder(folder, meshes) if meshes else []
 
 

@@ -98,6 +98,7 @@ ROS = "x,y,z,qx,qy,qz,qw"
         ("x [m] y [m] z [m] qx qy qz qw", "pq", " "),
         ("t\tx (m)\ty (m)\tz (m)\tqx\tqy\tqz\tqw", "tpq", "\t"),
         (f",{ROS}", "tpq", ","),
+        ("t_x,t_y,t_z,q_x,q_y,q_z,q_w", "pq", ","),
         (ROS + ",vx,vy,vz", "pqp", ","),
         ("a title of the file\n" + ROS, "pq", ","),
         ("px,py,pz,vx,vy,vz,qx,qy,qz,qw", "pvq", ","),
@@ -179,6 +180,8 @@ def test_a_header_without_one_position_and_one_quaternion_is_refused(tmp_path, h
         (f"note,{ROS}\n{'a' * 200_000},0,0,0,0,0,0,1", "line 2 of .* cannot be read: field larger"),
         ("Format Version,1.23,Length Units,Millimeters\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0", "line 1 of .*export z up"),
         ("Rotation,,,,Position,,\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0", "line 2 of .* names columns twice below another"),
+        (f"t,{ROS}\n0.0,0,0,0,0,0,0,1\n0.1,0,0,1,0,0,0,1\n0.1,0,0,2,0,0,0,1\n0,0,0,3,0,0,0,1", "line 5 .*earlier"),
+        (f"header.stamp.secs,{ROS}\n-1,0,0,0,0,0,0,1\n-2,0,0,1,0,0,0,1", "line 3 of .* is earlier .*Sort the lines"),
         ("a" + "[ " * 300 + "_" * 40_000 + "\n", "has no numbers"),
     ],
 )

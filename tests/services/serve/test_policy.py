@@ -102,6 +102,11 @@ BAD_REQUESTS = [
     ({"surface": np.zeros((5, 2))}, RefusedError),
     ({"wrist": (np.full(3, np.nan), IDENTITY)}, RefusedError),
     ({"q": "open"}, RefusedError),
+    ({"constraints": {"heading": "above"}}, RefusedError),
+    ({"q": np.full(20, 45.0)}, RefusedError),
+    ({"surface": 1000 * np.random.default_rng(0).uniform(-0.05, 0.05, (64, 3))}, RefusedError),
+    ({"wrist": np.eye(4)}, RefusedError),
+    ({"object_pose": np.eye(4)}, RefusedError),
     ({"q": None, "object_pose": None}, RefusedError),
     ({"above": True}, RefusedError),
 ]

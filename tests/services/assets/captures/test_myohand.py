@@ -103,9 +103,11 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     robot, pose = right["robot"], right["object"]
     write(case, folder / "MyoHand_box_nokey.npz", object=None)
     write(case, folder / "MyoHand_box_shape.npz", robot=robot[:, :28])
+    write(case, folder / "MyoHand_box_words.npz", object=np.full(len(pose), "a"))
     degrees = np.concatenate([robot[:, :3], np.degrees(robot[:, 3:])], 1)
     write(case, folder / "MyoHand_box_degrees.npz", robot=degrees)
     write(case, folder / "MyoHand_box_millimetres.npz", object=pose * ([1000] * 3 + [1] * 4))
+    write(case, folder / "MyoHand_box_reversed.npz", robot=robot[::-1], object=pose[::-1])
     gone = robot.copy()
     gone[:, 0] = np.nan
     write(case, folder / "MyoHand_box_gone.npz", robot=gone)
@@ -121,10 +123,12 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     for name, rule, words in (
         ("nokey", "wrong layout", "no 'object'"),
         ("shape", "wrong layout", "(90, 28)"),
+        ("words", "wrong layout", "'object' of the file holds no numbers"),
         ("degrees", "wrong units", "radians"),
         ("millimetres", "wrong units", "in metres"),
         ("gone", "frames missing", "no frame"),
         ("text", "unreadable", "cannot be read"),
+        ("reversed", "no approach", "does not move before the grasp"),
         ("lift", "no mesh", "no mesh of 'cup'"),
         ("limits", "joint limits", "ring_pip is 0.45 rad beyond"),
     ):

@@ -6,7 +6,7 @@ import types
 import pytest
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.assets.captures import build
+from congrasp.services.assets.captures import build, dexycb
 from congrasp.services.assets.captures.dexycb import _betas, _yaml
 from congrasp.services.assets.captures.grab import _template
 from congrasp.services.assets.captures.sequence import Dropped, Meshes
@@ -53,3 +53,12 @@ def test_a_mesh_folder_without_a_mesh_or_with_several_is_refused(tmp_path):
         (tmp_path / f"{name}.stl").write_bytes(b"")
     with pytest.raises(CongraspError, match="holds 2 objects"):
         build._source(tmp_path)
+
+
+@pytest.mark.parametrize("value", ["a", "[1]", "{b: 1}", "null"])
+def test_settings_of_other_types_drop_their_sequence_alone(tmp_path, value):
+    text = f"mano_sides: [right]\nycb_ids: [1]\nycb_grasp_ind: {value}\nmano_calib: [x]\n"
+    (tmp_path / "subject" / "session").mkdir(parents=True)
+    (tmp_path / "subject" / "session" / "meta.yml").write_text(text)
+    (dropped,) = dexycb.read(tmp_path, Meshes(()), types.SimpleNamespace())
+    assert isinstance(dropped, Dropped) and dropped.rule == "wrong layout"

@@ -168,3 +168,11 @@ def test_a_file_that_would_run_something_is_not_unpickled(run_import, tmp_path):
 def test_a_folder_without_annotations_is_refused(run_import, tmp_path):
     with pytest.raises(CongraspError, match="seq_all"):
         run_import("oakink", tmp_path)
+
+
+@pytest.mark.parametrize("text", ['{"a": 1}', "[[1, 2]]", '[["A01001_0001_0000", "x", 0, 0]]', "3"])
+def test_a_list_of_other_rows_is_refused(tmp_path, text):
+    (tmp_path / "anno").mkdir()
+    (tmp_path / "anno" / "seq_all.json").write_text(text)
+    with pytest.raises(CongraspError, match=r"holds other rows than \[sequence, subject, frame, camera\]"):
+        list(read(tmp_path, Meshes(()), None))

@@ -11,6 +11,7 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import faults, hand_text
+from congrasp.common.hands.spec import Coupling
 from congrasp.services.assets.hands import check, trials
 from congrasp.services.assets.hands.check import check_hand
 from congrasp.services.assets.hands.model_files import propose
@@ -60,6 +61,15 @@ def test_a_reversed_axis_is_found_and_named():
     lines, found = verdicts(turned)
     assert found.failed and lines["joint"].verdict == "failed" and "'opposing_root'" in lines["joint"].measured
     assert "axis" in lines["joint"].remedy and "closed_pose" in lines["joint"].remedy
+
+
+def test_a_follower_that_opens_as_a_parallel_pad_does_is_a_doubt():
+    pose = {name: angle for name, angle in CLAW.closed_pose.items() if name != "opposing_middle"}
+    opened = {name: angle for name, angle in CLAW.open_pose.items() if name != "opposing_middle"}
+    follows = (Coupling("opposing_middle", "opposing_root", -0.5, 0.0),)
+    hand = dataclasses.replace(CLAW, couplings=follows, open_pose=opened, closed_pose=pose)
+    (finding,) = (one for one in check._joints(hand) if one.check == "joint")
+    assert finding.verdict == "doubt" and "'opposing_middle'" in finding.measured and "parallel" in finding.remedy
 
 
 def moved(vector, by):

@@ -196,3 +196,14 @@ def test_a_fine_mesh_is_simplified(tmp_path):
     joints = {joint.name: joint for joint in proposal.hand.joints}
     reach = np.linalg.norm(vertices - np.array(joints["left_middle"].anchor), axis=-1).max()
     assert reach == pytest.approx(0.059, abs=1e-3)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj"])
+def test_a_mesh_of_many_triangles_keeps_its_shape(suffix, tmp_path):
+    """81,920 triangles, which are merged at their corners and reduced before MuJoCo reads them."""
+    trimesh.creation.icosphere(6, 0.009).export(tmp_path / f"pad.{suffix}")
+    text = (HANDS / "claw.urdf").read_text().replace('<sphere radius="0.009"/>', f'<mesh filename="pad.{suffix}"/>')
+    (tmp_path / "claw.urdf").write_text(text)
+    drawn = trimesh.Trimesh(*propose(tmp_path / "claw.urdf").meshes["left_upper"])
+    pad = max(drawn.split(only_watertight=False), key=lambda body: len(body.faces))
+    assert pad.volume == pytest.approx(4 / 3 * np.pi * 0.009**3, rel=0.03)

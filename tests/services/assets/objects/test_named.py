@@ -1,8 +1,10 @@
 """Objects that a user points to."""
 
+import os
 import pathlib
 
 import pytest
+import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
@@ -32,3 +34,9 @@ def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
     pathlib.Path("mug:7").mkdir()
     with pytest.raises(CongraspError):  # an empty folder
         objects_at(pathlib.Path("mug:7"))
+
+
+def test_a_name_in_another_encoding_is_a_name(tmp_path, quick_import):
+    path = tmp_path / os.fsdecode(b"m\xfcg.stl")
+    trimesh.creation.box((0.05, 0.05, 0.1)).export(path)
+    assert find_object(str(path)).name == "m_g"

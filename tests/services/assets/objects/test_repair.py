@@ -1,5 +1,7 @@
 """Broken meshes: each is repaired with a note, or rejected with the remedy."""
 
+import struct
+
 import numpy as np
 import pytest
 import trimesh
@@ -107,14 +109,36 @@ def test_what_single_precision_has_rounded_away_is_refused(tmp_path):
         read_mesh(tmp_path / "a.stl")
 
 
-@pytest.mark.parametrize("turn", [1, -1])
-@pytest.mark.parametrize("end", ["", "# end", "\\\n"])
-def test_dented_polygons_are_cut_inside_of_them(tmp_path, turn, end):
-    """The ends of a channel, as modelling programs export it: one polygon each."""
+def _channel(turn=1):
+    """Points and polygons of a channel, as modelling programs export it: one polygon for each end."""
     outline = [(0, 0), (6, 0), (6, 4), (5, 4), (5, 1), (1, 1), (1, 4), (0, 4)][::turn]
     points = [(x, y, z) for z in (0, 3) for x, y in outline]
     sides = [(i, (i + 1) % 8, (i + 1) % 8 + 8, i + 8) for i in range(8)]
-    faces = [tuple(range(8))[::-1], tuple(range(8, 16)), *sides]
+    return points, [tuple(range(8))[::-1], tuple(range(8, 16)), *sides]
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_polygons_of_a_ply_are_cut_inside_of_them(tmp_path, kind):
+    """Faces of eight corners and of four, each with a colour, between points with one and an edge."""
+    points, faces = _channel()
+    numbers = "property float x\nproperty float y\nproperty float z\nproperty uchar red"
+    face = "property uchar red\nproperty list uchar int vertex_indices\nproperty short rest"
+    edge = "element edge 1\nproperty int vertex1\nproperty int vertex2"
+    header = f"ply\nformat {kind} 1.0\nelement vertex 16\n{numbers}\nelement face 10\n{face}\n{edge}\nend_header\n"
+    rows = [("3fB", *point, 7) for point in points] + [(f"BB{len(one)}ih", 9, len(one), *one, 1) for one in faces]
+    rows.append(("ii", 5, 6))
+    order = ">" if "big" in kind else "<"
+    data = b"".join(struct.pack(order + row[0], *row[1:]) for row in rows)
+    text = "".join(" ".join(map(str, row[1:])) + "\n" for row in rows)
+    (tmp_path / "a.ply").write_bytes(header.encode() + (text.encode() if kind == "ascii" else data))
+    mesh = read_mesh(tmp_path / "a.ply")
+    assert mesh.is_watertight and abs(mesh.volume) == pytest.approx(36) and mesh.area == pytest.approx(24 + 26 * 3)
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+@pytest.mark.parametrize("end", ["", "# end", "\\\n"])
+def test_dented_polygons_are_cut_inside_of_them(tmp_path, turn, end):
+    points, faces = _channel(turn)
     text = "".join("v {} {} {}\n".format(*point) for point in points)
     (tmp_path / "a.obj").write_text(text + "".join(f"f {_row(face, end)}\n" for face in faces))
     mesh = read_mesh(tmp_path / "a.obj")
