@@ -31,13 +31,20 @@ class CongraspError(Exception):
         super().__init__(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}")
 
 
+PORT_ERRORS = OSError, OverflowError
+"""Errors of a port that is taken or out of range."""
+
+
 @contextlib.contextmanager
-def os_errors_as(what: str, remedy: str = "") -> Iterator[None]:
-    """Raises an error of the system, such as a full disk or a port out of range, as a CongraspError with its reason."""
+def os_errors_as(
+    what: str, remedy: str = "", kinds: type[Exception] | tuple[type[Exception], ...] = OSError
+) -> Iterator[None]:
+    """Raises an error of the system, such as a full disk, as a CongraspError with its reason."""
     try:
         yield
-    except (OSError, OverflowError) as error:
-        raise CongraspError(f"{what}: {getattr(error, 'strerror', None) or error}.", remedy) from None
+    except kinds as error:
+        reason = str(getattr(error, "strerror", None) or error).rstrip(".")
+        raise CongraspError(f"{what}: {reason}.", remedy) from None
 
 
 _EXTRAS = {

@@ -1,13 +1,13 @@
 """The programs of `examples/`, as modules."""
 
 import importlib
+import pathlib
 import sys
 from typing import Any
 from unittest import mock
 
-from tests.conftest import ROOT
-
-EXAMPLES = ROOT / "examples"
+EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / "examples"
+"""Not by way of `tests.conftest`, whose settings of JAX are for tests: benchmarks import this module."""
 
 
 def example(name: str) -> Any:

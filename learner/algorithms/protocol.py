@@ -120,14 +120,15 @@ class NonFiniteUpdate(PhysicsError):
 def rollout_form(config: RunConfig, spec: PolicySpec, schema: Schema) -> RolloutForm:
     """Returns the form of a run's rollouts, with the arrays of `schema` for its algorithm."""
     task = config.task
-    seen_by_teacher = sum(size for _, size in full_layout(task)) + extra(get_hand(task.hand))
     return RolloutForm(
         steps=config.rollout_steps,
         worlds=config.environments,
         observation=sum(size for _, size in spec.layout),
         action=spec.action_size,
         half=config.half_observations,
-        teacher=0 if TAUGHT.keys().isdisjoint(schema) else seen_by_teacher,
+        teacher=0
+        if TAUGHT.keys().isdisjoint(schema)
+        else sum(size for _, size in full_layout(task)) + extra(get_hand(task.hand)),
         privileged=spec.privileged_size,
         arrays=schema,
     )

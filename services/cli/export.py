@@ -76,10 +76,13 @@ def motion(
       congrasp export motion grasps/mug/grasp.npz --to glb
       congrasp export motion runs/mine --success --to ros2 --out bag
     """
-    from congrasp.services.export.motion_file import at_rate, default_name, export_motions, pick_motion
+    from congrasp.common.io.files import check_output
+    from congrasp.services.export.motion_file import FORMATS, at_rate, default_name, export_motions, pick_motion
 
     if not paths:
         raise CongraspError("No motion was given.", "Pass a .npz of 'congrasp grasp', a recording or a run's folder.")
+    if out and not out.exists():
+        check_output("--out", out, is_folder=not FORMATS[to])
     motions = [pick_motion(path, index, success=success) for path in paths]
     motions = [at_rate(motion, fps) for motion in motions] if fps else motions
     target = out or default_name(motions[0], to)

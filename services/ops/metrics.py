@@ -9,7 +9,7 @@ from typing import Any
 from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from congrasp.common.errors import TransportError, os_errors_as
+from congrasp.common.errors import PORT_ERRORS, TransportError, os_errors_as
 
 _TICKETS = ("granted", "redeemed", "returned", "expired")
 _GAUGES = {
@@ -35,8 +35,7 @@ def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
     ProcessCollector(registry=registry)
     for collector in collectors:
         registry.register(collector)
-    what = f"The metrics cannot be served at {host}:{port} on this machine"
-    with os_errors_as(what, "Pass another --metrics-port."):
+    with os_errors_as(f"The metrics cannot be served at {host}:{port}", "Pass another --metrics-port.", PORT_ERRORS):
         server, thread = start_http_server(port, host, registry)
     try:
         yield

@@ -66,7 +66,9 @@ class LiveServer:
         # Behind the gate, at an address of the loopback interface that other sites in a browser do not know.
         inside = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}.{secrets.randbelow(254) + 1}"
         inside = inside if sys.platform == "linux" else _HOST
-        with os_errors_as(f"The live view cannot listen on {_HOST}:{port}", "Pass another port with --live."):
+        with os_errors_as(
+            f"The live view cannot listen on {_HOST}:{port}", "Pass another port with --live.", OverflowError
+        ):
             outside = socket.create_server((_HOST, port))
         self._server = foxglove.start_server(
             name="congrasp", host=inside, port=0, context=self._context, server_listener=Listener()

@@ -15,7 +15,7 @@ import urllib.parse
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from congrasp.common.errors import CongraspError, os_errors_as
+from congrasp.common.errors import PORT_ERRORS, CongraspError, os_errors_as
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.ops.logs import log
 
@@ -142,7 +142,7 @@ class PageServer:
           CongraspError: the port is busy, or there is no such interface.
         """
         remedy = "Choose another --port, or end the process that uses it."
-        with os_errors_as(f"The page cannot be offered at {host}:{port}", remedy):
+        with os_errors_as(f"The page cannot be offered at {host}:{port}", remedy, PORT_ERRORS):
             self._server = _Server((host, port), _Handler)
         self.routes, self._server.page = routes, self
         self.host, self.port = host, int(self._server.server_address[1])

@@ -10,7 +10,6 @@ import sys
 import textwrap
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message, encode
 from tests.socket_transport import SocketListener, SocketTransport
-from tests.waits import eventually
+from tests.waits import eventually, together
 
 KEYS = Keys("test")
 
@@ -143,10 +142,9 @@ def test_silence_has_a_deadline(pair):
 
 def test_workers_answer_at_the_same_time(pair):
     server, client = pair
-    together = threading.Barrier(3)
-    server.serve(KEYS.act, lambda key, m: Message(meta={"n": together.wait(60)}), workers=3)
-    with ThreadPoolExecutor(3) as pool:
-        seen = pool.map(lambda _: client.query(KEYS.act, Message(), timeout=60).meta["n"], range(3))
+    barrier = threading.Barrier(3)
+    server.serve(KEYS.act, lambda key, m: Message(meta={"n": barrier.wait(60)}), workers=3)
+    seen = together(lambda _: client.query(KEYS.act, Message(), timeout=60).meta["n"], range(3))
     assert sorted(seen) == [0, 1, 2]
 
 

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -22,7 +21,7 @@ from congrasp.learner.distributed.ranks import Ranks, ended_by, relay
 from congrasp.learner.run_directory import create_run
 from tests.conftest import ROOT
 from tests.learner.rank_process import CONFIG
-from tests.waits import eventually
+from tests.waits import eventually, together
 
 
 class Party:
@@ -48,8 +47,7 @@ class Party:
 
     @staticmethod
     def everywhere(call: Callable[[int], object], count: int = 3) -> None:
-        with ThreadPoolExecutor(count) as pool:
-            list(pool.map(call, range(count)))
+        together(call, range(count))
 
     def end(self, rank: int) -> None:
         """Its process is no more: nothing in it runs on, and the kernel ends its connections."""

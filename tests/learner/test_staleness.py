@@ -4,7 +4,6 @@ import heapq
 import itertools
 import math
 import statistics
-from concurrent.futures import ThreadPoolExecutor
 
 import hypothesis.strategies as st
 import pytest
@@ -12,6 +11,7 @@ from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from congrasp.learner.hub.staleness import StalenessManager
+from tests.waits import together
 
 A, B = ("a", "1"), ("b", "1")
 
@@ -305,8 +305,7 @@ def test_threads_cannot_overdraw():
             if staleness.grant((name, "1"), str(i)):
                 granted.append(i)
 
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(ask, map(str, range(8))))
+    together(ask, map(str, range(8)))
     assert len(granted) == 50 == staleness.counters()["running"]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.files import read_hand
+from congrasp.common.hands.files import hand_from_text, read_hand
 from congrasp.common.io.inputs import distinct_names, file_name, read_file, safe_name
 from congrasp.common.objects import store
 from congrasp.common.objects.procedural import generate
@@ -73,6 +73,8 @@ def test_absent_cut_and_foreign_files_are_named(tmp_path, kind, data, why):
     with pytest.raises(CongraspError, match=why) as raised:
         LOADERS[kind](path)
     assert str(path) in str(raised.value) and "\n" not in str(raised.value)
+    with pytest.raises(CongraspError, match="the hand file has the format None"):
+        hand_from_text("{}")
 
 
 @pytest.mark.parametrize("name", ["mug", "mug_7", "Becher groß (2)", "x" * 100, "v1.2-b+c"])
@@ -182,7 +184,7 @@ def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, par
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (lambda h: h["links"][0].update(mass=-1.0), "needs a mass above zero"),
+        (lambda h: h["links"][0].update(mass=0.0), "needs a mass above zero"),
         (lambda h: h["links"][0].update(mass=NAN), "not a finite number"),
         (lambda h: h["links"][1]["joints"][0].update(lower=2.0, upper=-2.0), "wrong order"),
         (lambda h: h["links"][1]["joints"][0].update(kp=1e300), "not a finite number"),

@@ -10,7 +10,6 @@ import socket
 import subprocess
 import sys
 import urllib.request
-from concurrent.futures import ThreadPoolExecutor
 from unittest import mock
 
 import pytest
@@ -21,7 +20,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import main
 from congrasp.services.ops.logs import log, log_error, logging_as
 from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
-from tests.waits import eventually
+from tests.waits import eventually, together
 
 STATUS = {
     "version": 7,
@@ -88,8 +87,7 @@ def test_a_server_counts_answers_and_batches_from_many_threads():
             metrics.batch(3)
 
     with exposed(port, "127.0.0.1", metrics):
-        with ThreadPoolExecutor(4) as pool:
-            list(pool.map(answer, range(4)))
+        together(answer, range(4))
         found = scrape(port)
     assert found["congrasp_policy_queries_total", "answered"] == 400 == found["congrasp_policy_batch_bucket", "4.0"]
     assert found["congrasp_policy_queries_total", "overloaded"] == 400
@@ -186,5 +184,5 @@ def test_a_port_in_use_is_an_error_in_words():
     with socket.socket() as busy:
         busy.bind(("127.0.0.1", port))
         busy.listen()
-        with pytest.raises(CongraspError, match=rf"127.0.0.1:{port} .*--metrics-port"), exposed(port, "127.0.0.1"):
+        with pytest.raises(CongraspError, match=rf"127.0.0.1:{port}: .*--metrics-port"), exposed(port, "127.0.0.1"):
             pass

@@ -64,7 +64,7 @@ def guarded(policy, clock, limits=LIMITS, request=REQUEST, **options):
 
 
 def test_answers_are_followed_from_the_targets_that_were_commanded():
-    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.9, 0.9])))
+    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.9, 0.9])))
     with guarded(policy, clock) as guard:
         first = guard.step(STATE)
         clock.now += 0.01
@@ -80,7 +80,7 @@ def test_answers_are_followed_from_the_targets_that_were_commanded():
 
 def test_velocities_that_are_not_measured_are_estimated_from_positions():
     """A wrist at 0.4 m/s: its servo is that far ahead that friction of 0.1 N s/m leaves 1 N, 2 N/m being its gain."""
-    clock, policy = Clock(), ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0])))
+    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.zeros(FINGERS), np.array([5.0, 0, 0, 0, 0, 0])))
     limits = dataclasses.replace(LIMITS, upper=np.full(8, 9.0), lower=np.full(8, -9.0), speed=np.full(8, 50.0))
     with guarded(policy, clock, limits) as guard:
         turned = np.array([3.1, 3.2 - 2 * np.pi, 3.2 - 2 * np.pi, 3.3 - 2 * np.pi])
@@ -105,7 +105,7 @@ def test_velocities_that_are_not_measured_are_estimated_from_positions():
 
 @pytest.mark.parametrize("fallback", ["freeze", "open"])
 def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episode(fallback):
-    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback=fallback) as guard:
         guard.step(STATE)
         policy.outcome = TransportError("Nobody is there.")
@@ -138,7 +138,7 @@ def test_without_answers_the_hand_holds_and_then_falls_back_until_the_next_episo
     ],
 )
 def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
-    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback="open") as guard:
         guard.step({**STATE, **({} if "q" in changed or mode == "open" else changed)})
         policy.outcome = TransportError("Nobody is there.")
@@ -156,7 +156,7 @@ def test_what_may_be_held_is_not_dropped_unless_told(changed, mode):
 
 
 def test_a_frozen_hand_keeps_its_targets_while_the_policy_answers():
-    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
     with guarded(policy, clock, fallback="open") as guard:
         kept = guard.step(STATE)
         guard.freeze()
@@ -174,7 +174,7 @@ def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
     """Its hand opens after a silence, unless the table's absence says that something may be held."""
     state = {name: STATE[name] for name in ("q", "u")}
     for table, mode in ((True, "open"), (False, "freeze")):
-        clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+        clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
         with guarded(policy, clock, fallback="open") as guard:
             guard.reset(dataclasses.replace(REQUEST, object_pose=None, cloud=np.zeros((8, 3))))
             assert guard.step({**state, "table": table}).mode == "follow"
@@ -186,7 +186,7 @@ def test_a_policy_with_a_camera_is_asked_without_an_object_s_pose():
 
 def test_a_lasting_nan_holds_and_then_freezes_with_the_torque_of_the_last_measurement():
     """2 N.m/rad from the joints at 0 to the targets at 0.2 and 0.1 rad."""
-    clock, policy = Clock(), ScriptedPolicy(answer(np.array([0.2, 0.1])))
+    clock, policy = Clock(100.0), ScriptedPolicy(answer(np.array([0.2, 0.1])))
     blind = {name: np.full_like(value, np.nan) for name, value in STATE.items()}
     with guarded(policy, clock, fallback="open") as guard:
         guard.step(STATE)
@@ -204,7 +204,7 @@ def test_a_lasting_nan_holds_and_then_freezes_with_the_torque_of_the_last_measur
 def test_limits_and_open_pose_are_those_of_the_policy_s_metadata():
     policy = ScriptedPolicy(answer(np.array([0.9, 0.9])))
     policy.metadata = lambda: {"hand": "two", "limits": LIMITS.as_lists(), "open_pose": OPEN.tolist()}
-    with Guard(policy, period=0.5, wait=0.4, stale=0.6, hold=2.0, clock=Clock()) as guard:
+    with Guard(policy, period=0.5, wait=0.4, stale=0.6, hold=2.0, clock=Clock(100.0)) as guard:
         guard.reset(REQUEST)
         np.testing.assert_allclose(guard.step(STATE).q_target, [0.5, 0.4])
         guard.open()
@@ -220,19 +220,19 @@ def test_the_palm_stays_above_the_table():
     limits = dataclasses.replace(LIMITS, palm=np.array([[0.0, 0.0, 0.03, 0.02]]), speed=np.full(8, 100.0))
     down = answer(np.zeros(2), np.array([0.1, 0.0, 0.15, 0.0, 0.0, 0.0]))
     request = dataclasses.replace(REQUEST, wrist=wrist)
-    with guarded(ScriptedPolicy(down), Clock(), limits, request) as guard:
+    with guarded(ScriptedPolicy(down), Clock(100.0), limits, request) as guard:
         command = guard.step({**STATE, "u": down.u_target})
         np.testing.assert_allclose(command.u_target, [0.1, 0.0, 0.05, 0.0, 0.0, 0.0], atol=1e-9)
         assert guard.counters.table == 1
         for wrong in ((np.zeros(3), np.zeros(4)), (np.full(3, np.nan), wrist[1])):
             with pytest.raises(CongraspError, match="wrist's"):
                 guard.reset(dataclasses.replace(REQUEST, wrist=wrong))
-    with guarded(ScriptedPolicy(down), Clock(), limits, request, table=(0.0, 0.0, 1.0, -1.0)) as guard:
+    with guarded(ScriptedPolicy(down), Clock(100.0), limits, request, table=(0.0, 0.0, 1.0, -1.0)) as guard:
         np.testing.assert_allclose(guard.step({**STATE, "u": down.u_target}).u_target[2], 0.15)
 
 
 def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_them():
-    clock, policy = Clock(), ScriptedPolicy(TransportError("Nobody is there."))
+    clock, policy = Clock(100.0), ScriptedPolicy(TransportError("Nobody is there."))
     elsewhere = GraspRequest(q=np.array([-0.6, 0.2]))
     with guarded(policy, clock) as guard:
         guard.reset(elsewhere)
@@ -242,7 +242,7 @@ def test_an_episode_goes_on_from_the_fingers_last_targets_unless_somebody_moved_
 
 
 def test_the_hand_goes_on_when_the_policy_is_back_while_it_holds():
-    clock, policy = Clock(), ScriptedPolicy(TransportError("Nobody is there."))
+    clock, policy = Clock(100.0), ScriptedPolicy(TransportError("Nobody is there."))
     with guarded(policy, clock) as guard:
         assert guard.step(STATE).mode == "hold"
         policy.outcome = answer(np.array([0.1, 0.1]))
@@ -252,7 +252,7 @@ def test_the_hand_goes_on_when_the_policy_is_back_while_it_holds():
 
 
 def test_an_answer_to_an_old_state_is_thrown_away():
-    clock = Clock()
+    clock = Clock(100.0)
 
     def late(state):
         clock.now += 0.7
@@ -273,7 +273,7 @@ def test_after_an_answer_that_came_late_the_next_is_waited_for():
             done.wait(20.0)
         return answer(state["q"])
 
-    clock = Clock()
+    clock = Clock(100.0)
     with guarded(ScriptedPolicy(act), clock) as guard:
         guard._wait = 0.0
         assert guard.step(STATE).mode == "hold"
@@ -303,7 +303,7 @@ def test_a_policy_that_hangs_does_not_hold_the_loop_up():
 def test_the_policy_is_told_what_is_not_measured():
     """A client's query would have zeros there."""
     policy = ScriptedPolicy(answer(np.zeros(FINGERS)))
-    with guarded(policy, Clock()) as guard:
+    with guarded(policy, Clock(100.0)) as guard:
         guard.step({"u": np.zeros(6)})
     (state,) = policy.states
     assert {name: value.shape for name, value in state.items() if np.isnan(value).all()} == {
@@ -326,7 +326,7 @@ def test_the_policy_is_told_what_is_not_measured():
     ],
 )
 def test_what_is_no_answer_is_counted_and_holds(outcome, counter):
-    with guarded(ScriptedPolicy(outcome), Clock()) as guard:
+    with guarded(ScriptedPolicy(outcome), Clock(100.0)) as guard:
         command = guard.step(STATE)
     assert command.mode == "hold" and getattr(guard.counters, counter) == 1 and guard.counters.answers == 0
     np.testing.assert_array_equal(command.q_target, np.zeros(FINGERS))
@@ -349,7 +349,7 @@ TIMES = st.one_of(st.floats(-0.1, 1.0), st.just(float("nan")))
     st.sampled_from(["freeze", "open"]),
 )
 def test_no_command_leaves_the_limits_whatever_policy_sensors_and_clock_say(steps, fallback):
-    clock, policy = Clock(), ScriptedPolicy(None)
+    clock, policy = Clock(100.0), ScriptedPolicy(None)
     with guarded(policy, clock, fallback=fallback) as guard:
         last = np.zeros(FINGERS + 6)
         for outcome, state, passed, begins in steps:

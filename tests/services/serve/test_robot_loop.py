@@ -17,12 +17,14 @@ SECONDS = 120.0
 """That a server has to start."""
 
 
-LOOP = example("robot_loop")
+@pytest.fixture(scope="module")
+def loop():
+    return example("robot_loop")
 
 
 @pytest.fixture
-def robot():
-    return LOOP.MujocoRobot(HAND, TASK, SEED, congrasp.JointLimits.of_hand(HAND))
+def robot(loop):
+    return loop.MujocoRobot(HAND, TASK, SEED, congrasp.JointLimits.of_hand(HAND))
 
 
 def test_the_node_follows_a_server_and_opens_without_one(robot, tmp_path):
@@ -38,16 +40,16 @@ def test_the_node_follows_a_server_and_opens_without_one(robot, tmp_path):
     assert robot.beyond <= 0.0 and robot.strongest <= 1.0 + 1e-6
 
 
-def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(robot, tmp_path):
+def test_no_joint_leaves_its_limits_while_the_server_is_stopped_and_killed_and_started_again(loop, robot, tmp_path):
     bundles.save(policy(), tmp_path / "policy.safetensors")
     limits = congrasp.JointLimits.of_hand(HAND)
     robot.reset()
-    server = LOOP.Server(tmp_path / "policy.safetensors")
+    server = loop.Server(tmp_path / "policy.safetensors")
     try:
         client = congrasp.PolicyClient(server.url, hand=HAND.name, timeout=0.2, wait=SECONDS)
         client.metadata()
         with congrasp.Guard(client, limits, HAND.q_open, stale=0.1, hold=0.3, fallback="open") as guard:
-            grasps, ticker, counters = LOOP.Grasps(robot, guard, TASK), congrasp.Ticker(100.0), guard.counters
+            grasps, ticker, counters = loop.Grasps(robot, guard, TASK), congrasp.Ticker(100.0), guard.counters
 
             def step_until(done):
                 deadline = time.monotonic() + SECONDS
