@@ -350,7 +350,9 @@ def _check_units(fields: Mapping[str, np.ndarray]) -> None:
     """Raises a RefusedError for points in mm or cm, by their median, and for angles in degrees."""
     for name in ("surface_points", "cloud"):
         points = fields.get(name)
-        if points is not None and points.size and (size := np.median(np.abs(points - np.median(points, 0)))) > _SIZE:
+        if points is None or points.ndim != 2 or not points.size:
+            continue
+        if (size := np.median(np.abs(points - np.median(points, 0)))) > _SIZE:
             raise RefusedError(f"The field '{name}' has half of its points beyond {size:.3g} m.", "Give it in metres.")
     if (turn := np.abs(fields["q_initial"]).max(initial=0.0)) > _TURN:
         raise RefusedError(f"The field 'q' has an angle of {turn:.4g}.", "Give it in radians.")

@@ -114,7 +114,7 @@ def array_of(name: str, where: str, values: Mapping[str, Any], key: str, *shape:
     try:
         array = np.array(values[key], float)
     except (TypeError, ValueError):
-        raise Dropped(name, "wrong layout", f"'{key}' of {where} holds no numbers") from None
+        raise Dropped(name, "wrong layout", f"'{key}' of {where} holds no numbers of one shape") from None
     known = [size for size in shape if isinstance(size, int)]
     if len(known) == len(shape) and array.size == math.prod(known):
         return array.reshape(known)
