@@ -13,7 +13,7 @@ import stat
 import unicodedata
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -68,16 +68,16 @@ def safe_name(text: str) -> str:
     return safe or "object"
 
 
-def distinct_names(names: Iterable[str]) -> list[str]:
-    """Returns the names, with a number at each that repeats one (in upper or lower case), such as mug-2."""
+def distinct_names(names: Iterable[str], key: Callable[[str], str] = str.casefold) -> list[str]:
+    """Returns the names, with a number at each whose `key` repeats one's (in upper or lower case), such as mug-2."""
     names = list(names)
-    taken, given = {name.casefold() for name in names}, list[str]()
+    taken, given = {key(name) for name in names}, list[str]()
     used = set[str]()
     for name in names:
         free, number = name, 2
-        while free.casefold() in used or (free != name and free.casefold() in taken):
+        while key(free) in used or (free != name and key(free) in taken):
             free, number = f"{name}-{number}", number + 1
-        used.add(free.casefold())
+        used.add(key(free))
         given.append(free)
     return given
 

@@ -29,7 +29,10 @@ _NO_PLACE = re.compile(
     r"(?:.* )?(?:[vawfnre]|(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*)"
 )
 _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.*")  # first word without a body
-_TIME = re.compile(r"t(?: ?\[.*|_m?s)?|(?:.*[\W_])?(?:time|timestamp|stamp|secs?|seconds)(?:[\W_].*)?")
+_TIME = re.compile(
+    r"(?:.*[.%])?(?:t|time|(?:time[_ ]?)?stamp|secs?|seconds?)(?: ?\[.*|[_ ](?:[mnuµ]?s|secs?|seconds?))?"
+)
+_JITTER = 1e-3  # of a file's time so far, by which it may fall
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
@@ -173,7 +176,7 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         header names no position or quaternion, or several, quaternions are not of length one, or its time runs back.
     """
     columns, width, metres, named, titled, mark = list(range(7)), 7, 1.0, False, False, ""
-    clock, last = None, -np.inf
+    clock, first, last = None, np.inf, -np.inf
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
@@ -207,10 +210,11 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
             if len(cells) < width or any(cells[width:]) or len(row) < 7:
                 raise ValueError(f"is not {width} finite numbers")
             now = None if clock is None else _number(cells[clock])
-            if now is not None and now < last:
-                advice = "Sort the lines by time, and cut the file to one motion."
-                raise ValueError("is earlier than the line before")
-            last = last if now is None else now
+            if now is not None:
+                if last - now > _JITTER * (last - first):
+                    advice = "Sort the lines by time, and cut the file to one motion."
+                    raise ValueError("is earlier than one before")
+                first, last = min(first, now), max(last, now)
         except (ValueError, csv.Error) as error:
             what = f"cannot be read: {error}" if isinstance(error, csv.Error) else error
             raise CongraspError(f"line {number} of {path} {what}.", advice) from None

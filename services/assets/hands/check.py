@@ -37,6 +37,7 @@ _APART = 0.03, 0.06  # distance of a finger's first joint from the palm, m: limi
 _REACH = 2.5, 4.0  # distance of the hand centre from the wrist in finger lengths: limits for doubt and failure
 _STAYS = 0.01  # least displacement of a fingertip by a closing joint, m
 _ALONG = -0.1, -0.3  # cosine between a closing fingertip's motion and its opponent: limits for doubt and failure
+_PARALLEL = 0.2  # of a follower's turn: turn of its link in the palm's frame below which that is a parallel pad
 _GAP = 0.3, 0.5  # shares of the opening to which the fingertips close
 _FITTING = 0.9, 0.6  # shares of the objects spanned by the opening
 _CARRIED = 2.0, 1.0  # weights of a median object that friction carries
@@ -173,7 +174,7 @@ def _joints(hand: Hand) -> list[Finding]:
             "close further: increase the angles of closed_pose, and turn the thumb towards the fingers in open_pose",
         )
     ]
-    followers = {coupling.joint for coupling in hand.couplings}
+    leaders = {coupling.joint: coupling.leader for coupling in hand.couplings}
     moved = 0
     for j, joint in enumerate(hand.joints):
         finger = int(hand.link_fingers[hand.joint_links[j]])
@@ -182,15 +183,16 @@ def _joints(hand: Hand) -> list[Finding]:
             continue
         moved += 1
         if (verdict := _verdict(cosine, *_ALONG)) != "passed":
-            limit, follows = hand.lower[j] if way[j] > 0 else hand.upper[j], joint.name in followers
+            limit = hand.lower[j] if way[j] > 0 else hand.upper[j]
+            parallel = joint.name in leaders and _keeps_parallel(hand, j, leaders)
             found.append(
                 Finding(
                     "joint",
-                    "doubt" if follows else verdict,
+                    "doubt" if parallel else verdict,
                     f"closing '{joint.name}' moves the tip of '{hand.fingers[finger]}' {100 * path:.1f} cm, at a "
                     f"cosine of {cosine:.2f} to its opponent",
-                    "change its ratio or its leader in couplings, unless it keeps a pad parallel"
-                    if follows
+                    "change its ratio or its leader in couplings" + ", unless it keeps a pad parallel" * parallel
+                    if joint.name in leaders
                     else f"turn its axis, or close it towards {limit:.2f} in closed_pose; omit it if it spreads",
                 )
             )
@@ -199,6 +201,18 @@ def _joints(hand: Hand) -> list[Finding]:
     elif len(found) == 1:
         found.append(Finding("joints", "passed", f"each of the {moved} that close brings its fingertip nearer"))
     return found
+
+
+def _keeps_parallel(hand: Hand, follower: int, leaders: dict[str, str]) -> bool:
+    """True if the turns of the joints with a follower's leader, up to its link, cancel, as those of a parallel pad."""
+    way, leader = hand.q_closed - hand.q_open, leaders[hand.joints[follower].name]
+    chain = chain_of(hand, hand.links[hand.joint_links[follower]].name)
+    turns = [
+        way[j] * np.array(joint.axis)
+        for j, joint in enumerate(hand.joints)
+        if hand.links[hand.joint_links[j]].name in chain and leaders.get(joint.name, joint.name) == leader
+    ]
+    return bool(np.linalg.norm(np.sum(turns, axis=0)) < _PARALLEL * abs(way[follower]))
 
 
 def _approach(hand: Hand, joint: int, finger: int) -> tuple[float, float]:

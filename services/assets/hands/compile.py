@@ -36,8 +36,8 @@ LEAST = 1e-3, 1e-7
 _BALL = 0.4 * 0.02**2  # kg m2 for each kg: inertia of a ball with the radius of a finger link
 _KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar", "spherical")
 _INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-_DECIMAL = re.compile(r"(?<!\S)[-+]?\d+\.?\d*(?!\S)")
-_TURN = 7.0  # rad, largest angle of a joint's frame
+_DECIMAL = re.compile(r"(?<!\S)[-+]?\d+(?:\.\d*)?(?!\S)")
+_TURN, _RIGHT = 7.0, math.pi / 2  # rad, largest angle of a joint's frame, but for multiples of a right one
 _FLAT = 1e-6  # of a mesh's length: thickness below which it has no hull
 _START = 30  # s, for the child's imports on a busy machine
 _MOST_FILES = 300  # that a description names
@@ -261,13 +261,13 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
             else:
                 raise
     if missing:
-        notes.append(_missing(missing))
+        notes.append(_missing("not found", missing))
     if bounded:
         light, thin = model.body_mass == LEAST[0], (model.body_inertia == LEAST[1]).any(1)
         given = (light, f"mass get {1e3 * LEAST[0]:g} g"), (thin & ~light, f"inertia get {1e6 * LEAST[1]:g} kg.mm²")
         for links, text in given:
             if names := ", ".join(model.body(i).name for i in np.flatnonzero(links)):
-                notes.append(f"links without {text} ('<inertial>' in the file): {names}")
+                notes.append(f"links without {text} ('<inertial>' in the file), as do those with less: {names}")
     return model
 
 
@@ -312,7 +312,8 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     if robot.find("link") is not None and all(link.get("name") in children for link in robot.findall("link")):
         raise _Known("its links form a loop, and none is the root. Remove the joint that closes it")
     _complete_inertias(robot, notes)
-    assets, shared, lacking = dict[str, bytes](), dict[tuple[pathlib.Path | None, str], str](), dict[str, None]()
+    assets, shared = dict[str, bytes](), dict[tuple[pathlib.Path | None, str], str]()
+    lacking = dict[str, dict[str, None]]()  # by the reason
     for link in robot.iter("link"):
         for i, shape in enumerate((*link.findall("visual"), *link.findall("collision"))):
             shape.set("name", f"shape {i} of {link.get('name')}")  # for errors; those of the file may be equal
@@ -320,16 +321,15 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
                 file = _mesh_file(path, mesh.get("filename", ""))
                 used = file, mesh.get("scale", "")  # MuJoCo shares a mesh among shapes of one name and scale
                 if used not in shared:
-                    content, kind = _readable(file) if file else (b"", "")
-                    shared[used] = f"{len(assets)}.{kind}" if content else ""
+                    content, kind = _readable(file) if file else (b"", "not found")
+                    shared[used] = f"{len(assets)}.{kind}" if content else kind
                     assets |= {shared[used]: content} if content else {}
-                if not shared[used]:
-                    lacking[mesh.get("filename", "")] = None
+                if shared[used] not in assets:
+                    lacking.setdefault(shared[used], {})[mesh.get("filename", "")] = None
                     link.remove(shape)
                     break
                 mesh.set("filename", shared[used])
-    if lacking:
-        notes.append(_missing(list(lacking)))
+    notes += [_missing(why, list(files)) for why, files in lacking.items()]
     return mujoco.MjSpec.from_string(ET.tostring(robot, "unicode"), assets=assets)
 
 
@@ -342,7 +342,7 @@ def _check_joints(robot: ET.Element, notes: list[str]) -> None:
     kinds = {joint.get("name"): joint.get("type") for joint in robot.findall("joint")}
     for joint in robot.findall("joint"):
         for angle in (x for origin in joint.findall("origin") for x in _DECIMAL.findall(origin.get("rpy", ""))):
-            if abs(float(angle)) > _TURN:
+            if abs(float(angle)) > _TURN and not (float(angle) + 1e-3) % _RIGHT < 2e-3:
                 raise _Known(f"rpy of the joint '{joint.get('name', '')}' has {angle}. Write radians, not degrees")
         name, limit, mimic = joint.get("name", ""), joint.find("limit"), joint.find("mimic")
         if (kind := joint.get("type", "")) not in _KINDS:
@@ -373,7 +373,7 @@ def _check_joints(robot: ET.Element, notes: list[str]) -> None:
 
 def _complete_inertias(robot: ET.Element, notes: list[str]) -> None:
     """Removes repeated inertials and those without mass; adds the elements of inertia that MuJoCo requires."""
-    guessed, weightless = list[str](), list[str]()
+    guessed, raised, weightless = list[str](), list[str](), list[str]()
     for link in robot.findall("link"):
         found = link.findall("inertial")
         for inertial in found[1:]:
@@ -389,13 +389,21 @@ def _complete_inertias(robot: ET.Element, notes: list[str]) -> None:
             raise _Known(f"the mass of the link '{link.get('name', '')[:40]}' is {weight:g}, below zero. Correct it")
         inertia = found[0].find("inertia")
         inertia = ET.SubElement(found[0], "inertia") if inertia is None else inertia
-        if weight and not all(_value(inertia, name, link) for name in _INERTIA[:3]):
+        given = [value for name in _INERTIA[:3] if (value := _value(inertia, name, link))]
+        if weight and len(given) < 2:
             inertia.attrib = dict.fromkeys(_INERTIA[:3], str(_BALL * weight))
             guessed.append(link.get("name", ""))
+        elif weight and len(given) == 2:  # an axis has at least the difference of the others
+            zero = next(name for name in _INERTIA[:3] if not _value(inertia, name, link))
+            inertia.set(zero, str(abs(given[0] - given[1]) + min(LEAST[1], *given)))
+            raised.append(link.get("name", ""))
         for name in _INERTIA:
             inertia.set(name, str(_value(inertia, name, link)))
     if guessed:
-        notes.append(f"links without '<inertia>' get that of a ball of their mass, 4 cm wide: {', '.join(guessed)}")
+        what = "links with one axis of inertia or without '<inertia>'"
+        notes.append(f"{what} get that of a ball of their mass, 4 cm wide: {', '.join(guessed)}")
+    if raised:
+        notes.append(f"links with inertia about two axes get the least possible about the third: {', '.join(raised)}")
     if weightless:
         notes.append(f"'<inertial>' without mass, which follows from the link's shapes: {', '.join(weightless)}")
 
@@ -431,29 +439,34 @@ def _there(path: pathlib.Path) -> pathlib.Path | None:
 
 
 def _readable(file: pathlib.Path) -> tuple[bytes, str]:
-    """Content of a mesh in a format that MuJoCo reads, and its suffix; nothing if it cannot be read."""
+    """Content of a mesh in a format that MuJoCo reads, and its suffix; or nothing, and the reason."""
     suffix = file.suffix.lower()
     if file.stat().st_size > MAX_FILE:
-        return b"", ""
+        return b"", f"larger than {MAX_FILE >> 20} MB"
     if suffix == ".msh":
         return file.read_bytes(), "msh"
     try:
         known = suffix in SUFFIXES
-        scene = trimesh.Scene(load_geometry(file, "", skip_materials=True)) if known else trimesh.load_scene(file)
-        # COLLADA states its unit. Its upward axis is ignored, as in ROS.
-        mesh = (scene.convert_units("meters") if suffix == ".dae" else scene).to_mesh()
+        loaded: Any = load_geometry(file, "", skip_materials=True) if known else trimesh.load_scene(file)
+        if cloud := isinstance(loaded, trimesh.PointCloud):
+            mesh = trimesh.Trimesh(loaded.vertices, process=False)
+        else:
+            # COLLADA states its unit. Its upward axis is ignored, as in ROS.
+            mesh = (loaded.convert_units("meters") if suffix == ".dae" else trimesh.Scene(loaded)).to_mesh()
+        if not (cloud or len(mesh.faces)):
+            return b"", "without faces"
         if len(mesh.faces) > _FACES:
             mesh.merge_vertices()
             mesh = mesh.simplify_quadric_decimation(face_count=_FEWER_FACES)
         spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(0), compute_uv=False)
-        if spread[2] < _FLAT * spread[0]:  # MuJoCo would refuse the whole file
-            return b"", ""
-        return trimesh.exchange.stl.export_stl(mesh), "stl"
+        if spread[-1] <= _FLAT * spread[0]:  # MuJoCo would refuse the whole file
+            return b"", "flat"
+        return trimesh.exchange.stl.export_stl(mesh.convex_hull if cloud else mesh), "stl"
     except Exception:  # readers of many formats raise arbitrary errors
-        return b"", ""
+        return b"", "not readable"
 
 
-def _missing(files: list[str]) -> str:
-    """Note on missing files."""
+def _missing(why: str, files: list[str]) -> str:
+    """Note on files that are left out."""
     some = ", ".join(files[:5]) + (f" and {len(files) - 5} more" if len(files) > 5 else "")
-    return f"not found or not readable, results without them are approximate: {some}"
+    return f"{why}, results without them are approximate: {some}"

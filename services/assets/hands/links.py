@@ -8,6 +8,7 @@ its collision shapes, else for its visual shapes, else for its inertia; and a vi
 import dataclasses
 import re
 from collections import Counter
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import mujoco
@@ -66,6 +67,12 @@ def identifier(name: str, other: str) -> str:
     return re.sub(r"\W+", "_", name).strip("_") or other
 
 
+def renamed(kind: str, before: Iterable[str], after: Iterable[str]) -> list[str]:
+    """Returns a note on names that changed because others have them, if there are any."""
+    changed = ", ".join(f"{old} -> {new}" for old, new in zip(before, after, strict=True) if old != new)
+    return [f"{kind} renamed, as others have their names: {changed}"] if changed else []
+
+
 def hinges(model: mujoco.MjModel, body: int) -> list[int]:
     """Indices of a body's joints."""
     start, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
@@ -110,8 +117,9 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
         if link != palm and depth[link] > depth.get(last.get(root[link], palm), 0):
             last[root[link]] = link
     called = ["palm", *(identifier(names[link], f"body_{link}") for link in groups if link != palm)]
-    numbered = dict(zip(groups, distinct_names(called), strict=True))
-    return Tree(model, data, palm, groups, owner, tuple(last.values()), numbered)
+    numbered = distinct_names(called, str)
+    notes += renamed("links", called, numbered)
+    return Tree(model, data, palm, groups, owner, tuple(last.values()), dict(zip(groups, numbered, strict=True)))
 
 
 def _to_palm(data: mujoco.MjData, palm: int) -> None:

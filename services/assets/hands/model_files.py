@@ -30,6 +30,7 @@ from congrasp.services.assets.hands.links import (
     inertia_boxes,
     link_mesh,
     placed,
+    renamed,
     solids_of,
 )
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
@@ -244,7 +245,7 @@ def _links(tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]) ->
         carried = [at[x] for x in tree.groups if x != tree.palm and tree.above(x) == link]
         shapes[link] = fit_capsules(np.array(found or bare(at[link], *carried)))
     tips = {link: far_end(shapes[link], at[link]) for link in tree.ends}
-    joints = _joint_names(tree)
+    joints = _joint_names(tree, notes)
     drive = Drive(tree.model, tree.data, joints, _levers(tree, tips))
     links = []
     for link, bodies in tree.groups.items():
@@ -278,11 +279,12 @@ def _meshes(tree: Tree, notes: list[str]) -> Meshes:
     return {name: mesh for name, mesh in drawn.items() if name not in large}
 
 
-def _joint_names(tree: Tree) -> dict[int, str]:
+def _joint_names(tree: Tree, notes: list[str]) -> dict[int, str]:
     """Names of the hand's joints in its order, distinct from those of links."""
     names = {j: identifier(tree.model.joint(j).name, f"joint_{j}") for link in tree.groups for j in tree.joints(link)}
     taken = {*tree.names.values()} | TAKEN_JOINTS
-    named = distinct_names(f"{name}_joint" if name in taken else name for name in names.values())
+    named = distinct_names((f"{name}_joint" if name in taken else name for name in names.values()), str)
+    notes += renamed("joints", names.values(), named)
     return dict(zip(names, named, strict=True))
 
 

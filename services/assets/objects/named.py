@@ -236,7 +236,8 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
     if not meshes:
         found = [source for folder in sorted(path.iterdir()) if folder.is_dir() for source in _nested(folder)]
         if not found:
-            if deeper := next((file for file in sorted(path.glob("*/*/*")) if file.suffix.lower() in SUFFIXES), None):
+            files = (file for depth in ("*/*/*", "*/*/*/*") for file in sorted(path.glob(depth)))
+            if deeper := next((file for file in files if _shows(file.relative_to(path)) and file.is_file()), None):
                 fault = f"The folder {path} holds meshes deeper inside alone, such as {deeper}."
                 raise CongraspError(fault, "Name the folders in which they are.")
             raise CongraspError(f"The folder {path} holds no STL, OBJ, PLY or GLB file.", CONVERT)
@@ -252,7 +253,12 @@ def distinct(sources: Sequence[Source]) -> list[Source]:
 
 def _meshes_in(folder: pathlib.Path) -> list[pathlib.Path]:
     """The meshes directly in a folder, without hidden files, such as those that macOS adds."""
-    return sorted(x for x in folder.iterdir() if x.suffix.lower() in SUFFIXES and not x.name.startswith("."))
+    return sorted(file for file in folder.iterdir() if _shows(file.relative_to(folder)))
+
+
+def _shows(path: pathlib.Path) -> bool:
+    """True for a mesh's path without hidden parts."""
+    return path.suffix.lower() in SUFFIXES and not any(part.startswith((".", "__MACOSX")) for part in path.parts)
 
 
 def _nested(folder: pathlib.Path) -> list[Source]:

@@ -181,6 +181,10 @@ def test_a_header_without_one_position_and_one_quaternion_is_refused(tmp_path, h
         ("Format Version,1.23,Length Units,Millimeters\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0", "line 1 of .*export z up"),
         ("Rotation,,,,Position,,\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0", "line 2 of .* names columns twice below another"),
         (f"t,{ROS}\n0.0,0,0,0,0,0,0,1\n0.1,0,0,1,0,0,0,1\n0.1,0,0,2,0,0,0,1\n0,0,0,3,0,0,0,1", "line 5 .*earlier"),
+        *(
+            (f"{clock},{ROS}\n2,0,0,0,0,0,0,1\n1,0,0,1,0,0,0,1", "line 3 .*earlier")
+            for clock in ("Time (s)", "%time", "timestamp_ns", "timeStamp", "t_ms", "seconds", "stamp.sec")
+        ),
         (f"header.stamp.secs,{ROS}\n-1,0,0,0,0,0,0,1\n-2,0,0,1,0,0,0,1", "line 3 of .* is earlier .*Sort the lines"),
         ("a" + "[ " * 300 + "_" * 40_000 + "\n", "has no numbers"),
     ],
@@ -189,6 +193,19 @@ def test_lines_that_could_be_misread_are_refused(tmp_path, text, complaint):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(CongraspError, match=complaint):
         read_wrist_path(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    "name",
+    (
+        *("delta_time", "deltaTime", "frame_time", "exposure_time", "latency_seconds", "time_offset"),
+        *("time_to_contact", "time_left", "header.stamp.nanosec"),
+    ),
+)
+def test_a_column_that_may_fall_is_no_clock(tmp_path, name):
+    lines = [f"{9 - i},{t},0,0,0,0,0,0,1" for i, t in enumerate((0.0, 1.0, 0.9995))]  # the last is jitter
+    (tmp_path / "a.csv").write_text("\n".join([f"{name},header.stamp.sec,{ROS}", *lines]))
+    assert len(read_wrist_path(tmp_path / "a.csv").position) == 3
 
 
 def test_another_wrist_frame_is_converted(tmp_path):

@@ -63,13 +63,21 @@ def test_a_reversed_axis_is_found_and_named():
     assert "axis" in lines["joint"].remedy and "closed_pose" in lines["joint"].remedy
 
 
-def test_a_follower_that_opens_as_a_parallel_pad_does_is_a_doubt():
+@pytest.mark.parametrize(("ratio", "verdict"), [(-1.0, "doubt"), (-0.5, "failed")])
+def test_a_follower_that_opens_is_a_doubt_if_it_keeps_its_pad_parallel(ratio, verdict):
     pose = {name: angle for name, angle in CLAW.closed_pose.items() if name != "opposing_middle"}
     opened = {name: angle for name, angle in CLAW.open_pose.items() if name != "opposing_middle"}
-    follows = (Coupling("opposing_middle", "opposing_root", -0.5, 0.0),)
+    follows = (Coupling("opposing_middle", "opposing_root", ratio, 0.0),)
     hand = dataclasses.replace(CLAW, couplings=follows, open_pose=opened, closed_pose=pose)
     (finding,) = (one for one in check._joints(hand) if one.check == "joint")
-    assert finding.verdict == "doubt" and "'opposing_middle'" in finding.measured and "parallel" in finding.remedy
+    assert finding.verdict == verdict and "'opposing_middle'" in finding.measured
+    assert ("parallel" in finding.remedy) == (verdict == "doubt")
+
+
+def test_both_pads_of_a_gripper_of_one_motor_stay_parallel():
+    hand = propose(pathlib.Path(__file__).parents[3] / "hands" / "pincher.urdf").hand
+    found = {one.measured.split("'")[1]: one.verdict for one in check._joints(hand) if one.check == "joint"}
+    assert found == {"left_parallel": "doubt", "right_parallel": "doubt"}
 
 
 def moved(vector, by):

@@ -1,6 +1,8 @@
 """Hands of one's own: from URDF and MJCF to a file, and from the file to everywhere."""
 
+import itertools
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -10,10 +12,12 @@ from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.meshes import MAX_FACES
 from congrasp.common.hands.mjcf import add_hand
+from congrasp.services.assets.hands import compile
 from congrasp.services.assets.hands.model_files import Choices, describe, propose
 from congrasp.services.cli import main
 
 HANDS = pathlib.Path(__file__).parents[3] / "hands"
+PINCH = HANDS.parent / "cases" / "_hand"
 ENDS = {"left_root": -0.96, "left_middle": -1.28, "opposing_root": 0.96, "opposing_middle": 1.28}
 
 
@@ -109,6 +113,30 @@ def test_the_commands_import_list_and_draw(tmp_path, capsys):
     assert main.run(["hands", "list"]) == 0
     said = capsys.readouterr().out
     assert all(name in said for name in ("human", "allegro", "sharpa", "gripper", "CONGRASP_MANO"))
+
+
+def test_long_numbers_are_searched_in_linear_time():
+    assert not compile._DECIMAL.findall("1" * 1_000_000 + "x")
+
+
+def test_a_zero_axis_of_inertia_gets_the_least_and_keeps_the_others(tmp_path):
+    inertia = '<inertia ixx="2e-5" iyy="0" izz="3e-5"/>'
+    text = re.sub("<inertia [^>]*>", inertia, (PINCH / "pinch.urdf").read_text(), count=1)
+    (tmp_path / "hand.urdf").write_text(text)
+    notes = []
+    _, model = compile.robot_spec(tmp_path / "hand.urdf", notes)
+    np.testing.assert_allclose(model.body("palm").inertia, [3e-5, 2e-5, 1.01e-5])
+    assert notes == ["links with inertia about two axes get the least possible about the third: palm"]
+
+
+def test_an_obj_of_points_is_a_hull(tmp_path):
+    text = (PINCH / "pinch.urdf").read_text()
+    (tmp_path / "hand.urdf").write_text(text.replace('<box size="0.06 0.1 0.03"/>', '<mesh filename="points.obj"/>'))
+    corners = itertools.product((-0.03, 0.03), (-0.05, 0.05), (0.0, 0.03))
+    (tmp_path / "points.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners))
+    notes = []
+    _, model = compile.robot_spec(tmp_path / "hand.urdf", notes)
+    assert not notes and model.nmesh == 1 and model.nmeshvert == 8
 
 
 def test_a_link_of_many_parts_is_drawn_by_a_coarse_hull(tmp_path):

@@ -24,6 +24,16 @@ def test_other_text_is_a_path(tmp_path, monkeypatch, text):
         objects_at(pathlib.Path(text))
 
 
+def test_meshes_deeper_inside_are_named_without_hidden_ones(tmp_path):
+    folder = tmp_path / "sets"
+    for file in ("syn/.git/x.obj", "syn/__MACOSX/x.obj", "syn/a/._x.obj", "syn/id/models/model_normalized.obj"):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    (folder / "syn" / "a" / "folder.obj").mkdir()
+    with pytest.raises(CongraspError, match=r"deeper inside alone, such as \S+/syn/id/models/model_normalized\.obj\. "):
+        objects_at(folder)
+
+
 def test_a_family_that_does_not_exist_is_named():
     with pytest.raises(CongraspError, match="mugg"):
         objects_at(pathlib.Path("mugg:7"))
