@@ -456,7 +456,7 @@ def _readable(file: pathlib.Path) -> tuple[bytes, str]:
         if not (cloud or len(mesh.faces)):
             return b"", "without faces"
         if len(mesh.faces) > _FACES:
-            mesh.merge_vertices()
+            mesh.merge_vertices(merge_tex=True, merge_norm=True)
             mesh = mesh.simplify_quadric_decimation(face_count=_FEWER_FACES)
         spread = np.linalg.svd(mesh.vertices - mesh.vertices.mean(0), compute_uv=False)
         if spread[-1] <= _FLAT * spread[0]:  # MuJoCo would refuse the whole file

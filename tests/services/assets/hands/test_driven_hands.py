@@ -200,8 +200,13 @@ def test_a_fine_mesh_is_simplified(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["stl", "obj"])
 def test_a_mesh_of_many_triangles_keeps_its_shape(suffix, tmp_path):
-    """81,920 triangles, which are merged at their corners and reduced before MuJoCo reads them."""
-    trimesh.creation.icosphere(6, 0.009).export(tmp_path / f"pad.{suffix}")
+    """81,920 triangles, which are merged at their corners, also where a texture is cut, and reduced for MuJoCo."""
+    ball = trimesh.creation.icosphere(6, 0.009)
+    if suffix == "obj":
+        ball.unmerge_vertices()
+        cut = np.random.default_rng(0).random((len(ball.vertices), 2))
+        ball.visual = trimesh.visual.TextureVisuals(uv=cut)
+    ball.export(tmp_path / f"pad.{suffix}")
     text = (HANDS / "claw.urdf").read_text().replace('<sphere radius="0.009"/>', f'<mesh filename="pad.{suffix}"/>')
     (tmp_path / "claw.urdf").write_text(text)
     drawn = trimesh.Trimesh(*propose(tmp_path / "claw.urdf").meshes["left_upper"])
