@@ -7,6 +7,7 @@ colours of the files are sampled at points of their surface.
 
 import array
 import io
+import itertools
 import pathlib
 import re
 import tomllib
@@ -25,7 +26,7 @@ from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.gltf import MAX_FACES, plain_glb
 from congrasp.services.assets.objects.options import Up
 from congrasp.services.assets.objects.ply import plain_ply
-from congrasp.services.assets.objects.polygons import cut_dented
+from congrasp.services.assets.objects.polygons import alike, cut_dented
 
 SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CONVERT = "Convert it to STL, OBJ, PLY or GLB."
@@ -360,17 +361,17 @@ def _cut_polygons(data: bytes, notes: list[str]) -> bytes:
     if any(len(row) < 3 for row in numbers):
         raise ValueError("a point has fewer than three numbers")
     points = np.array([_number(word) for row in numbers for word in row]).reshape(-1, 3)
-    rows = list(_POLYGON.finditer(data))
-    corners = [row[1].split() for row in rows]
+    corners = [row.split() for row in _POLYGON.findall(data)]
     polygons = [[int(corner.partition(b"/")[0]) - 1 for corner in some] for some in corners]
     if max(map(max, polygons)) >= len(points):
         return data  # which is an error of its own
-    ends, parts = 0, list[bytes]()
-    for i, triangles in sorted(cut_dented(points, polygons, notes).items()):
-        text = b"\n".join(b"f " + b" ".join(corners[i][k] for k in triangle) for triangle in triangles)
-        parts += [data[ends : rows[i].start()], text]
-        ends = rows[i].end()
-    return b"".join([*parts, data[ends:]])
+    groups = [some for _, some in alike(np.array([*map(len, polygons)]))]
+    cut = cut_dented(points, [np.array([polygons[i] for i in some]) for some in groups], notes)
+    text, place = dict[int, bytes](), itertools.count()
+    for some, found in zip(groups, cut, strict=True):
+        for i, triangles in ((some[k], found[k]) for k in found):
+            text[i] = b"\n".join(b"f " + b" ".join(corners[i][k] for k in triangle) for triangle in triangles)
+    return _POLYGON.sub(lambda row: text.get(next(place), row[0]), data)
 
 
 def _absolute(index: bytes, count: int) -> bytes:

@@ -3,27 +3,19 @@
 trimesh reads no binary files whose faces differ in their number of corners, which Blender and others write.
 """
 
-import itertools
-import re
 import struct
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from congrasp.services.assets.objects.polygons import cut_dented
+from congrasp.services.assets.objects.polygons import alike, cut_dented
 
-_HEADER = 1 << 16  # bytes
-_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
-_TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
-_TYPES |= {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
-_FACES = re.compile(rb"element[ ]+face[^\n]*\n(?:(?:property|comment)[^\n]*\n)*")
-_LINE = re.compile(rb"[^\r\n]*[^\s][^\r\n]*\r?\n?")
-
-
-def _size(kind: str) -> int:
-    """Bytes of a number of this type."""
-    return np.dtype(_TYPES[kind]).itemsize
+_HEADER, _MOST = 1 << 16, 1 << 29  # bytes of a header, and of the triangles of polygons
+_COUNT, _INDEX = "number of vertex_indices", "vertex_indices"  # the latter as trimesh names it
+_TYPES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
+_TYPES |= {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}
+_TYPES |= {"float32": "f", "float64": "d"}
 
 
 class _Element(NamedTuple):
@@ -33,10 +25,24 @@ class _Element(NamedTuple):
     rows: int
     properties: list[list[str]]
 
-    def least(self, is_text: bool) -> int:
-        """Least bytes of a row: a list has those of its length, a number of text two."""
-        types = (row[1] if row[0] == "list" else row[0] for row in self.properties)
-        return sum(2 if is_text else _size(kind) for kind in types)
+    def row(self, order: str, corners: int = 0) -> np.dtype:
+        """A row of a binary file whose lists have so many values, with "number of" each before it."""
+        fields = list[tuple]()
+        for *words, name in self.properties:
+            types = [order + _TYPES[word] for word in words if word != "list"]
+            fields += (
+                [(f"number of {name}", types[0]), (name, types[1], (corners,))] if types[1:] else [(name, types[0])]
+            )
+        return np.dtype(fields)
+
+    def packed(self, line: bytes) -> bytes:
+        """A row of text as one of a little-endian file."""
+        words, types = line.split(), ""
+        for i, (kind, *more) in enumerate(self.properties):
+            corners = min(max(int(float(words[i])), 0), len(words)) if kind == "list" else 0
+            types += _TYPES[more[0]] + corners * _TYPES[more[1]] if kind == "list" else _TYPES[kind]
+        values = (float(word) if kind in "fd" else int(float(word)) for kind, word in zip(types, words, strict=False))
+        return struct.pack(f"<{types}", *values)
 
 
 def plain_ply(data: bytes, notes: list[str]) -> bytes:
@@ -49,99 +55,96 @@ def plain_ply(data: bytes, notes: list[str]) -> bytes:
     header, end, _ = data[:_HEADER].partition(b"end_header")
     if not end:
         raise ValueError(f"its header does not end within {_HEADER} bytes")
-    is_text, elements = b"ascii" in header, list[_Element]()
-    for line in header.decode("latin-1").splitlines():
+    lines, kind, elements = [line.decode("latin-1") for line in header.splitlines()], "", list[_Element]()
+    for line in lines:
         match line.split():
+            case ["format", kind, *_]:
+                pass
             case ["element", "tristrips", count] if int(count):
                 raise ValueError("its triangles are strips, which MeshLab opens and exports as faces")
             case ["element", name, count]:
                 elements.append(_Element(name, int(count), []))
             case ["property", *words]:
                 elements[-1].properties.append(words)
+    least = 0
     for element in elements:
         if element.rows < 0 or (element.rows and not element.properties):
             raise ValueError(f"it announces an element of {element.rows} rows without values")
-    if sum(element.rows * element.least(is_text) for element in elements) > len(data):
+        least += element.rows * (2 * len(element.properties) if kind == "ascii" else element.row("<").itemsize)
+    if least > len(data):
         raise ValueError(f"it announces {max(x.rows for x in elements)} rows, but has {len(data)} bytes")
-    if [element.name for element in elements[:2]] != ["vertex", "face"]:
-        return data
-    vertex, face = elements[:2]
-    lists = [row[0] == "list" for row in face.properties]
-    if sum(lists) != 1 or any(row[0] == "list" for row in vertex.properties):
-        return data
-    start = data.index(b"\n", len(header)) + 1
-    read = (_text_rows if is_text else _binary_rows)(data, start, vertex, face, lists.index(True))
-    if read is None or max(itertools.chain(*read.polygons)) >= len(read.points):  # the latter is an error of its own
-        return data
-    large = [i for i, polygon in enumerate(read.polygons) if len(polygon) > 3]
-    cut = cut_dented(read.points, [read.polygons[i] for i in large], notes)
-    ears = dict(zip(large, map(cut.get, range(len(large))), strict=True))
-    triangles = list[list[int]]()
-    for i, polygon in enumerate(read.polygons):
-        fan = [[0, k, k + 1] for k in range(1, len(polygon) - 1)]
-        triangles += [[polygon[k] for k in triangle] for triangle in ears.get(i) or fan]
-    rows = b"".join(b"3 %d %d %d\n" % tuple(row) for row in triangles)
-    if not is_text:
-        rows = _packed(triangles, _order(header))
-    faces = f"element face {len(triangles)}\nproperty list uchar int vertex_indices\n".encode()
-    return _FACES.sub(faces, data[:start], count=1) + data[start : read.first] + rows + data[read.end :]
+    body = data[data.index(b"\n", len(header)) + 1 :]
+    match elements:
+        case [_Element("vertex") as vertex, _Element("face") as face, *_] if face.rows:
+            try:
+                return _plain(body, kind, [x for x in lines if x.startswith("comment")], vertex, face, notes) or data
+            except struct.error:
+                raise ValueError("a row lacks values that its header announces, or has others") from None
+    return data
 
 
-def _order(header: bytes) -> str:
-    return ">" if b"big_endian" in header else "<"
+def _plain(
+    body: bytes, kind: str, comments: list[str], vertex: _Element, face: _Element, notes: list[str]
+) -> bytes | None:
+    """The file with triangles for the polygons of its body; None if it has only triangles, or several lists.
 
-
-def _packed(triangles: list[list[int]], order: str) -> bytes:
-    """Rows of a binary file."""
-    rows = np.empty(len(triangles), [("count", "u1"), ("corners", f"{order}i4", 3)])
-    rows["count"], rows["corners"] = 3, triangles
-    return rows.tobytes()
-
-
-class _Rows(NamedTuple):
-    """The faces of a file that has other polygons than triangles."""
-
-    polygons: Sequence[Sequence[int]]
-    points: np.ndarray
-    """(V, 3)."""
-    first: int
-    """Place of the first face in the file."""
-    end: int
-
-
-def _text_rows(data: bytes, start: int, vertex: _Element, face: _Element, place: int) -> _Rows | None:
-    """The faces of a text file, with their list at a place in the row; None if they are triangles."""
-    simple = data[start:].split(b"\n")[vertex.rows : vertex.rows + face.rows]
-    if place == 0 and all(row.startswith(b"3 ") for row in simple):
+    Also for a corner without a point, which is an error of its own.
+    """
+    lists = [i for i, words in enumerate(face.properties) if words[0] == "list"]
+    if len(lists) != 1 or any(words[0] == "list" for words in vertex.properties):
         return None
-    lines = list(itertools.islice(_LINE.finditer(data, start), vertex.rows + face.rows))
-    words = [row[0].split() for row in lines[vertex.rows :]]
-    columns = [[row[-1] for row in vertex.properties].index(axis) for axis in "xyz"]
-    corners = (row[0].split() for row in lines[: vertex.rows])
-    points = np.array([[float(row[k]) for k in columns] for row in corners])
-    polygons = [[*map(int, row[place + 1 : place + 1 + int(row[place])])] for row in words]
-    return _Rows(polygons, points, lines[vertex.rows].start(), lines[-1].end())
-
-
-def _binary_rows(data: bytes, start: int, vertex: _Element, face: _Element, place: int) -> _Rows | None:
-    """Those of a binary file."""
-    order = _order(data[:start])
-    row = np.dtype([(words[-1], order + _TYPES[words[0]]) for words in vertex.properties])
-    count, index = (np.dtype(order + _TYPES[word]) for word in face.properties[place][1:3])
-    before, after = (
-        sum(_size(words[0]) for words in some) for some in (face.properties[:place], face.properties[place + 1 :])
-    )
-    first = at = start + vertex.rows * row.itemsize
-    width = before + count.itemsize + 3 * index.itemsize + after
-    if first + face.rows * width <= len(data):
-        counts = np.ndarray(face.rows, count, data, first + before, (width,))
-        if (counts == 3).all():
+    if kind == "ascii":
+        lines = [line for line in body.splitlines() if line.strip()][: vertex.rows + face.rows]
+        if all(float(line.split()[lists[0]]) == 3 for line in lines[vertex.rows :]):
             return None
-    corners = np.frombuffer(data, row, vertex.rows, start)
-    polygons = list[Sequence[int]]()
-    for _ in range(face.rows):
-        (corners_of,) = struct.unpack_from(order + count.char, data, at + before)
-        at += before + count.itemsize
-        polygons.append(struct.unpack_from(f"{order}{corners_of}{index.char}", data, at))
-        at += corners_of * index.itemsize + after
-    return _Rows(polygons, np.stack([corners[axis] for axis in "xyz"], -1).astype(float), first, at)
+        kind, face.properties[lists[0]][1:3] = "binary_little_endian", ["int", "int"]
+        body = b"".join((vertex if i < vertex.rows else face).packed(line) for i, line in enumerate(lines))
+    order, face.properties[lists[0]][3:] = ">" if kind == "binary_big_endian" else "<", [_INDEX]
+    values = np.ndarray(vertex.rows, vertex.row(order), body)
+    tables = _tables(body, values.nbytes, face, order)
+    corners = [table[_INDEX].astype(int) for table in tables]
+    if all(some.shape[1] == 3 for some in corners) or any(x.min() < 0 or x.max() >= vertex.rows for x in corners):
+        return None
+    count = sum(len(some) * (some.shape[1] - 2) for some in corners)
+    if count * face.row(order, 3).itemsize > _MOST:
+        raise ValueError(f"the triangles of its polygons take more than {_MOST >> 20} MB")
+    cut = cut_dented(np.stack([values[axis] for axis in "xyz"], -1).astype(float), corners, notes)
+    header = [f"ply\nformat {kind} 1.0", *comments]
+    for element in (vertex, face._replace(rows=count)):
+        header += [f"element {element.name} {element.rows}", *(" ".join(["property", *x]) for x in element.properties)]
+    parts = ["\n".join([*header, "end_header\n"]).encode("latin-1"), body[: values.nbytes]]
+    for table, some, dented in zip(tables, corners, cut, strict=True):
+        places = np.tile([[0, k, k + 1] for k in range(1, some.shape[1] - 1)], (len(some), 1, 1))
+        for i, triangles in dented.items():
+            places[i] = triangles
+        rows = np.empty(places.shape[:2], face.row(order, 3))
+        for name in table.dtype.names or ():
+            rows[name] = table[name][:, None] if name != _INDEX else np.take_along_axis(some[:, None], places, 2)
+        rows[_COUNT] = 3
+        parts.append(rows.tobytes())
+    return b"".join(parts)
+
+
+def _tables(body: bytes, start: int, face: _Element, order: str) -> list[np.ndarray]:
+    """Rows (m,) of the faces with three corners, with four and so on."""
+    least, step = face.row(order), face.row(order, 1).itemsize - face.row(order).itemsize
+    count, before = dict(least.fields or {})[_COUNT][:2]
+    read = struct.Struct(order + count.char).unpack_from
+    (n,) = read(body, start + before)
+    if n > 2 and start + face.rows * (least.itemsize + n * step) <= len(body):
+        table = np.ndarray(face.rows, face.row(order, n), body, start)
+        if (table[_COUNT] == n).all():
+            return [table]
+    starts, counts = np.empty(face.rows, int), np.empty(face.rows, int)
+    for i in range(face.rows):
+        (n,) = read(body, start + before)
+        starts[i], counts[i] = start, n
+        start += least.itemsize + n * step
+    if counts.min() < 0 or start > len(body):
+        raise ValueError("it ends within a face, or one has a negative number of corners")
+    return [
+        sliding_window_view(np.frombuffer(body, "u1"), least.itemsize + n * step)[starts[some]].view(
+            face.row(order, n)
+        )[:, 0]
+        for n, some in alike(counts)
+    ]

@@ -1,32 +1,35 @@
 """Cuts dented polygons of mesh files into triangles inside of them."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 _CORNERS, _CUT = 64, 20_000  # most corners of a dented polygon that is cut, and of all that have more than four
+_PART = 4096  # polygons at a time, whose corners stay in the processor's cache
 _DENT = 0.01  # sine of the least turn of a corner against the others
 
 
-def cut_dented(points: np.ndarray, polygons: Sequence[Sequence[int]], notes: list[str]) -> dict[int, list[list[int]]]:
+def alike(counts: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """The numbers of corners from three on, ascending, each with the places (m,) of the faces that have as many."""
+    order = np.argsort(counts, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(counts[order])) + 1)
+    return [(int(counts[some[0]]), some) for some in groups if counts[some[0]] > 2]
+
+
+def cut_dented(points: np.ndarray, groups: list[np.ndarray], notes: list[str]) -> list[dict[int, list[list[int]]]]:
     """Cuts the polygons that a fan from their first corner would not cut.
 
     Args:
       points: (V, 3).
-      polygons: indices of the points of each, four or more.
+      groups: (m, n) indices of the points of polygons with n corners, n ascending.
       notes: the number of those that could not be cut is appended.
 
     Returns:
-      Triangles of each dented polygon, by its index; each has the places of three corners.
+      Triangles of the dented polygons of each group, by their row; each has the places of three corners.
     """
-    alike: dict[int, list[int]] = {}
-    for i, polygon in enumerate(polygons):
-        alike.setdefault(len(polygon), []).append(i)
-    found, budget, uncut = dict[int, list[list[int]]](), _CUT, 0
-    for count, some in sorted(alike.items()):
-        corners = points[np.array([polygons[i] for i in some])]
-        turns = _turns(corners)
-        for k in np.flatnonzero((turns < -_DENT).any(1)):
+    cut, budget, uncut = list[dict[int, list[list[int]]]](), _CUT, 0
+    for group in groups:
+        count, found = group.shape[1], dict[int, list[list[int]]]()
+        turns = np.concatenate([_turns(points[part]) for part in np.array_split(group, len(group) // _PART + 1)])
+        for k in np.flatnonzero((turns < -_DENT).any(1)).tolist():
             triangles: list[list[int]] = []
             if count == 4:
                 dents = np.flatnonzero(turns[k] < -_DENT)
@@ -34,13 +37,14 @@ def cut_dented(points: np.ndarray, polygons: Sequence[Sequence[int]], notes: lis
                 triangles = [order[:3], [order[0], *order[2:]]] if len(dents) == 1 else []
             elif count <= min(_CORNERS, budget):
                 budget -= count
-                triangles = _ears(corners[k])
+                triangles = _ears(points[group[k]])
             uncut += not triangles
             if triangles:
-                found[some[k]] = triangles
+                found[k] = triangles
+        cut.append(found)
     if uncut:
         notes.append(f"{uncut} of its dented polygons could not be cut and may be filled (export it as triangles)")
-    return found
+    return cut
 
 
 def _normals(corners: np.ndarray) -> np.ndarray:

@@ -13,6 +13,11 @@ _PLY = (
     b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty float x\nproperty float y\nproperty float z\n"
 )
 _FACES = b"element face %d\nproperty list uchar int vertex_indices\nend_header\n"
+_POINTS = (
+    _PLY.replace(b"binary_little_endian", b"ascii") % 4
+    + _FACES.replace(b"%d", b"0\nproperty int part")
+    + b"1 2 3\n" * 4
+)
 
 
 def _glb(change=lambda tree: None):
@@ -42,6 +47,7 @@ def _twice(tree):
         pytest.param("a.ply", _PLY % 0 + _FACES % 4_000_000_000 + bytes(99), "announces 4000000000", id="PLY faces"),
         pytest.param("a.ply", b"ply\nformat ascii 1.0\nelement vertex -5\nend_header\n", "without values", id="PLY -5"),
         pytest.param("a.ply", b"ply\n" + b"comment\n" * 10_000, "does not end", id="PLY without an end"),
+        pytest.param("a.ply", _POINTS, "only 4 points. Make a surface", id="PLY without faces"),
         pytest.param("a.stl", bytes(80) + b"\xff" * 4 + bytes(50), "only 0 proper triangles", id="STL"),
         pytest.param("a.glb", _glb(lambda t: t["accessors"][0].update(count=1 << 33)), "has a count", id="GLB count"),
         pytest.param(

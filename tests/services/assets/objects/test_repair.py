@@ -109,18 +109,78 @@ def test_what_single_precision_has_rounded_away_is_refused(tmp_path):
         read_mesh(tmp_path / "a.stl")
 
 
-def _channel(turn=1):
-    """Points and polygons of a channel, as modelling programs export it: one polygon for each end."""
-    outline = [(0, 0), (6, 0), (6, 4), (5, 4), (5, 1), (1, 1), (1, 4), (0, 4)][::turn]
-    points = [(x, y, z) for z in (0, 3) for x, y in outline]
-    sides = [(i, (i + 1) % 8, (i + 1) % 8 + 8, i + 8) for i in range(8)]
-    return points, [tuple(range(8))[::-1], tuple(range(8, 16)), *sides]
+_CHANNEL = [(0, 0), (6, 0), (6, 4), (5, 4), (5, 1), (1, 1), (1, 4), (0, 4)]
+_ARROW = [(0, 0), (2, 0), (0.5, 0.5), (0, 2)]
+
+
+def _prism(outline):
+    """Points and polygons of a prism, as modelling programs export it: one polygon for each end."""
+    points, n = [(x, y, z) for z in (0, 3) for x, y in outline], len(outline)
+    sides = [(i, (i + 1) % n, (i + 1) % n + n, i + n) for i in range(n)]
+    return points, [tuple(range(n))[::-1], tuple(range(n, 2 * n)), *sides]
+
+
+def _ply(outline, kind, number=None, comment=""):
+    """A prism whose faces have colours; in text if there is a format for the numbers."""
+    points, faces = _prism(outline)
+    header = f"""ply\n{comment}format {kind} 1.0
+comment element face follows\nobj_info big_endian
+element vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z
+element face {len(faces)}\ncomment its colours\nobj_info ascii\nproperty list uchar int vertex_index
+property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"""
+    rows = [("3f", *point) for point in points]
+    rows += [(f"B{len(one)}i3B", len(one), *one, 9, i, 7) for i, one in enumerate(faces)]
+    order = ">" if "big" in kind else "<"
+    packed = [struct.pack(order + row[0], *row[1:]) for row in rows]
+    return header.encode() + b"".join(
+        packed if number is None else [(" ".join(number % x for x in row[1:]) + "\n").encode() for row in rows]
+    )
+
+
+_QUADS = _ply(_ARROW, "binary_little_endian")
+
+
+@pytest.mark.parametrize(
+    ("data", "volume"),
+    [
+        pytest.param(_ply(_ARROW, "ascii", " %.3e"), 3, id="text of np.savetxt"),
+        pytest.param(_ply(_CHANNEL, "ascii", "%g").replace(b"element face 10", b"element\tface\t10"), 36, id="tabs"),
+        pytest.param(_ply(_ARROW, "ascii", "%g").replace(b"\n", b"\r\n"), 3, id="lines of Windows"),
+        pytest.param(_ply(_ARROW, "binary_little_endian", comment="comment ascii big\n"), 3, id="comment"),
+        pytest.param(_ply(_ARROW, "binary_big_endian"), 3, id="big-endian quads"),
+        pytest.param(_ply(_CHANNEL, "binary_big_endian"), 36, id="mixed polygons"),
+        pytest.param(_QUADS, 3, id="dented quads"),
+    ],
+)
+def test_polygons_of_a_ply_keep_their_volume_and_their_colours(tmp_path, data, volume):
+    (tmp_path / "a.ply").write_bytes(data)
+    said = list[str]()
+    mesh = read_mesh(tmp_path / "a.ply", said)
+    assert mesh.is_watertight and abs(mesh.volume) == pytest.approx(volume) and not said
+    colours = load_geometry(tmp_path / "a.ply", "").visual.face_colors[:, :3]
+    faces = 6 if volume == 3 else 10
+    np.testing.assert_array_equal(np.unique(colours, axis=0), [(9, i, 7) for i in range(faces)])
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (_QUADS[:-1], "it ends within a face"),
+        (_QUADS[:-30], "a row lacks values"),
+        (_ply(_ARROW, "ascii", "%g")[:-4], "a row lacks values"),
+        (_QUADS.replace(b"list uchar", b"list char").replace(b"\4\3\0\0\0\2", b"\xfc\3\0\0\0\2"), "a negative number"),
+    ],
+)
+def test_a_ply_of_other_faces_than_it_announces_is_refused(tmp_path, data, why):
+    (tmp_path / "a.ply").write_bytes(data)
+    with pytest.raises(CongraspError, match=why):
+        read_mesh(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_polygons_of_a_ply_are_cut_inside_of_them(tmp_path, kind):
     """Faces of eight corners and of four, each with a colour, between points with one and an edge."""
-    points, faces = _channel()
+    points, faces = _prism(_CHANNEL)
     numbers = "property float x\nproperty float y\nproperty float z\nproperty uchar red"
     face = "property uchar red\nproperty list uchar int vertex_indices\nproperty short rest"
     edge = "element edge 1\nproperty int vertex1\nproperty int vertex2"
@@ -138,7 +198,7 @@ def test_polygons_of_a_ply_are_cut_inside_of_them(tmp_path, kind):
 @pytest.mark.parametrize("turn", [1, -1])
 @pytest.mark.parametrize("end", ["", "# end", "\\\n"])
 def test_dented_polygons_are_cut_inside_of_them(tmp_path, turn, end):
-    points, faces = _channel(turn)
+    points, faces = _prism(_CHANNEL[::turn])
     text = "".join("v {} {} {}\n".format(*point) for point in points)
     (tmp_path / "a.obj").write_text(text + "".join(f"f {_row(face, end)}\n" for face in faces))
     mesh = read_mesh(tmp_path / "a.obj")
@@ -159,7 +219,7 @@ def test_a_polygon_with_a_bridge_to_its_hole_and_dented_quads_are_cut(tmp_path):
     square = [(0, 0), (4, 0), (4, 4), (0, 4), (1, 1), (1, 3), (3, 3), (3, 1)]
     for text, area in [
         (_flat(square, (0, 1, 2, 3, 0, 4, 5, 6, 7, 4)), 12),
-        (_flat([(0, 0), (2, 0), (0.5, 0.5), (0, 2)]), 1),
+        (_flat(_ARROW), 1),
     ]:
         (tmp_path / "a.obj").write_text(text)
         assert load_geometry(tmp_path / "a.obj", "").area == pytest.approx(area)
