@@ -207,7 +207,9 @@ class Cluster:
         return self.wait(lambda status: status["version"] >= version + count, timeout)
 
     def outcomes(self, name="a"):
-        return [json.loads(line) for line in (self.folder / f"{name}.log").read_text().splitlines()]
+        """What became of an actor's rollouts; nothing before its first."""
+        path = self.folder / f"{name}.log"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
     def stop(self, learner):
         """Ends the learner and the actors gently; returns what the learner found in its books, and the audit's counts.

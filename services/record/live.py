@@ -15,7 +15,7 @@ import time
 import urllib.parse
 from typing import Any
 
-from congrasp.common.errors import need_package, os_errors_as
+from congrasp.common.errors import PORT_ERRORS, need_package, os_errors_as
 from congrasp.services.record.writer import Channel, Entry
 
 _HOST, _LOOPBACK = "127.0.0.1", ("127.0.0.1", "localhost", "::1")
@@ -67,7 +67,7 @@ class LiveServer:
         inside = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}.{secrets.randbelow(254) + 1}"
         inside = inside if sys.platform == "linux" else _HOST
         with os_errors_as(
-            f"The live view cannot listen on {_HOST}:{port}", "Pass another port with --live.", OverflowError
+            f"The live view cannot listen on {_HOST}:{port}", "Pass another port with --live.", PORT_ERRORS
         ):
             outside = socket.create_server((_HOST, port))
         self._server = foxglove.start_server(
