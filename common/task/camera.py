@@ -23,7 +23,7 @@ from congrasp.common.task.settings import TaskSettings
 from congrasp.common.task.types import Array, Goal, Surface
 
 _TOGETHER = 512
-"""Clouds whose normals are estimated together."""
+"""Images that are taken together: few of a batch are due in one control step."""
 
 
 class Camera(NamedTuple):
@@ -88,7 +88,10 @@ def look(hand: Hand, camera: Camera, time: Array, state: Any, start: Any, surfac
     poses, arrived, due = arrival(camera.sensors, camera.poses, time, pose)
     turn = rotations.euler_to_quaternion(state.u[:, 3:])
     wrist = rotations.compose_pose(start.base_position, start.base_quaternion, state.u[:, :3], turn)
-    capsules = hand_capsules(hand, state.q, *wrist)
+
+    def capsules(rows: Array) -> Capsules:
+        return hand_capsules(hand, *(each[rows] for each in (state.q, *wrist)))
+
     return _image(camera._replace(poses=poses), time, due, arrived, surface, capsules)
 
 
@@ -106,16 +109,46 @@ def hand_capsules(hand: Hand, q: Array, position: Array, quaternion: Array) -> C
     return Capsules(flat.reshape(ends.shape), jnp.asarray(hand.capsule_radii))
 
 
-def _image(camera: Camera, time: Array, due: Array, pose: Array, surface: Surface, hand: Capsules | None) -> Camera:
-    """Replaces the clouds of cameras with a due image (B,) in which any point is visible."""
-    sensors, count = camera.sensors, surface.points.shape[1]
+def _image(
+    camera: Camera, time: Array, due: Array, pose: Array, surface: Surface, hand: Callable[[Array], Capsules] | None
+) -> Camera:
+    """Replaces the clouds of cameras with a due image (B,) in which any point is visible, a small batch at a time.
+
+    Args:
+      camera: the cameras.
+      time: (B,) int control steps since the start of the episodes.
+      due: (B,) bool.
+      pose: (B, 7) poses of the objects in the images.
+      surface: labelled surface points, object frame.
+      hand: returns the capsules of these environments' hands; None if the hands hide nothing.
+    """
+    batch = len(due)
+    together = min(batch, _TOGETHER)
+
+    def some(carry: tuple[Surface, Array]) -> tuple[Surface, Array]:
+        cloud, left = carry
+        rows = jnp.nonzero(left, size=together, fill_value=batch)[0]
+        seen = camera.sensors, camera.origin, time, pose, surface
+        visible, fresh = _taken(hand and hand(rows), *jax.tree.map(lambda x: x[rows], seen))
+        replaced = jnp.where(jnp.any(visible, -1), rows, batch)
+        cloud = jax.tree.map(lambda x, new: x.at[replaced].set(new, mode="drop"), cloud, fresh)
+        return cloud, left.at[rows].set(False, mode="drop")
+
+    return camera._replace(cloud=jax.lax.while_loop(lambda carry: jnp.any(carry[1]), some, (camera.cloud, due))[0])
+
+
+def _taken(
+    hand: Capsules | None, sensors: Sensors, origin: Array, time: Array, pose: Array, surface: Surface
+) -> tuple[Array, Surface]:
+    """Returns which points (B, N) are visible, and the clouds of B images, world frame."""
+    count = surface.points.shape[1]
 
     def errors(key: Array, time: Array) -> tuple[Array, Array]:
         noise, loss = jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(key), time))
         return jax.random.normal(noise, (count,)), jax.random.uniform(loss, (count,))
 
     noise, luck = jax.vmap(errors)(sensors.key, time)
-    eye = camera.origin + sensors.eye
+    eye = origin + sensors.eye
     points = rotations.transform(pose[:, :3], pose[:, 3:], surface.points)
     visible = facing(eye, points) & (luck >= sensors.dropout[:, None])
     if hand is not None:
@@ -123,34 +156,14 @@ def _image(camera: Camera, time: Array, due: Array, pose: Array, surface: Surfac
     ray = points - eye[:, None]
     ray = ray / jnp.maximum(jnp.linalg.norm(ray, axis=-1, keepdims=True), 1e-6)
     measured = points + (sensors.position_noise[:, None] * noise)[..., None] * ray
-    turn = rotations.from_rotation_vector(sensors.rotation_bias)
-    measured = rotations.transform(camera.origin + sensors.position_bias, turn, measured - camera.origin[:, None])
+    shift, turn = origin + sensors.position_bias, rotations.from_rotation_vector(sensors.rotation_bias)
+    measured = rotations.transform(shift, turn, measured - origin[:, None])
     index = _filled(visible)
-    fresh = (due & jnp.any(visible, -1))[:, None]
-    points = jnp.take_along_axis(measured, index[..., None], 1)
-    cloud = Surface(
-        jnp.where(fresh[..., None], points, camera.cloud.points),
-        jnp.where(fresh, jnp.take_along_axis(surface.avoid, index, 1), camera.cloud.avoid),
-    )
-    if camera.cloud.normals is not None:
-        shown = rotations.transform(camera.origin + sensors.position_bias, turn, sensors.eye[:, None])[:, 0]
-        normals = _normals(points, shown)
-        cloud = cloud._replace(normals=jnp.where(fresh[..., None], normals, camera.cloud.normals))
-    return camera._replace(cloud=cloud)
-
-
-def _normals(points: Array, eye: Array) -> Array:
-    """Normals (B, N, 3) of clouds toward cameras, a few hundred environments at a time for the sake of memory."""
-    batch = points.shape[0]
-    if batch <= _TOGETHER:
-        return estimated_normals(points, eye)
-
-    def parts(array: Array) -> Array:
-        filled = jnp.pad(array, ((0, -batch % _TOGETHER), *[(0, 0)] * (array.ndim - 1)))
-        return filled.reshape(-1, _TOGETHER, *array.shape[1:])
-
-    found = jax.lax.map(lambda part: estimated_normals(*part), (parts(points), parts(eye)))
-    return found.reshape(-1, *points.shape[1:])[:batch]
+    cloud = Surface(jnp.take_along_axis(measured, index[..., None], 1), jnp.take_along_axis(surface.avoid, index, 1))
+    if surface.normals is not None:
+        shown = rotations.transform(shift, turn, sensors.eye[:, None])[:, 0]
+        cloud = cloud._replace(normals=estimated_normals(cloud.points, shown))
+    return visible, cloud
 
 
 def facing(eye: Array, points: Array) -> Array:

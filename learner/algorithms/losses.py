@@ -22,6 +22,9 @@ from congrasp.common.task.types import Array
 from congrasp.learner.algorithms import gae
 from congrasp.learner.distributed.collectives import Collectives
 
+_TOGETHER = 1 << 15
+"""Transitions that the networks evaluate together, if a step of all environments has no more."""
+
 
 class Sample(NamedTuple):
     """Transitions of a minibatch, with quantities that stay fixed during an update; leading axis M."""
@@ -150,19 +153,24 @@ def evaluate(params: Params, given: Inputs, collectives: Collectives, layout: La
     batch, hyper = given.batch, given.hyper
     action, behaviour = batch["action"], batch["log_probability"]
     log_std = params["actor"]["log_std"]
-    observation = normalizer.apply(given.observations, batch["observation"])
-    exact, _ = network.policy(params, layout, observation)
-    log_exact = network.log_probability(exact, log_std, action)
-    weight = importance_weight(log_exact, behaviour, hyper["importance_max"])
-    mean, _ = network.policy(params, layout, observation, exact=False)
 
     def values(normalised: Array, privileged: Array | None) -> Array:
         inputs = normalised_inputs(given.privileged, privileged)
         return network.value(params, layout, normalised, inputs) / given.returns.scale + given.returns.shift
 
-    value = values(observation, batch.get("privileged"))
+    def evaluated(observation: Array, privileged: Array | None) -> tuple[Array, Array, Array]:
+        seen = normalizer.apply(given.observations, observation)
+        exact, fast = (network.policy(params, layout, seen, exact=exact)[0] for exact in (True, False))
+        return exact, fast, values(seen, privileged)
+
+    # Not all steps at once: the features of the points of 327,680 clouds are 40 GiB.
+    inputs = batch["observation"], batch.get("privileged")
+    together = max(_TOGETHER // action.shape[1], 1)
+    exact, mean, value = jax.lax.map(lambda step: evaluated(*step), inputs, batch_size=together)
     last_observation = normalizer.apply(given.observations, batch["last_observation"])
     last_value = values(last_observation, batch.get("last_privileged"))
+    log_exact = network.log_probability(exact, log_std, action)
+    weight = importance_weight(log_exact, behaviour, hyper["importance_max"])
     reward = batch["reward"] * hyper["reward_scale"]
     truncated = batch["truncated"] & hyper["bootstrap_truncated"]
     chunk = reward, value, last_value, batch["terminal"]

@@ -64,6 +64,7 @@ UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_NO_MEMORY = re.compile(r"(?:out of memory|failed to allocate \d+ bytes)[^[\n]*", re.IGNORECASE)
 _PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError, FileExistsError)
 _PATH_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP)
 
@@ -91,6 +92,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = UNREAD
     except OSError as error:
         code = _fail(_said_of(error), USAGE_ERROR, debug)
+    except RuntimeError as error:  # of XLA or Warp, whose types are imported late
+        if not (found := _NO_MEMORY.search(str(error))):
+            raise
+        what = f"The accelerator's memory does not suffice: {found[0].strip('. ')}."
+        remedy = (
+            "Choose fewer --environments or a smaller --batch, or change JAX's share, XLA_PYTHON_CLIENT_MEM_FRACTION."
+        )
+        code = _fail(str(CongraspError(what, remedy)), USAGE_ERROR, debug)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package == "congrasp":

@@ -275,7 +275,7 @@ def _supervise(
             if code := child.code:
                 _check_can_restart(child, code)
                 if child.again_at == 0.0:
-                    notify(f"The {child.name} died (exit code {code}); restarting it.")
+                    notify(f"The {child.name} died (exit code {code}): {child.last_line()} Restarting it.")
                     child.again_at = time.monotonic() + min(2.0**child.restarts, 15.0) - 1.0
                 if time.monotonic() >= child.again_at:
                     child.restarts += 1
@@ -291,13 +291,16 @@ def _supervise(
 
 def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: Callable[[str], None]) -> None:
     """Restarts all ranks after one died; the others notice and end, or are terminated."""
-    dead = next(child for child in learners if child.code)
-    died = f"The {dead.name} died (exit code {dead.code})"
+    first = next(child for child in learners if child.code)
     wait_for([child.process for child in learners if child.process], CHILD_GRACE)
+    # A rank that lost another one says no more than that.
+    dead = [child for child in (first, *learners) if child.code and child.code != TransportError.exit_code]
+    cause = dead[0] if dead else first
+    died = f"The {cause.name} died (exit code {cause.code}): {cause.last_line()}"
     end_all(learners)
-    for child in learners:
+    for child in (cause, *learners):
         _check_can_restart(child, child.code or 0)
-    notify(f"{died}; restarting it." if len(learners) == 1 else f"{died}; restarting all ranks.")
+    notify(f"{died} Restarting {'it' if len(learners) == 1 else 'all ranks'}.")
     stop.wait(min(2.0 ** learners[0].restarts, 15.0) - 1.0)
     for child in learners:
         child.restarts += 1

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from congrasp.common.config import NetworkConfig
-from congrasp.common.policy import network
+from congrasp.common.policy import network, normalizer
 from congrasp.learner.algorithms import losses
+from congrasp.learner.distributed.collectives import Collectives
 from tests.learner import toy
 
 LAYOUT = (("state", 3), *toy.LAYOUT[1:])
@@ -122,3 +123,25 @@ def test_stale_data_do_not_use_up_the_trust_region(case):
     assert norm(jax.grad(loss)(params)) > 1e-3
     plain = jax.grad(lambda p: plain_ppo(p, stale, log_behaviour, value=0.0, entropy=0.0))(params)
     assert norm(plain) == 0.0
+
+
+def test_the_features_of_a_long_rollout_are_not_held_at_once():
+    """Those of one layer of 64 units are 8 MiB a step of 2^15 worlds, 64 in all; what is kept of a step is 1 MiB."""
+    params = network.init(0, LAYOUT, 2, NetworkConfig(hidden=(64,), encoder=2))
+    worlds, hyper = 1 << 15, {"importance_max": 4.0, "reward_scale": 1.0, "bootstrap_truncated": True}
+    hyper |= {"gamma": 0.99, "gae_lambda": 0.95, "decoupled": True}
+    one = normalizer.Affine(jnp.float32(0.0), jnp.float32(1.0))
+    floats = {"observation": (12,), "action": (2,), "log_probability": (), "reward": ()}
+
+    def temporary(steps):
+        batch = {name: jax.ShapeDtypeStruct((steps, worlds, *row), jnp.float32) for name, row in floats.items()}
+        flags = jax.ShapeDtypeStruct((steps, worlds), bool)
+        batch |= {"terminal": flags, "truncated": flags, "lag": jax.ShapeDtypeStruct((worlds,), jnp.int32)}
+        batch["last_observation"] = jax.ShapeDtypeStruct((worlds, 12), jnp.float32)
+
+        def evaluate(batch):
+            return losses.evaluate(params, losses.Inputs(batch, one, None, one, hyper), Collectives(None), LAYOUT)
+
+        return jax.jit(evaluate).lower(batch).compile().memory_analysis().temp_size_in_bytes
+
+    assert temporary(8) - temporary(1) < 7 * (2 << 20)

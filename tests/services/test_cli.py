@@ -24,6 +24,8 @@ from congrasp.services.cli.main import COMMANDS, load
 from congrasp.services.ops.logs import announced
 from tests.printed import errors
 
+NO_MEMORY = "The accelerator's memory does not suffice"
+LESS = "Choose fewer --environments or a smaller --batch, or change JAX's share, XLA_PYTHON_CLIENT_MEM_FRACTION."
 ROOT = Path(__file__).parents[2]
 URDF = ROOT / "tests" / "hands" / "claw.urdf"
 
@@ -160,9 +162,20 @@ def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path)
             FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"),
             "There is no folder for temporary files that can be written. Set TMPDIR to one.",
         ),
+        (
+            RuntimeError(
+                "NOT_FOUND: All configs failed.\nEXECUTION FAILED: RESOURCE_EXHAUSTED: Out of memory while trying to "
+                "allocate 40.02GiB with allocator bfc. [error='']"
+            ),
+            f"{NO_MEMORY}: Out of memory while trying to allocate 40.02GiB with allocator bfc. {LESS}",
+        ),
+        (
+            RuntimeError("Failed to allocate 9000 bytes on device 'cuda:0'"),
+            f"{NO_MEMORY}: Failed to allocate 9000 bytes on device 'cuda:0'. {LESS}",
+        ),
     ],
 )
-def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(error, line, monkeypatch, capsys):
+def test_a_disk_or_memory_that_is_full_or_fails_is_one_line_wherever_it_strikes(error, line, monkeypatch, capsys):
     def fail(arguments):
         raise error
 

@@ -53,8 +53,15 @@ def test_one_that_dies_takes_the_others_with_it_and_all_come_back(supervise, tmp
     waits_for_it = (
         f"import pathlib, time\nwhile not pathlib.Path({str(tmp_path)!r}, 'again').exists(): time.sleep(0.05)"
     )
-    notes = supervise([WAITS, waits_for_it], ["raise SystemExit(9)", writes])
-    assert notes == ["The rank-1 died (exit code 9); restarting all ranks."]
+    notes = supervise([WAITS, waits_for_it], ["print('No memory.'); raise SystemExit(9)", writes])
+    assert notes == ["The rank-1 died (exit code 9): No memory. Restarting all ranks."]
+
+
+def test_the_rank_that_failed_is_named_and_not_those_that_lost_it(supervise):
+    fails = "import time; print('No memory.', flush=True); time.sleep(0.5); raise SystemExit(9)"
+    lost = "print('Rank 1 ended.'); raise SystemExit(4)"
+    notes = supervise([lost, "pass"], [fails, "pass"])
+    assert notes == ["The rank-1 died (exit code 9): No memory. Restarting all ranks."]
 
 
 def test_bad_input_of_any_rank_ends_the_run_with_its_last_words(supervise):
