@@ -50,8 +50,8 @@ class View:
         """Offers the page until a signal."""
         import contextlib
 
+        from congrasp.services.ops.lifetime import on_signal
         from congrasp.services.ops.logs import announced
-        from congrasp.services.ops.shutdown import on_signal
 
         starting = contextlib.ExitStack()
         starting.enter_context(announced("Loading the policies and compiling the studio's rules"))

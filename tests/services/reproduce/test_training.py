@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from congrasp.services.cli import main
-from congrasp.services.ops import children
+from congrasp.services.ops import lifetime
 from congrasp.services.reproduce.plan import RequiredPolicy
 from congrasp.services.reproduce.run import Request, train_all
 from congrasp.services.train import processes
@@ -34,7 +34,7 @@ def scripts(monkeypatch):
                 self.process = subprocess.Popen(command, stdout=log, stderr=log)
 
     monkeypatch.setattr(processes, "Child", Script)
-    monkeypatch.setattr(children, "_POLL", 0.05)
+    monkeypatch.setattr(lifetime, "_POLL", 0.05)
     yield chosen, started
     assert all(child.process.poll() is not None for child in started)
 

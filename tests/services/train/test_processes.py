@@ -9,7 +9,7 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
-from congrasp.services.ops.children import command
+from congrasp.services.ops.lifetime import command
 from congrasp.services.train import processes
 from congrasp.services.train.processes import Child
 
