@@ -7,7 +7,7 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects.options import METRES, guessed_unit, metres_per_unit, sizes_by_unit
-from congrasp.services.studio.app import MeshImporter
+from congrasp.services.studio.catalogue import Importer
 
 
 @pytest.mark.parametrize(
@@ -41,4 +41,4 @@ def test_the_size_in_every_unit_says_whether_a_hand_could_grasp_that() -> None:
 
 def test_the_sides_of_a_mesh_are_read_in_its_own_unit(tmp_path: pathlib.Path) -> None:
     trimesh.creation.box((30.0, 40.0, 50.0)).export(tmp_path / "box.stl")
-    assert MeshImporter().sides(tmp_path / "box.stl") == pytest.approx((30.0, 40.0, 50.0))
+    assert Importer().sides(tmp_path / "box.stl") == pytest.approx((30.0, 40.0, 50.0))
