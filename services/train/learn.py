@@ -172,12 +172,4 @@ def until_first_update(
         run_dir = pathlib.Path(folder, "run")
         config = dataclasses.replace(config, updates=1)
         create_run(run_dir, config, None)
-        learn(
-            run_dir,
-            config,
-            wire=None,
-            inside=engine_of(physics, False),
-            stop=stop,
-            on_update=updated,
-            grace=_GRACE,
-        )
+        learn(run_dir, config, wire=None, inside=engine_of(physics, False), stop=stop, on_update=updated, grace=_GRACE)

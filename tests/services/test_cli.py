@@ -76,10 +76,7 @@ def test_help_names_every_command_and_every_command_exists():
         (["render", "hand", "--out", "hand.pdf"], "--out is hand.pdf, but the picture is a PNG. End its name in .png"),
         (["objects", "show", "mug:7", "--png", "x.jpg"], "--png is x.jpg, but the picture is a PNG"),
         (["export", "policy", "--out", "/"], "--out is the folder /. Pass a file"),
-        (
-            ["export", "motion", "/", "--out", "/dev/null/x.glb"],
-            "--out is /dev/null/x.glb, but",
-        ),
+        (["export", "motion", "/", "--out", "/dev/null/x.glb"], "--out is /dev/null/x.glb, but"),
         (["plot", "/nonexistent-run", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["hands", "train", "no-hand", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["constraints", "import", "grab", "/", "--objects", "/dev/null"], "--objects is the file /dev/null. Pass a"),

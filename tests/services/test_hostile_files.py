@@ -21,13 +21,7 @@ from congrasp.common.task.sampling import sets as stored_sets
 from congrasp.common.wire.codec import Message, decode, encode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from congrasp.services.grasp import wrist_paths
-from congrasp.services.record.reader import (
-    metrics_of,
-    pick_episode,
-    read_episodes,
-    read_metrics,
-    read_records,
-)
+from congrasp.services.record.reader import metrics_of, pick_episode, read_episodes, read_metrics, read_records
 from congrasp.services.record.scene import EPISODE_SCHEMA
 from congrasp.services.record.writer import Entry, JsonChannels, LogWriter, opaque_channel
 from tests.episodes import episode
