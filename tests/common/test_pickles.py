@@ -5,8 +5,6 @@ import io
 import os
 import pickle
 import re
-import subprocess
-import sys
 import threading
 import zipfile
 
@@ -18,6 +16,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io import pickles
 from congrasp.common.io.inputs import read_npz
 from congrasp.common.io.pickles import read_pickle, read_pickles
+from tests.children import python
 from tests.limits import limited
 from tests.mano_file import Reduced, dumps, mano_pickle, selection
 
@@ -58,9 +57,8 @@ def test_several_files_are_read_in_one_process_and_the_wrong_one_is_named(monkey
 def test_the_process_imports_no_package_but_numpy(tmp_path):
     (tmp_path / "pickles.zip").write_bytes(b"PK\x05\x06" + bytes(18))
     listed = "import runpy, sys; runpy.run_path(sys.argv.pop(1), run_name='__main__'); print(*sys.modules)"
-    files = map(str, (pickles._CHILD, tmp_path / "pickles.zip", tmp_path / "answer.npz"))
-    command = [sys.executable, "-c", listed, *files, str(1 << 30), "10", str(1 << 20)]
-    modules = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.split()
+    files = pickles._CHILD, tmp_path / "pickles.zip", tmp_path / "answer.npz"
+    modules = python("-c", listed, *files, 1 << 30, 10, 1 << 20).stdout.split()
     assert "numpy" in modules and not {"jax", "congrasp", "scipy", "zenoh"}.intersection(modules)
 
 

@@ -19,6 +19,7 @@ from congrasp.common.transport.ports import free_port
 from congrasp.learner.distributed import ranks as ranks_module
 from congrasp.learner.distributed.ranks import Ranks, ended_by, relay
 from congrasp.learner.run_directory import create_run
+from tests.children import python
 from tests.conftest import ROOT
 from tests.learner.rank_process import CONFIG
 from tests.learner.test_distill import save_teacher
@@ -359,13 +360,8 @@ np.testing.assert_allclose(two.observation.mean, one.observation.mean, atol=1e-5
 
 def two_devices(program, *arguments):
     """What a program prints that sees two devices."""
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(ROOT),
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2",
-    }
-    command = [sys.executable, "-c", PREAMBLE + program, *map(str, arguments)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=280.0)
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    done = python("-c", PREAMBLE + program, *arguments, env={"XLA_FLAGS": flags})
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 

@@ -26,16 +26,15 @@ from congrasp.services.cli import console
 from congrasp.services.cli import main as cli
 from congrasp.services.cli.main import COMMANDS, load
 from congrasp.services.ops.logs import announced
+from tests.children import python
 from tests.printed import errors
 
 ROOT = Path(__file__).parents[2]
 URDF = ROOT / "tests" / "hands" / "claw.urdf"
 
 
-def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Runs the command line in a process of its own."""
-    command = [sys.executable, "-m", "congrasp", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+congrasp = functools.partial(python, "-m", "congrasp")
+"""Runs the command line in a process of its own."""
 
 
 def is_one_line(code: int, said: str, words: str) -> None:
@@ -190,28 +189,22 @@ def test_a_path_that_cannot_be_used_is_one_line_and_a_fault_of_ours_is_not(numbe
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_log_on_a_full_disk_does_not_change_the_exit_code():
     """Only bad input ends a run's process for good; another code would start it again and again."""
-    command = [sys.executable, "-m", "congrasp", "levitate"]
     with open("/dev/full", "wb") as full:
-        assert subprocess.run(command, stdout=full, stderr=full, timeout=60, check=False).returncode == 2
+        assert congrasp("levitate", stdout=full, stderr=full, capture_output=False).returncode == 2
 
 
 def test_a_reader_that_is_gone_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)  # as `head` does when it has read enough
-    command = [sys.executable, "-m", "congrasp", "hands", "list", "--help"]
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    done = congrasp("hands", "list", "--help", stdout=writer, stderr=subprocess.PIPE, capture_output=False)
     os.close(writer)
     lines = errors(done.stderr)
     assert not lines and done.returncode in (0, 128 + signal.SIGPIPE)
 
 
 def test_an_output_without_some_characters_gets_escapes():
-    command, env = (
-        [sys.executable, "-m", "congrasp", "objects", "list", "ü"],
-        {**os.environ, "PYTHONIOENCODING": "ascii"},
-    )
-    done = subprocess.run(command, env=env, capture_output=True, timeout=60, check=False)
-    is_one_line(done.returncode, done.stderr.decode(), r"no folder .*\\xfc")
+    done = congrasp("objects", "list", "ü", env={"PYTHONIOENCODING": "ascii"})
+    is_one_line(done.returncode, done.stderr, r"no folder .*\\xfc")
 
 
 @pytest.mark.parametrize(
@@ -238,7 +231,7 @@ threading.Thread(target=threading.Event().wait, args=(60 if {late} else 0,), dae
 sys.argv[1:] = ["hands", "list"]
 main()
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = python("-c", code)
     assert done.returncode == 0 and "allegro" in done.stdout, done.stderr
     assert done.stdout.endswith("shut down\n") is not late
 
