@@ -36,6 +36,7 @@ from congrasp.services.assets.captures.references import (
 )
 from congrasp.services.assets.captures.sequence import Dropped, Sequence
 from congrasp.services.cli.constraints import _print_report
+from tests.scenes import pointing
 from tests.services.assets.captures import known
 from tests.services.assets.captures.test_myohand import write
 
@@ -274,21 +275,13 @@ def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
 # --- resting poses ---
 
 
-def facing(z):
-    """Orientation of a human hand whose heading is (0, 0, z)."""
-    frame = grasp_frame(HUMAN)
-    own = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
-    aim = rotations.frame_from_axes(jnp.array([0.0, 0, z]), jnp.array([1.0, 0, 0]))
-    return rotations.multiply(aim, rotations.conjugate(own))
-
-
 def test_the_hand_is_not_in_the_table_or_as_little_as_can_be():
     """A hand from straight above, in resting poses in which the table is 1 mm, 15 mm and 45 mm too high for it.
 
     Further hands are 3 and 15 mm lower: one is requested in the first of them alone, 4 mm in the table, and the other,
     16 mm in it, in none.
     """
-    turn = facing(-1.0)
+    turn = pointing(-1.0)
     ends = np.asarray(capsules(HUMAN, link_transforms(HUMAN, jnp.array(HUMAN.q_open)))).reshape(-1, 3)
     ends = np.asarray(rotations.rotate(jnp.broadcast_to(turn, (len(ends), 4)), jnp.array(ends)))
     reach = -(ends[:, 2] - np.repeat(HUMAN.capsule_radii, 2)).min()
@@ -310,7 +303,7 @@ def test_the_hand_is_not_in_the_table_or_as_little_as_can_be():
 
 def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
     """By hand: an object whose centre is 10 cm high; wrists 5 cm over it and 9 cm under, coming down, up and up."""
-    turns = [facing(z) for z in (-1.0, 1.0, 1.0)]
+    turns = [pointing(z) for z in (-1.0, 1.0, 1.0)]
     path = np.zeros((2, 3, 15, 3), np.float32)
     path[..., 2] = np.array([0.05, 0.05, -0.09])[:, None]
     arrays = {
