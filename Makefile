@@ -3,7 +3,7 @@
 # Everything runs in .venv, which the first target makes; another interpreter: make quickstart PYTHON=python3.12
 
 FAST := tests/test_architecture.py $(addprefix tests/common/,$(addsuffix .py,test_rotations test_motors test_priority \
-  test_trajectories test_plausibility test_codec test_messages)) $(addprefix tests/learner/,$(addsuffix .py,test_gae test_losses \
+  test_trajectories test_plausibility test_codec test_messages)) $(addprefix tests/learner/,$(addsuffix .py,test_losses \
   test_staleness test_limits))
 supported := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do $$p -c '$(supported)' 2>/dev/null && echo $$p && break; done)

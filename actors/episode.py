@@ -20,13 +20,7 @@ from congrasp.common.wire.codec import Message
 
 
 def episode_message(
-    hand: Hand,
-    task: TaskConfig,
-    trace: Trace,
-    goal: Goal,
-    surface: Surface,
-    obj: GraspObject,
-    meta: dict[str, Any],
+    hand: Hand, task: TaskConfig, trace: Trace, goal: Goal, surface: Surface, obj: GraspObject, meta: dict[str, Any]
 ) -> Message:
     """Returns the episode up to its end within the trace, or the whole trace if it does not end.
 

@@ -248,10 +248,7 @@ def _meanings(kind: type) -> dict[str, str]:
         for mark in getattr(hint, "__metadata__", ())
         if isinstance(mark, Doc)
     }
-    return {
-        **declared,
-        **dict(re.findall(r'^    (\w+): [^\n]*\n    """(.+?)"""', written, re.M | re.S)),
-    }
+    return {**declared, **dict(re.findall(r'^    (\w+): [^\n]*\n    """(.+?)"""', written, re.M | re.S))}
 
 
 def _entries(spec: MessageSpec) -> Iterator[tuple[str, str, str]]:

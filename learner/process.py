@@ -208,8 +208,7 @@ class _Learner:
                 write_atomically(self._run_dir / CONFIG_FILE, to_json(config).encode())
             elif newest >= 0:
                 raise CongraspError(
-                    f"{self._run_dir} has checkpoints of a run.",
-                    "Pass --resume to continue it, or another --run-dir.",
+                    f"{self._run_dir} has checkpoints of a run.", "Pass --resume to continue it, or another --run-dir."
                 )
             version, newest = state.version + meta["skipped"], newest + meta["skipped"]
             meta = {**meta, "skipped": self._skip_lost_versions(version, newest) + meta["skipped"]}

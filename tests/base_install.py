@@ -2,7 +2,6 @@
 
 import contextlib
 import subprocess
-import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,6 +13,7 @@ from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.ports import free_port
 from congrasp.common.wire.codec import Message
 from congrasp.services.serve.inference import Inference, PolicyFunction
+from tests.children import python
 
 BASE_INSTALL = """
 import sys
@@ -31,9 +31,7 @@ sys.meta_path.insert(0, BaseInstall())
 
 def run_in_base_install(code: str) -> subprocess.CompletedProcess[str]:
     """Runs a program that finds the standard library, numpy, zenoh and congrasp alone."""
-    return subprocess.run(
-        [sys.executable, "-c", BASE_INSTALL + code], capture_output=True, text=True, timeout=60, check=False
-    )
+    return python("-c", BASE_INSTALL + code)
 
 
 @contextlib.contextmanager

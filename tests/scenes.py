@@ -6,11 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from congrasp.common import rotations
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.kinematics import keypoints, link_transforms
+from congrasp.common.hands.kinematics import grasp_frame, keypoints, link_transforms
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.affordance import AffordanceGoal
@@ -37,6 +39,14 @@ def units(rng: np.random.Generator, *shape: int) -> np.ndarray:
     """Uniform unit vectors (..., 3)."""
     v = rng.normal(size=(*shape, 3))
     return (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def pointing(z: float) -> jax.Array:
+    """(4,) orientation of a human wrist whose heading points up (1) or down (-1)."""
+    frame = grasp_frame(HAND)
+    own = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
+    target = rotations.frame_from_axes(jnp.array([0.0, 0.0, z]), jnp.array([1.0, 0.0, 0.0]))
+    return rotations.multiply(target, rotations.conjugate(own))
 
 
 def scene(seed: int, batch: int = 4) -> tuple[SceneState, Surface, Goal]:

@@ -18,7 +18,8 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.record.scene import episode_entries
 from congrasp.services.record.writer import JsonChannels, LogWriter
 from congrasp.services.studio.catalogue import Catalogue
-from congrasp.services.studio.session import Progress, Session
+from congrasp.services.studio.grasping import Progress
+from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import TrainingWindow
 from tests.episodes import episode
 

@@ -3,8 +3,6 @@
 import importlib.metadata
 import inspect
 import re
-import subprocess
-import sys
 import textwrap
 
 import numpy as np
@@ -13,6 +11,7 @@ import trimesh
 
 import congrasp
 from tests.base_install import run_in_base_install, steady_server
+from tests.children import python
 
 CLIENT = """
 import congrasp
@@ -79,8 +78,7 @@ def test_client_guard_and_errors_need_numpy_and_zenoh_alone():
 def test_a_probe_of_a_server_s_health_loads_neither_jax_nor_mujoco():
     code = "import sys, congrasp.services.cli.query, congrasp.services.serve.load as _\n"
     code += "print({'jax', 'mujoco'} & {*sys.modules})"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\n"
+    assert python("-c", code).stdout == "set()\n"
 
 
 def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_policy):

@@ -8,6 +8,8 @@ import zipfile
 
 import pytest
 
+from tests.children import python
+
 ROOT = pathlib.Path(__file__).parents[1]
 FOLDERS = ("common", "actors", "learner", "services")
 
@@ -42,12 +44,5 @@ def test_a_program_may_have_folders_of_the_same_names(wheel, tmp_path):
         (program / folder / "__init__.py").write_text("raise ImportError('the module of another program')")
     code = "import congrasp; congrasp.PolicyClient, congrasp.Guard; print(congrasp.__file__)"
     for command, printed in ((["-c", code], str(installed)), (["-m", "congrasp", "--help"], "congrasp train")):
-        done = subprocess.run(
-            [sys.executable, *command],
-            cwd=program,
-            env={"PYTHONPATH": str(installed)},
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
+        done = python(*command, cwd=program, env={"PYTHONPATH": str(installed)})
         assert done.returncode == 0 and printed in done.stdout, done.stderr

@@ -68,13 +68,7 @@ class WarpBuffers:
     """Buffers of a batch of environments on one device."""
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        where: Addresses,
-        geoms: np.ndarray,
-        substeps: int,
-        batch: int,
-        device: wp.Device,
+        self, model: mujoco.MjModel, where: Addresses, geoms: np.ndarray, substeps: int, batch: int, device: wp.Device
     ):
         """Allocates the buffers.
 

@@ -108,10 +108,7 @@ def link_poses(hand: Hand, q: Array) -> tuple[Array, Array]:
     """Origins (..., L, 3) and orientations (..., L, 4) of the links' frames."""
     rotation, translation = link_transforms(hand, q)
     origins = jnp.array([link_origin(link) for link in hand.links])
-    return (
-        rotations.apply(rotation, origins[:, None])[..., 0, :] + translation,
-        rotations.from_matrix(rotation),
-    )
+    return (rotations.apply(rotation, origins[:, None])[..., 0, :] + translation, rotations.from_matrix(rotation))
 
 
 def hand_center(hand: Hand, points: Array) -> Array:

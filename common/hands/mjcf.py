@@ -169,11 +169,7 @@ def _add_position_actuator(
 ) -> None:
     """Adds a position servo for the joint or tendon of this name, with this force limit."""
     actuator = spec.add_actuator(
-        name=name,
-        target=name,
-        trntype=kind,
-        forcerange=(-limit, limit),
-        forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+        name=name, target=name, trntype=kind, forcerange=(-limit, limit), forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE
     )
     actuator.set_to_position(kp, kv=kv)
 

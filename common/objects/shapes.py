@@ -330,11 +330,7 @@ def sample_union(
 
 
 def sample_mesh(
-    triangles: np.ndarray,
-    pieces: tuple[Piece, ...],
-    rng: np.random.Generator,
-    *,
-    oriented: bool,
+    triangles: np.ndarray, pieces: tuple[Piece, ...], rng: np.random.Generator, *, oriented: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples points on the part of a mesh that a finger can reach.
 

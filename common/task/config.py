@@ -24,17 +24,12 @@ def _declared(fields: Iterable[tuple[str, float, str]]) -> Any:
 
 
 _Weights: Any = _declared(
-    (
-        *(term[:3] for term in GRASP),
-        *(weight for constraint in CONSTRAINTS for weight in constraint.weights),
-    )
+    (*(term[:3] for term in GRASP), *(weight for constraint in CONSTRAINTS for weight in constraint.weights))
 )
 _Shares: Any = _declared(
-    (
-        (f"p_{c.name}", 0.5, f"Probability that an episode has the constraint '{c.name}', where the object allows it.")
-        for c in CONSTRAINTS
-        if c.optional
-    ),
+    (f"p_{c.name}", 0.5, f"Probability that an episode has the constraint '{c.name}', where the object allows it.")
+    for c in CONSTRAINTS
+    if c.optional
 )
 
 

@@ -34,10 +34,7 @@ def hand_center(hand: Hand, points: Array, fingers: Array | None = None) -> Arra
 def wrist_pose(state: SceneState) -> tuple[Array, Array]:
     """Position (B, 3) and quaternion (B, 4) of the wrist frame in the world frame."""
     return rotations.compose_pose(
-        state.base_position,
-        state.base_quaternion,
-        state.u[..., :3],
-        rotations.euler_to_quaternion(state.u[..., 3:]),
+        state.base_position, state.base_quaternion, state.u[..., :3], rotations.euler_to_quaternion(state.u[..., 3:])
     )
 
 

@@ -84,10 +84,7 @@ METHODS = {
         "the paper's two phases: stationary objects, then free ones with larger constraint weights",
         schedule=_two_phases,
     ),
-    "single-stage": Method(
-        "free objects and the final weights from the start, no ramp",
-        schedule=_single_stage,
-    ),
+    "single-stage": Method("free objects and the final weights from the start, no ramp", schedule=_single_stage),
     STUDENT: Method(
         "no privileged observations: joints, wrist and a tracker's object poses over some steps, no forces and "
         "no velocities",

@@ -120,10 +120,7 @@ GRASP: tuple[Term, ...] = (
         _object_position,
     ),
     Term(
-        "object_rotation",
-        0.1,
-        "w_R: per square radian of the object's rotation (at most 1 rad^2).",
-        _object_rotation,
+        "object_rotation", 0.1, "w_R: per square radian of the object's rotation (at most 1 rad^2).", _object_rotation
     ),
     Term(
         "wrist_velocity",

@@ -145,15 +145,7 @@ _EPISODES = {"episode/*": ArraySpec(F32, ("E",)), "term/*": ArraySpec(F32, ("E",
 ROLLOUT = MessageSpec(
     "rollout",
     {**RECORDABLE, **_EPISODES},
-    {
-        "actor": str,
-        "incarnation": str,
-        "sequence": int,
-        "version": int,
-        "run_id": str,
-        "schema": str,
-        "steps": int,
-    },
+    {"actor": str, "incarnation": str, "sequence": int, "version": int, "run_id": str, "schema": str, "steps": int},
 )
 """Actor to learner: T control steps of B worlds, D observation and A action sizes, P inputs of the critic and S of a
 teacher, E finished episodes. Of the per-step arrays it holds those that the run's algorithm learns from."""

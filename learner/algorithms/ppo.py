@@ -231,11 +231,7 @@ def _program(
     failure = jnp.where((failure == _FINE) & (kl > _UNREASONABLE_KL), len(_CHECKED) - 1, failure)
     metrics = {name: jnp.mean(term) for name, term in terms._asdict().items()}
     metrics |= {f"{name}_grad_norm": jnp.mean(norm) for name, norm in norms.items()}
-    metrics |= {
-        "kl": kl,
-        "learning_rate": learning_rate,
-        "action_std": jnp.mean(jnp.exp(moved["actor"]["log_std"])),
-    }
+    metrics |= {"kl": kl, "learning_rate": learning_rate, "action_std": jnp.mean(jnp.exp(moved["actor"]["log_std"]))}
     metrics |= losses.batch_metrics(given, evaluation, collectives)
     moved_optimizer = _with(moved_optimizer, learning_rate=_adapt_rate(learning_rate, kl, hyper))
     params, optimizer = jax.tree.map(

@@ -9,13 +9,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import below, check_name, parse_alive
 from congrasp.common.wire.codec import Message, SharedMessage
-from congrasp.common.wire.messages import (
-    TICKET,
-    RolloutHeader,
-    validate,
-    validate_bundle,
-    validate_rollout,
-)
+from congrasp.common.wire.messages import TICKET, RolloutHeader, validate, validate_bundle, validate_rollout
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.limits import DAMAGED, Events, Members, RateLimit, sender
 from congrasp.learner.hub.queue import RolloutQueue

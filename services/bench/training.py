@@ -103,13 +103,7 @@ class _Meter:
 
 
 def bench_scaling(
-    config: RunConfig,
-    ranks: Sequence[int],
-    *,
-    seconds: float,
-    actors: int | None,
-    deadline: float,
-    out: pathlib.Path,
+    config: RunConfig, ranks: Sequence[int], *, seconds: float, actors: int | None, deadline: float, out: pathlib.Path
 ) -> None:
     """Measures every number of ranks in turn, prints a table, and writes JSON after each of them.
 

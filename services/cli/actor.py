@@ -49,8 +49,8 @@ class Actor:
         from congrasp.common.runtime.stages import imported, since_start
         from congrasp.common.transport import urls
         from congrasp.common.transport.keys import process_name
+        from congrasp.services.ops.lifetime import on_signal
         from congrasp.services.ops.metrics import ActorMetrics
-        from congrasp.services.ops.shutdown import on_signal
 
         name, metrics = urls.name_on_wire(self.id or process_name("actor"), self.certs), ActorMetrics()
 

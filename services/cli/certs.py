@@ -10,10 +10,7 @@ Role = Literal["learner", "actor", "server", "client", "observer"]
 
 
 def init(
-    folder: Folder = pathlib.Path("certs"),
-    run: str = "quickstart",
-    host: tuple[str, ...] = (),
-    force: bool = False,
+    folder: Folder = pathlib.Path("certs"), run: str = "quickstart", host: tuple[str, ...] = (), force: bool = False
 ) -> int:
     """Create a private authority, and number 0 of every role: all that a run on one machine needs.
 

@@ -175,11 +175,7 @@ class Import:
             task = progress.add_task("Reading", total=None)
             sequences = importer.read(self.path, Meshes(self.meshes), own_mano_model(self.mano))
             objects, sets, report = import_sets(
-                sequences,
-                hand,
-                options,
-                self.format,
-                lambda doing: progress.update(task, description=doing, advance=1),
+                sequences, hand, options, self.format, lambda doing: progress.update(task, description=doing, advance=1)
             )
         if not report.kept and not report.dropped:
             raise CongraspError(
@@ -244,10 +240,7 @@ def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathl
 
 
 def show(
-    file: Annotated[pathlib.Path, tyro.conf.Positional],
-    png: pathlib.Path | None = None,
-    rest: int = 0,
-    seed: int = 0,
+    file: Annotated[pathlib.Path, tyro.conf.Positional], png: pathlib.Path | None = None, rest: int = 0, seed: int = 0
 ) -> int:
     """Print the content of a constraint set, and draw some of it.
 

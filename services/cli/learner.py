@@ -80,7 +80,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
     from congrasp.common.transport import urls
     from congrasp.learner.distributed.ranks import Ranks, end_process
     from congrasp.learner.run_directory import listening
-    from congrasp.services.ops.shutdown import on_signal
+    from congrasp.services.ops.lifetime import on_signal
     from congrasp.services.train.learn import learn, longest_rollout
 
     run_dir, rank, config = options.run_dir, options.rank, with_hand(config, options.hand)

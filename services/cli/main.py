@@ -20,8 +20,8 @@ from typing import Any, TextIO
 import congrasp
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.io.files import cache_folder, can_cache, check_output
+from congrasp.services.ops.lifetime import SIGNALS, follow_parent, on_signal
 from congrasp.services.ops.logs import announced, log_error
-from congrasp.services.ops.shutdown import SIGNALS, follow_parent, on_signal
 
 COMMANDS = {
     "train": "train a policy: a learner and its actors on this machine",

@@ -306,8 +306,7 @@ def set_affordance(
         found = affordance.in_half_space(obj, half_space[:3], half_space[3])
     if (found != invert).all():
         raise CongraspError(
-            f"All of the surface of '{obj.name}' would be graspable, so nothing is divided.",
-            "Choose a smaller part.",
+            f"All of the surface of '{obj.name}' would be graspable, so nothing is divided.", "Choose a smaller part."
         )
     labelled = affordance.two_parts(obj, found != invert, name)
     file = Catalogue(folder).add(labelled)

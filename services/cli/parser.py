@@ -31,13 +31,7 @@ def of_command(
     def parse(rest: list[str]) -> Callable[[], Any]:
         bound = functools.partial(_deferred(command), **defaults(rest))
         with _epilog(examples(command)):
-            return tyro.cli(
-                bound,
-                prog=prog,
-                args=rest,
-                config=(tyro.conf.DisallowNone,),
-                registry=_REGISTRY,
-            )
+            return tyro.cli(bound, prog=prog, args=rest, config=(tyro.conf.DisallowNone,), registry=_REGISTRY)
 
     return parse
 

@@ -11,7 +11,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.policy.pretrained import pretrained_hands
 from congrasp.services.cli.console import in_range, tracked
 from congrasp.services.evaluate.lineup import Entrant, read_entrants
-from congrasp.services.ops.children import command
+from congrasp.services.ops.lifetime import command
 from congrasp.services.reproduce.comparison import JSON, LATEX, PAGE, summary
 from congrasp.services.reproduce.plan import BASELINES, RequiredPolicy, policies
 from congrasp.services.reproduce.run import Request, reproduce, to_train

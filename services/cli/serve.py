@@ -53,8 +53,8 @@ class Serve:
         from congrasp.common.policy.pretrained import policy_file
         from congrasp.common.transport import urls
         from congrasp.common.transport.keys import Keys
+        from congrasp.services.ops.lifetime import on_signal
         from congrasp.services.ops.metrics import ServerMetrics
-        from congrasp.services.ops.shutdown import on_signal
         from congrasp.services.serve.server import PolicyServer, follow_file, follow_run
 
         if self.policy is not None and self.connect:

@@ -1,10 +1,29 @@
 """`congrasp view`: the constraint studio, and the training window, in a browser."""
 
+import contextlib
 import dataclasses
+import functools
 import pathlib
+import threading
+from collections.abc import Callable, Iterator
 from typing import Annotated
 
 import tyro
+
+from congrasp.common.errors import CongraspError, TransportError
+from congrasp.common.policy.pretrained import hands_with_policy, policy_file
+from congrasp.common.transport import urls
+from congrasp.common.transport.base import Transport
+from congrasp.common.transport.security import check_exposure
+from congrasp.learner.run_directory import LOGS, POLICY_FILE, learner_url, open_run
+from congrasp.services.ops.lifetime import on_signal
+from congrasp.services.ops.logs import announced, log
+from congrasp.services.serve.server import follow_file, follow_run
+from congrasp.services.studio.catalogue import Importer, offered
+from congrasp.services.studio.grasping import PolicyGrasping
+from congrasp.services.studio.server import PageServer, Sessions
+from congrasp.services.studio.session import Session
+from congrasp.services.studio.training import Follower, Recordings, TrainingWindow
 
 _RUN = "quickstart"
 
@@ -48,29 +67,17 @@ class View:
 
     def __call__(self) -> int:
         """Offers the page until a signal."""
-        import contextlib
-
-        from congrasp.services.ops.logs import announced
-        from congrasp.services.ops.shutdown import on_signal
-
-        starting = contextlib.ExitStack()
-        starting.enter_context(announced("Loading the policies and compiling the studio's rules"))
-        from congrasp.services.studio.app import open_view
-
-        options = dataclasses.asdict(self if self.run_dir is None else self._of_folder(self.run_dir))
-        del options["run_dir"]
-        with on_signal() as stop, starting, open_view(names=options.pop("allow_host"), **options) as url:
-            starting.close()
-            print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
-            stop.wait()
-            return stop.exit_code
+        view = self if self.run_dir is None else self._of_folder(self.run_dir)
+        with contextlib.ExitStack() as starting:
+            starting.enter_context(announced("Loading the policies and compiling the studio's rules"))
+            with on_signal() as stop, view._page() as url:
+                starting.close()
+                print(f"The studio is at {url} (Ctrl-C ends it)", flush=True)
+                stop.wait()
+                return stop.exit_code
 
     def _of_folder(self, run_dir: pathlib.Path) -> "View":
         """The page of a run: of its learner if that responds, else of its newest policy."""
-        from congrasp.common.errors import CongraspError, TransportError
-        from congrasp.common.transport import urls
-        from congrasp.learner.run_directory import POLICY_FILE, learner_url, open_run
-
         if self.connect or self.policy or self.recordings or self.run != _RUN:
             raise CongraspError(
                 f"The folder {run_dir} is in place of --connect, --run, --policy and --recordings.",
@@ -85,6 +92,66 @@ class View:
         except TransportError:
             print(f"No response from the learner of {run_dir}: the page shows its files.")
         return dataclasses.replace(page, policy=policy if policy.is_file() else None)
+
+    @contextlib.contextmanager
+    def _page(self) -> Iterator[str]:
+        """Offers the page while the block runs; yields its address."""
+        if self.policy is not None and self.connect:
+            raise CongraspError(
+                f"The studio can take either {self.policy} or the weights of {self.connect}.",
+                "Give one of --policy and --connect.",
+            )
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        check_exposure(f"tcp/{host}:{self.port}", None, insecure=self.insecure)
+        with contextlib.ExitStack() as stack:
+            window = None
+            if self.connect or self.recordings:
+                recorded = Recordings(self.recordings) if self.recordings else None
+                window = TrainingWindow(self.run if self.connect else _run_of(self.recordings), recorded)
+                # In the background, since reading the curves of a long run takes seconds.
+                threading.Thread(target=window.load, daemon=True, name="curves").start()
+            if window is not None and self.connect:
+                watching = stack.enter_context(urls.connect(self.connect, "observer", certs=self.certs))
+                stack.callback(Follower(watching, window).close)
+                hands = self._of_run(watching, stack)
+            elif self.policy is not None:
+                source = follow_file(self.policy)
+                hands = {"of the policy": functools.partial(PolicyGrasping, source, self.policy.name)}
+            else:
+                hands = _pretrained()
+            loaded = {name: functools.cache(load) for name, load in hands.items()}  # all browsers share programs
+            opened: list[Sessions] = []  # the port is taken before they compile
+            server = PageServer(lambda browser: opened[0].routes(browser), self.host, self.port, self.allow_host)
+            stack.callback(server.close)
+            opened.append(Sessions(lambda: Session(loaded, offered(self.objects), Importer(), window)))
+            stack.callback(opened[0].close)
+            yield server.url
+
+    def _of_run(self, watching: Transport, stack: contextlib.ExitStack) -> dict[str, Callable[[], PolicyGrasping]]:
+        """The policy of a run; the pretrained ones if there is only an observer's certificate."""
+        pulling = watching
+        if self.certs is not None:
+            try:
+                pulling = stack.enter_context(urls.connect(self.connect, "server", certs=self.certs, run=self.run))
+            except CongraspError as error:
+                log("warning", f"{error} The studio grasps with the pretrained policies.")
+                return _pretrained()
+        source = follow_run(pulling, self.run, urls.name_on_wire("studio", self.certs, "server"))
+        return {"of the run": functools.partial(PolicyGrasping, source, f"the run '{self.run}'")}
+
+
+def _pretrained() -> dict[str, Callable[[], PolicyGrasping]]:
+    """The pretrained and custom policies, by the names of their hands."""
+    return {
+        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
+        for name in hands_with_policy()
+    }
+
+
+def _run_of(recordings: pathlib.Path | None) -> str:
+    """The name of a run, from the folder of its recordings."""
+    names = [part for part in recordings.resolve().parts if part != LOGS] if recordings else []
+    return names[-1] if names else ""
 
 
 COMMAND = View

@@ -57,7 +57,7 @@ def warmup(
     from rich.console import Console
 
     from congrasp.common.runtime.stages import imported
-    from congrasp.services.ops.shutdown import on_signal
+    from congrasp.services.ops.lifetime import on_signal
     from congrasp.services.train.command import first_update
     from congrasp.services.train.learn import until_first_update
     from congrasp.services.train.presets import get_preset

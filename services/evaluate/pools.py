@@ -33,13 +33,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.evaluate.episodes import Episodes, Sample, joined
-from congrasp.services.evaluate.experiment import (
-    MEASURED,
-    STRESSED,
-    Experiment,
-    Variation,
-    silent,
-)
+from congrasp.services.evaluate.experiment import MEASURED, STRESSED, Experiment, Variation, silent
 from congrasp.services.evaluate.scores import Row, object_groups, summarise
 
 Exam = Literal["figures", "development"]
@@ -248,10 +242,7 @@ def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | No
     each = -(-experiment.episodes // (pools.size * number))
     advance = experiment.track("Episodes on many objects", experiment.episodes)
     experiment = dataclasses.replace(
-        experiment,
-        constraints=None,
-        episodes=each * pools.size,
-        measured=pools.size * number <= MEASURED,
+        experiment, constraints=None, episodes=each * pools.size, measured=pools.size * number <= MEASURED
     )
     name = experiment.digest(pools.source, pools.size)
     files = [kept / f"{name}-{n:05d}.safetensors" for n in range(number)] if kept else []

@@ -50,13 +50,7 @@ _COLOURS = {
 }
 _OWN = {**_COLOURS, **ARM_ARRAYS}
 """Arrays of motions whose object has colours, or with an arm."""
-FORMATS = {
-    "glb": ".glb",
-    "usd": ".usda",
-    "bvh": ".bvh",
-    "ros2": "",
-    "lerobot": "",
-}
+FORMATS = {"glb": ".glb", "usd": ".usda", "bvh": ".bvh", "ros2": "", "lerobot": ""}
 """Name and suffix of each format; `services.export.<name>` writes it. Those without a suffix are folders."""
 DATASETS = ("lerobot",)
 """Formats that hold several motions, and videos."""

@@ -158,10 +158,7 @@ def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
             _remedy(request, "set another --heading"),
         )
     if request.given("heading", "direction") is None:
-        return (
-            f"'{obj.name}' cannot be approached in any of its resting poses.",
-            _remedy(request, "scale it"),
-        )
+        return (f"'{obj.name}' cannot be approached in any of its resting poses.", _remedy(request, "scale it"))
     down = -matrix(obj.rest_poses[0][3:])[2]
     return (
         "In every resting pose, the hand would have to come through the table.",

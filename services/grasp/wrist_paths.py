@@ -52,11 +52,7 @@ class WristPath(NamedTuple):
 
 
 def read_wrist_path(
-    path: pathlib.Path,
-    *,
-    joint: str = "RightHand",
-    fingers: str = "-y",
-    back: str = "+z",
+    path: pathlib.Path, *, joint: str = "RightHand", fingers: str = "-y", back: str = "+z"
 ) -> WristPath:
     """A wrist's path.
 

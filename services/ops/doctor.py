@@ -51,10 +51,7 @@ class Finding(NamedTuple):
 
 
 def examine(
-    connect: str = "",
-    run: str = "quickstart",
-    folder: pathlib.Path = pathlib.Path(),
-    certs: pathlib.Path | None = None,
+    connect: str = "", run: str = "quickstart", folder: pathlib.Path = pathlib.Path(), certs: pathlib.Path | None = None
 ) -> list[Finding]:
     """Runs all checks, without side effects.
 
@@ -250,10 +247,7 @@ def _learner(connect: str, run: str, certs: pathlib.Path | None = None) -> Itera
 
 
 def doctor(
-    connect: str = "",
-    run: str = "quickstart",
-    folder: pathlib.Path = pathlib.Path(),
-    certs: pathlib.Path | None = None,
+    connect: str = "", run: str = "quickstart", folder: pathlib.Path = pathlib.Path(), certs: pathlib.Path | None = None
 ) -> int:
     """Check this machine and installation: versions, GPU, ports, disk, clock, certificates.
 

@@ -21,10 +21,7 @@ from congrasp.common.transport.ports import LEARNER_URL
 from congrasp.common.wire.codec import Message
 
 _TIMEOUT = 5.0
-_SUMS = {
-    "granted": ("running", "redeemed", "returned", "expired"),
-    "accepted": ("consumed", "dropped", "queued"),
-}
+_SUMS = {"granted": ("running", "redeemed", "returned", "expired"), "accepted": ("consumed", "dropped", "queued")}
 """Counters that are sums of others: no ticket and no accepted rollout is lost."""
 _ROLE = ("role", "name", "incarnation", "version", "lag", "rollouts", "rollouts/s", "steps/s")
 _SHOWN = 100  # most processes in a table

@@ -211,8 +211,7 @@ def _captured(folder: pathlib.Path, track: Track) -> Captured:
     for name in (OBJECTS, CONSTRAINTS):
         if not (folder / name).is_dir():
             raise CongraspError(
-                f"{folder} has no folder '{name}'.",
-                "Run 'congrasp constraints import' in it, or pass another folder.",
+                f"{folder} has no folder '{name}'.", "Run 'congrasp constraints import' in it, or pass another folder."
             )
     return captured(folder / CONSTRAINTS, "all", objects_of(folder / OBJECTS, track=track))
 
@@ -280,10 +279,7 @@ def _policies(request: Request, failed: Mapping[RequiredPolicy, str]) -> _Polici
 def _account(request: Request, found: _Policies, results: Sequence[Result], failures: Sequence[str]) -> Account:
     """Collects the content of the page."""
     trainings = {policy: processes.training_seconds(request.runs / policy.name) or 0.0 for policy in found.entrants}
-    seconds = {
-        "training": sum(trainings.values()),
-        "evaluation": sum(result.about["seconds"] for result in results),
-    }
+    seconds = {"training": sum(trainings.values()), "evaluation": sum(result.about["seconds"] for result in results)}
     where = []
     for policy, one in found.entrants.items():
         took = f", trained in {trainings[policy] / 60:.0f} min" if trainings[policy] else ""

@@ -14,7 +14,7 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.transport.ports import local_url
 from congrasp.services.client.policy import Policy
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.ops.children import Child, command, end_all
+from congrasp.services.ops.lifetime import Child, command, end_all
 
 
 @contextlib.contextmanager

@@ -1,31 +1,41 @@
 """Objects that a studio offers, including uploaded meshes, and pictures of their resting poses."""
 
 import dataclasses
+import functools
 import pathlib
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, cast
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.objects import procedural
+from congrasp.common.objects.pool import HELD_OUT_SEED
 from congrasp.common.objects.spec import GraspObject
-from congrasp.services.assets.objects.options import UNIT_NAMES, guessed_unit, sizes_by_unit
+from congrasp.services.assets.objects.mesh_files import read_mesh
+from congrasp.services.assets.objects.named import objects_at, one_object
+from congrasp.services.assets.objects.options import UNIT_NAMES, ImportOptions, Unit, guessed_unit, sizes_by_unit
 from congrasp.services.studio.server import BadRequest, Picture
 from congrasp.services.viz.object_sheet import rest_picture
 from congrasp.services.viz.sheets import png_of
 
+_FIRST = "mug"  # family of the initial object, unless the user names objects
 _LONGEST_NAME = 255  # bytes, of Linux
 _SIZE = (150, 112)  # pixels of a thumbnail
 
 
-class Importer(Protocol):
-    """Makes objects from meshes."""
+class Importer:
+    """Makes objects from meshes, as `congrasp objects import` does."""
 
     def sides(self, path: pathlib.Path) -> tuple[float, float, float]:
         """The sides of a mesh in its own unit; a CongraspError if it cannot be read."""
+        x, y, z = read_mesh(path).extents.tolist()
+        return x, y, z
 
     def load(self, path: pathlib.Path, unit: str) -> tuple[GraspObject, list[str]]:
         """The object of a mesh in one of the units m, cm, mm and in, with notes for the user."""
+        obj = one_object(path, ImportOptions(unit=cast(Unit, unit)))
+        return obj, list(obj.notes)
 
 
 class Catalogue:
@@ -59,6 +69,20 @@ class Catalogue:
         if name not in self._made:
             self._made[name] = self._makers[name]()
         return self._made[name]
+
+
+def offered(folder: pathlib.Path | None) -> Catalogue:
+    """The user's objects, then one of each procedural family; none is made or imported yet.
+
+    Raises:
+      CongraspError: there is nothing at the path.
+    """
+    makers: dict[str, Callable[[], GraspObject]] = {}
+    if folder is not None:
+        guess = ImportOptions(unit="guess")
+        makers |= {found.name: functools.partial(found.load, guess) for found in objects_at(folder)}
+    families = sorted(procedural.FAMILIES, key=lambda family: family != _FIRST)
+    return Catalogue(makers | {name: functools.partial(procedural.generate, HELD_OUT_SEED, name) for name in families})
 
 
 @dataclasses.dataclass(frozen=True)

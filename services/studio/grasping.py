@@ -25,7 +25,6 @@ from congrasp.services.grasp.approaches import repeated, surface_of
 from congrasp.services.grasp.motion import costs
 from congrasp.services.grasp.reach import with_planned_reach
 from congrasp.services.serve.server import Source
-from congrasp.services.studio.session import SECONDS, Progress
 from congrasp.services.studio.state import tool_of
 
 ATTEMPTS = 8
@@ -36,6 +35,10 @@ _COMPILING = 60
 """Seconds of the first grasp on two cores of a laptop, with an empty compilation cache."""
 _OTHER = 2.0
 """Cost of deviating from the drawn grasp, in addition to the costs of `services.grasp.motion`."""
+SECONDS = "{seconds}"
+"""Placeholder in the text of a job for its elapsed seconds."""
+Progress = Callable[[str, float], None]
+"""(current activity, completed share from 0 to 1)."""
 Held = Callable[[GraspRequest, str], int]
 """(weaker request, name of the omitted constraint) -> number of attempts that hold."""
 

@@ -9,20 +9,18 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from congrasp.actors.attempts import PLAIN, Phases
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
-from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.request import GraspRequest
-from congrasp.common.task.config import TaskConfig
 from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.materials import MATERIALS, with_mass
 from congrasp.services.assets.objects.options import METRES
 from congrasp.services.ops.logs import log
 from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads
+from congrasp.services.studio.grasping import SECONDS, PolicyGrasping, Progress
 from congrasp.services.studio.page import DATA, DRAWN, Motions, data_file, describe, drawing, for_page, hand_message
 from congrasp.services.studio.server import BadRequest, Download, Get, Picture, Routes
 from congrasp.services.studio.state import ACTIONS, History, Studio
@@ -37,23 +35,6 @@ _DRAWING = "drawing"
 """Result of a job that rendered a picture or a video, in place of a motion's number."""
 _LATEST = 1e10
 """Seconds since 1970 beyond which nothing was recorded."""
-SECONDS = "{seconds}"
-"""Placeholder in the text of a job for its elapsed seconds."""
-Progress = Callable[[str, float], None]
-"""(current activity, completed share from 0 to 1)."""
-
-
-class Grasping(Protocol):
-    """A policy that grasps objects."""
-
-    hand: Hand
-    task: TaskConfig
-
-    def newest(self) -> dict[str, Any]:
-        """Source and version of the weights of the last grasp, and the trouble with newer ones."""
-
-    def grasp(self, obj: GraspObject, request: GraspRequest, phases: Phases, progress: Progress) -> Message:
-        """The episode of a grasp with these phases."""
 
 
 class Session:
@@ -61,7 +42,7 @@ class Session:
 
     def __init__(
         self,
-        hands: Mapping[str, Callable[[], Grasping]],
+        hands: Mapping[str, Callable[[], PolicyGrasping]],
         objects: Catalogue,
         importer: Importer,
         window: TrainingWindow | None = None,
@@ -259,7 +240,7 @@ class Session:
         if name not in self._hands:
             raise CongraspError(f"There is no policy for the hand '{name}'.", f"There is: {', '.join(self._hands)}.")
 
-        def show(grasping: Grasping) -> None:
+        def show(grasping: PolicyGrasping) -> None:
             """Begins a request for it."""
             self._hand = name
             self._take_hand(grasping, self._studio.obj)
@@ -278,7 +259,7 @@ class Session:
 
         return self._jobs.start(text, work)
 
-    def _take_hand(self, grasping: Grasping, obj: GraspObject) -> None:
+    def _take_hand(self, grasping: PolicyGrasping, obj: GraspObject) -> None:
         """Opens a studio for a policy's hand."""
         self._grasping = grasping
         self._studio = Studio(grasping.hand, grasping.task, obj)

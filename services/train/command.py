@@ -32,8 +32,8 @@ from congrasp.learner.run_directory import (
 )
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.experiment import Experiment, Variation
+from congrasp.services.ops.lifetime import on_signal
 from congrasp.services.ops.logs import Watch
-from congrasp.services.ops.shutdown import on_signal
 from congrasp.services.serve.load import example_episode, one_answer, serving
 from congrasp.services.train.learn import learn
 from congrasp.services.train.presets import FULL, easier

@@ -24,9 +24,9 @@ from congrasp.learner.algorithms.protocol import rollout_form
 from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import LOGS, create_run, has_checkpoints
+from congrasp.services.ops.lifetime import GRACE
 from congrasp.services.ops.logs import Watch
 from congrasp.services.ops.metrics import LearnerMetrics
-from congrasp.services.ops.shutdown import GRACE
 from congrasp.services.ops.status import ask
 from congrasp.services.record.recorder import recorded
 from congrasp.services.train.processes import engine_of
@@ -172,12 +172,4 @@ def until_first_update(
         run_dir = pathlib.Path(folder, "run")
         config = dataclasses.replace(config, updates=1)
         create_run(run_dir, config, None)
-        learn(
-            run_dir,
-            config,
-            wire=None,
-            inside=engine_of(physics, False),
-            stop=stop,
-            on_update=updated,
-            grace=_GRACE,
-        )
+        learn(run_dir, config, wire=None, inside=engine_of(physics, False), stop=stop, on_update=updated, grace=_GRACE)

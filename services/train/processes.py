@@ -33,7 +33,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import LEARNER_URL, local_url, rank_url, reachable_url
 from congrasp.common.transport.security import CERTIFICATE_FILE, check_exposure
 from congrasp.learner.run_directory import CONFIG_FILE, LOGS, POLICY_FILE, has_checkpoints
-from congrasp.services.ops.children import CHILD_GRACE, Child, command, end_all, run_child, wait_for
+from congrasp.services.ops.lifetime import CHILD_GRACE, Child, command, end_all, run_child, wait_for
 
 MAX_RESTARTS = 5
 _BAD_INPUT = 2

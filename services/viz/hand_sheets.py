@@ -40,10 +40,7 @@ def _frame(hand: Hand) -> list[Shape]:
     reach = 0.7 * frame.opening
     ends = frame.center + np.outer([-0.5, 0.5], frame.opening * frame.cross)
     forward = turn.apply(np.array([frame.center - reach * frame.heading, frame.center]))
-    return [
-        *arrow(forward[0], forward[1], 0.0028, HEADING),
-        beads(turn.apply(ends), 0.005, WAYPOINT),
-    ]
+    return [*arrow(forward[0], forward[1], 0.0028, HEADING), beads(turn.apply(ends), 0.005, WAYPOINT)]
 
 
 def _side(hand: Hand) -> np.ndarray:

@@ -117,13 +117,7 @@ def episode_sheet(
 
 
 def episode_strip(
-    episode: Message,
-    frames: int,
-    size: tuple[int, int],
-    first: str,
-    last: str,
-    *,
-    until: int | None = None,
+    episode: Message, frames: int, size: tuple[int, int], first: str, last: str, *, until: int | None = None
 ) -> tuple[list[np.ndarray], list[str]]:
     """A contact sheet's row: pictures of an episode's key frames, and their labels.
 
@@ -138,11 +132,7 @@ def episode_strip(
     table = np.asarray(episode.arrays["table"], bool)
     steps = key_steps(table if until is None else table[: until + 1], frames)
     seconds = [f"{episode.meta['control_dt'] * step:.2f} s" for step in steps]
-    return list(render_episode_frames(episode, steps, size)), [
-        first,
-        *seconds[1:-1],
-        f"{seconds[-1]}{last}",
-    ]
+    return list(render_episode_frames(episode, steps, size)), [first, *seconds[1:-1], f"{seconds[-1]}{last}"]
 
 
 def grasp_steps(episode: Message) -> tuple[int, int]:

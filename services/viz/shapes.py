@@ -81,12 +81,7 @@ class Camera:
 
 
 def between(
-    start: np.ndarray,
-    end: np.ndarray,
-    radius: float,
-    colour: tuple[float, float, float],
-    *,
-    shadow: bool = True,
+    start: np.ndarray, end: np.ndarray, radius: float, colour: tuple[float, float, float], *, shadow: bool = True
 ) -> Shape:
     """A capsule from `start` to `end` (3,), or a ball if they coincide; for the other arguments see `Shape`."""
     along = np.subtract(end, start)

@@ -11,12 +11,13 @@ import pytest
 from congrasp.actors.harvest import Grasps, renew, save_references, with_kept_references
 from congrasp.common import rotations as module
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.kinematics import capsules, grasp_frame, link_transforms
+from congrasp.common.hands.kinematics import capsules, link_transforms
 from congrasp.common.task.sampling.bank import SHARED, surface_of
 from congrasp.common.task.sampling.build import POSES, bank_form, build_bank, make_references
 from congrasp.common.task.sampling.closed_poses import Poses
 from tests import task as suite
 from tests.compiled import Compiled
+from tests.scenes import pointing
 from tests.task import HAND, TASK
 
 OBJECTS = [suite.OBJECTS[3], suite.OBJECTS[0]]  # a hammer and a box
@@ -47,14 +48,6 @@ def test_headings_of_a_flat_object_stay_above_the_table(bank):
     assert (np.asarray(bank.heading_back) <= 0.03 + 1e-5).all()
 
 
-def _pointing(z: float) -> jax.Array:
-    """(4,) wrist orientation whose heading axis points up (1) or down (-1)."""
-    frame = grasp_frame(HAND)
-    own = rotations.frame_from_axes(jnp.array(frame.heading), jnp.array(frame.cross))
-    target = rotations.frame_from_axes(jnp.array([0.0, 0.0, z]), jnp.array([1.0, 0.0, 0.0]))
-    return rotations.multiply(target, rotations.conjugate(own))
-
-
 def test_normals_belong_to_the_points_of_their_object(bank):
     for n, obj in enumerate(OBJECTS):
         place = np.linalg.norm(obj.points[:, None] - np.asarray(bank.points[n]), axis=-1).argmin(0)
@@ -67,7 +60,7 @@ def test_normals_belong_to_the_points_of_their_object(bank):
 
 def test_references_with_fingers_in_the_table_are_not_valid():
     """From above, the lowest finger a centimetre over the table and a centimetre in it."""
-    q, down = jnp.zeros((1, F)), _pointing(-1.0)
+    q, down = jnp.zeros((1, F)), pointing(-1.0)
     ends = ends_of(q)
     height = rotations.rotate(jnp.broadcast_to(down, (len(ends), 4)), ends)[:, 2]
     reach = float(jnp.max(np.repeat(HAND.capsule_radii, 2) - height))
@@ -118,7 +111,7 @@ def _grasps(angle: float, count: int = 4) -> Grasps:
     """Grasps of the graspable region of the second object from straight above, of which `count` were found."""
     second, above = jnp.ones(4, int), jnp.array([[0.0, 0.0, 0.2]] * 4)
     return Grasps(
-        jnp.arange(4) < count, second, second, jnp.full((4, F), angle), above, jnp.stack([_pointing(-1.0)] * 4)
+        jnp.arange(4) < count, second, second, jnp.full((4, F), angle), above, jnp.stack([pointing(-1.0)] * 4)
     )
 
 

@@ -1,8 +1,6 @@
 """An engine that only this file knows: it is registered here, and episodes and tables are made on it."""
 
 import queue
-import subprocess
-import sys
 import threading
 
 import numpy as np
@@ -14,6 +12,7 @@ from congrasp.common.config import RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from tests import task as suite
+from tests.children import python
 from tests.task import BATCH, HAND, OBJECTS, TASK
 
 
@@ -78,6 +77,6 @@ def test_command_lines_offer_it():
         "from congrasp.actors.physics import ENGINES, Engine; from congrasp.services.cli.main import run; "
         "ENGINES['counting'] = Engine(None, batch=1); run(['train', '--help'])"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    done = python("-c", program)
     assert "--physics {auto,warp,jax,native,counting}" in done.stdout
     assert "(default: native)" in done.stdout.split("--physics")[1][:200]

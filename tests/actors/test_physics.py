@@ -11,7 +11,6 @@ import pytest
 
 from congrasp.actors.physics import make_physics, resolve_physics
 from congrasp.actors.physics.engine import ResetState
-from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.physics.scene import TABLE_AWAY, compile_scene, scene_spec
 from congrasp.actors.physics.slots import LEAVES, Pool
 from congrasp.common import rotations
@@ -75,9 +74,9 @@ def servoed(start: ResetState) -> tuple[ResetState, np.ndarray]:
     return start, np.concatenate([np.full((batch, 6), 0.01), np.asarray(start.q) + 0.1], 1).astype(np.float32)
 
 
-def test_gains_scale_the_finger_servos_alone(env):
+def test_gains_scale_the_finger_servos_alone(native, env):
     """After one substep a joint at rest has the speed that the torque kp * ahead gave it: proportional to the gain."""
-    physics = NativePhysics(HAND, dataclasses.replace(TASK, control_dt=0.0005, substeps=1), [OBJECTS[0]] * 3, 1)
+    physics = native([OBJECTS[0]] * 3, dataclasses.replace(TASK, control_dt=0.0005, substeps=1))
     start, target = servoed(env._replace(object_index=np.zeros(ENVIRONMENTS, int)))
     state = physics.start(start)
     _, after = physics.step(state, target, np.ones(ENVIRONMENTS, bool))
@@ -88,11 +87,10 @@ def test_gains_scale_the_finger_servos_alone(env):
     np.testing.assert_allclose(gains[:, 6:], gains[1, 6:] * np.array([[1.0], [1.0], [1.5]]))
     np.testing.assert_array_equal(gains[:, :6], gains[[1, 1, 1], :6])  # of the wrist
     np.testing.assert_array_equal(*(physics.instances[i].model.actuator_forcerange for i in (0, 2)))
-    physics.close()
 
 
-def test_objects_rest_and_the_hand_stays_without_commands(env):
-    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+def test_objects_rest_and_the_hand_stays_without_commands(native, env):
+    physics = native(OBJECTS)
     state = physics.start(above(env, 0.3))
     still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.q)], 1)
     for _ in range(50):
@@ -100,11 +98,10 @@ def test_objects_rest_and_the_hand_stays_without_commands(env):
     np.testing.assert_allclose(after.object_position, env.object_position, atol=2e-3)
     np.testing.assert_allclose(after.q, env.q, atol=1e-3)  # gravity on the hand is compensated
     assert not after.contact_found.any() and not after.diverged.any()
-    physics.close()
 
 
-def test_a_removed_table_lets_objects_fall_freely(env):
-    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+def test_a_removed_table_lets_objects_fall_freely(native, env):
+    physics = native(OBJECTS)
     state = physics.start(above(env, 0.3))
     still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.q)], 1)
     table = np.array([True, False, False])
@@ -113,11 +110,10 @@ def test_a_removed_table_lets_objects_fall_freely(env):
     drop = np.asarray(env.object_position)[:, 2] - after.object_position[:, 2]
     assert abs(drop[0]) < 2e-3
     np.testing.assert_allclose(drop[1:], 0.5 * 9.81 * 0.2**2, rtol=0.05)
-    physics.close()
 
 
-def test_a_stationary_object_stays_when_pushed(env):
-    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+def test_a_stationary_object_stays_when_pushed(native, env):
+    physics = native(OBJECTS)
     start = above(env, 0.19)._replace(stationary=np.ones(ENVIRONMENTS, bool))
     state = physics.start(start)
     touched = np.zeros(ENVIRONMENTS, bool)
@@ -126,13 +122,12 @@ def test_a_stationary_object_stays_when_pushed(env):
         touched |= after.contact_found.any((1, 2))
     assert touched.any()
     np.testing.assert_allclose(after.object_position, env.object_position, atol=4e-3)
-    physics.close()
 
 
-def test_a_scaled_mass_is_the_mass_of_a_heavier_object(env):
+def test_a_scaled_mass_is_the_mass_of_a_heavier_object(native, env):
     """Its inertia and the weights of its constraints change with it."""
     heavy = [dataclasses.replace(obj, mass=3 * obj.mass, inertia=3 * obj.inertia) for obj in OBJECTS]
-    scaled, compiled = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, heavy, 1)
+    scaled, compiled = native(OBJECTS), native(heavy)
     scaled.start(env._replace(mass_scale=np.full(ENVIRONMENTS, 3.0)))
     compiled.start(env._replace(mass_scale=np.ones(ENVIRONMENTS)))
     names = {name for name in dir(mujoco.MjModel) if name.startswith(("body_", "dof_"))} - {"dof_M0"}  # the compiler's
@@ -141,14 +136,12 @@ def test_a_scaled_mass_is_the_mass_of_a_heavier_object(env):
             if isinstance(value := getattr(ours.model, name), np.ndarray):
                 world = name.startswith("body_")  # nothing depends on the mass of everything together
                 np.testing.assert_allclose(value[world:], getattr(theirs.model, name)[world:], 1e-5, 1e-9, err_msg=name)
-    scaled.close()
-    compiled.close()
 
 
-def test_contact_force_is_that_of_the_object_on_the_link(env):
+def test_contact_force_is_that_of_the_object_on_the_link(native, env):
     """An object that lies on a flat, upturned hand presses it down with its weight."""
     box = dataclasses.replace(OBJECTS[0])
-    physics = NativePhysics(HAND, TASK, [box], 1)
+    physics = native([box])
     height = float(np.abs(box.points[:, 2]).max())
     start = suite.start_of(
         base_position=np.array([[0.0, -0.05, 0.5]]),
@@ -162,12 +155,11 @@ def test_contact_force_is_that_of_the_object_on_the_link(env):
         state, after = physics.step(state, np.zeros((1, 6 + len(HAND.joints))), np.ones(1, bool))
         forces.append(after.contact_force.sum((1, 2))[0])
     np.testing.assert_allclose(np.mean(forces[-40:], 0)[2], -box.mass * 9.81, rtol=0.1)
-    physics.close()
 
 
-def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(env, tmp_path, monkeypatch):
+def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(native, env, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    physics = NativePhysics(HAND, TASK, OBJECTS, 2)
+    physics = native(OBJECTS, threads=2)
     start = above(env, 0.3)
     state = physics.start(start)
     still = np.concatenate([np.zeros((ENVIRONMENTS, 6)), np.asarray(env.q)], 1)
@@ -180,12 +172,11 @@ def test_a_diverged_environment_is_marked_and_put_back_while_the_others_go_on(en
     state, after = physics.step(state, still, np.ones(ENVIRONMENTS, bool))
     assert not after.diverged.any()
     assert not list(tmp_path.iterdir()), "MuJoCo wrote its own log"
-    physics.close()
 
 
-def test_environments_whose_solver_reached_its_limit_are_counted(env):
+def test_environments_whose_solver_reached_its_limit_are_counted(native, env):
     start = jax.tree.map(np.asarray, env)
-    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+    physics = native(OBJECTS)
     state = physics.start(start)
     target, table = grasp(start, 0), np.ones(ENVIRONMENTS, bool)
     for limited in (0, 1, 2):
@@ -195,12 +186,11 @@ def test_environments_whose_solver_reached_its_limit_are_counted(env):
             instance.model.opt.iterations = 1
         state, after = physics.step(state, target, table)
         np.testing.assert_allclose(after.occupancy, [0.0, 0.0, limited / ENVIRONMENTS], rtol=1e-6)
-    physics.close()
 
 
-def test_an_environment_that_was_used_before_is_as_good_as_new(env):
+def test_an_environment_that_was_used_before_is_as_good_as_new(native, env):
     """Worlds are recycled: neither state nor mass of an earlier episode may be left in them."""
-    physics, fresh = NativePhysics(HAND, TASK, OBJECTS, 1), NativePhysics(HAND, TASK, OBJECTS, 1)
+    physics, fresh = native(OBJECTS), native(OBJECTS)
     start = above(env, 0.19)
     everywhere = np.ones(ENVIRONMENTS, bool)
     state = physics.start(start._replace(mass_scale=np.full(ENVIRONMENTS, 3.0), stationary=everywhere))
@@ -214,12 +204,10 @@ def test_an_environment_that_was_used_before_is_as_good_as_new(env):
     assert after.contact_found.any()
     for a, b in zip(after, expected, strict=True):
         np.testing.assert_array_equal(a, b)
-    physics.close()
-    fresh.close()
 
 
-def test_reset_changes_only_the_masked_environments(env):
-    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+def test_reset_changes_only_the_masked_environments(native, env):
+    physics = native(OBJECTS)
     start = above(env, 0.3)
     state = physics.start(start)
     moving = np.concatenate([np.full((ENVIRONMENTS, 6), 0.05), np.asarray(start.q)], 1)
@@ -230,7 +218,6 @@ def test_reset_changes_only_the_masked_environments(env):
     after = physics.read(state)
     np.testing.assert_allclose(after.u[1], 0.0)
     np.testing.assert_allclose(after.u[~mask], before.u[~mask], atol=1e-7)
-    physics.close()
 
 
 def test_slots_are_the_same_bodies_as_models_of_their_own():
@@ -260,55 +247,65 @@ def optimised():
     jax.config.update(name, before)
 
 
-@pytest.mark.timeout(900)
-@pytest.mark.slow
-def test_jax_agrees_with_native(env, optimised):
-    """Free motion agrees tightly, a scripted grasp statistically; three different objects in one batch."""
-    start = above(env, 0.2)
-    # Without the hand's contacts with itself and the table, which take minutes to compile there.
-    task = dataclasses.replace(TASK, hand_self_collision=False, hand_table_collision=False)
-    native = NativePhysics(HAND, task, OBJECTS, 1)
-    other = make_physics("jax", HAND, task, OBJECTS, threads=1)
-    step = jax.jit(other.step)
-    device = jax.devices()[0]  # a state that is on no certain one would have the step compiled once more
-    a, b = native.start(start), jax.device_put(other.start(jax.tree.map(jnp.asarray, start)), device)
-    table = np.ones(ENVIRONMENTS, bool)
-    force = np.zeros((2, ENVIRONMENTS))
-    for i in range(40):
-        target = grasp(start, i)
-        a, x = native.step(a, target, table)
-        b, y = step(b, jnp.asarray(target, jnp.float32), jnp.asarray(table))
-        if not x.contact_found.any() and i < 10:
+def side_by_side(native, step, start, state, targets):
+    """Measurements of both engines after each step, and the state of the other, whose step this is."""
+    ours, table = native.start(start), np.ones(len(start.q), bool)
+    for target in targets:
+        ours, x = native.step(ours, target, table)
+        state, y = step(state, jnp.asarray(target, jnp.float32), jnp.asarray(table))
+        yield x, y, state
+
+
+def agreeing(native, step, start, begin):
+    """A scripted grasp, which agrees tightly until something is touched and squeezed, statistically after that."""
+    force, targets = np.zeros((2, len(start.q))), [grasp(start, i) for i in range(40)]
+    for i, (x, y, state) in enumerate(side_by_side(native, step, start, begin, targets)):
+        if i < 10:
+            assert not x.contact_found.any()
             for name in ("q", "u", "object_position", "q_velocity", "u_velocity"):
                 np.testing.assert_allclose(getattr(x, name), getattr(y, name), atol=2e-4, err_msg=f"{name} at {i}")
-        assert not x.occupancy[:2].any() and not y.occupancy.any()
         force += [np.linalg.norm(after.contact_force, axis=-1).sum((1, 2)) for after in (x, y)]
-    assert force[0].max() > 0, "the script must make contact"
+        yield i, x, y, state
+    assert (force[0] > 0).all(), "the script must touch every object"
     assert not np.asarray(y.diverged).any()
+    np.testing.assert_allclose(x.object_position, y.object_position, atol=0.03)
+    np.testing.assert_allclose(force[0], force[1], rtol=0.35, atol=20.0)
+
+
+def _begun(engine, start):
+    """A state on a certain device: another would have the step compiled once more."""
+    return jax.device_put(engine.start(jax.tree.map(jnp.asarray, start)), jax.devices()[0])
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.slow
+def test_jax_agrees_with_native(native, env, optimised):
+    """Three different objects in one batch."""
+    start = above(env, 0.19)
+    # Without the hand's contacts with itself and the table, which take minutes to compile there.
+    task = dataclasses.replace(TASK, hand_self_collision=False, hand_table_collision=False)
+    engine, other = native(OBJECTS, task), make_physics("jax", HAND, task, OBJECTS, threads=1)
+    step = jax.jit(other.step)
+    *_, (_, x, y, b) = steps = [*agreeing(engine, step, start, _begun(other, start))]
+    assert not any(x.occupancy[:2].any() or y.occupancy.any() for _, x, y, _ in steps)
     # A finger that slips a step earlier lands elsewhere, so not every joint; nearly all of them, though.
     apart = np.abs(np.asarray(x.q) - np.asarray(y.q))
     assert np.quantile(apart, 0.95) < 0.15 and np.median(apart) < 0.02, np.sort(apart.ravel())
-    np.testing.assert_allclose(x.object_position, y.object_position, atol=0.03)
-    np.testing.assert_allclose(force[0], force[1], rtol=0.35, atol=20.0)
     # A reset puts the masked environments back and leaves the rest.
     mask = jnp.array([True, False, False])
     again = other.read(other.reset(b, mask, jax.tree.map(jnp.asarray, start)))
     np.testing.assert_allclose(again.u[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(again.u[1:], y.u[1:], atol=1e-6)
     start, target = servoed(env)
-    a, b = native.start(start), jax.device_put(other.start(jax.tree.map(jnp.asarray, start)), device)
-    for _ in range(5):
-        (a, x), (b, y) = native.step(a, target, table), step(b, jnp.asarray(target), jnp.asarray(table))
+    *_, (x, y, _) = side_by_side(engine, step, start, _begun(other, start), [target] * 5)
     np.testing.assert_allclose(x.q, y.q, atol=2e-4)
-    native.close()
 
 
-def test_environments_that_do_not_fit_into_the_memory_are_one_clear_line(env, monkeypatch):
+def test_environments_that_do_not_fit_into_the_memory_are_one_clear_line(native, env, monkeypatch):
     monkeypatch.setattr("congrasp.actors.physics.native.memory", lambda: 1_500_000)
-    native = NativePhysics(HAND, TASK, OBJECTS, 1)
+    physics = native(OBJECTS)
     with pytest.raises(CongraspError, match=r"environments of MuJoCo C need .* GB are free.*smaller --environments"):
-        native.start(env)
-    native.close()
+        physics.start(env)
 
 
 def test_a_demanded_gpu_that_is_missing_is_one_clear_line():
@@ -317,8 +314,8 @@ def test_a_demanded_gpu_that_is_missing_is_one_clear_line():
     assert resolve_physics("auto") == "native"
 
 
-def test_object_velocity_is_in_the_world_frame(env):
-    physics = NativePhysics(HAND, TASK, OBJECTS, 1)
+def test_object_velocity_is_in_the_world_frame(native, env):
+    physics = native(OBJECTS)
     state = physics.start(above(env, 0.3))
     instance = physics.instances[0]
     spin = np.array([0.0, 0.0, 3.0])  # about the world's vertical
@@ -327,7 +324,6 @@ def test_object_velocity_is_in_the_world_frame(env):
     instance.data.qvel[physics._where.object_qvel[3:]] = local
     physics._qpos[0], physics._qvel[0] = instance.data.qpos, instance.data.qvel
     np.testing.assert_allclose(physics.read(state).object_angular_velocity[0], spin, atol=1e-5)
-    physics.close()
 
 
 PLAIN = TaskConfig()

@@ -10,12 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from congrasp.actors.env import GraspEnv, episode_fields, metric_names
+from congrasp.actors.episode import _geometry
 from congrasp.actors.physics.engine import PhysicsState, where_environments
 from congrasp.actors.physics.native import NativePhysics
 from congrasp.actors.rollout import Programs, finished_episodes, no_probe
 from congrasp.actors.worker import RolloutWorker
 from congrasp.common import chance, rotations
 from congrasp.common.hands.kinematics import capsules, grasp_frame, keypoints, link_transforms
+from congrasp.common.objects import procedural
 from congrasp.common.task.constraints import blocks
 from congrasp.common.task.geometry import hand_center
 from congrasp.common.task.observation import layout
@@ -359,3 +361,9 @@ def _equations(program) -> int:
 def _programs_in(value):
     values = value if isinstance(value, (tuple, list)) else (value,)
     return [getattr(one, "jaxpr", one) for one in values if hasattr(one, "eqns") or hasattr(one, "jaxpr")]
+
+
+def test_sizes_are_real_numbers_for_objects_of_meshes_too():
+    bowl = procedural.generate(3, "bowl")
+    assert {piece.kind for piece in bowl.pieces} == {"mesh"}
+    assert _geometry(bowl)["piece_size"].dtype == float

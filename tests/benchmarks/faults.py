@@ -49,9 +49,11 @@ _RESTARTS = 4  # deaths of one child after which `congrasp train` is started aga
 class Run:
     """A small real run of `congrasp train` in a directory, which can be killed, stopped, resumed and observed."""
 
-    def __init__(self, run_dir: pathlib.Path, actors: int):
-        """Starts nothing yet."""
-        self.run_dir, self._count = run_dir, actors
+    def __init__(
+        self, run_dir: pathlib.Path, actors: int, options: Sequence[str] = _OPTIONS, output: int = subprocess.DEVNULL
+    ):
+        """Starts nothing yet; `output` takes what it prints."""
+        self.run_dir, self._count, self._options, self._output = run_dir, actors, options, output
         self._transport: Transport | None = None
         self.process: psutil.Popen | None = None
 
@@ -59,8 +61,8 @@ class Run:
         """Begins the run, or resumes it, and waits until its learner has taken rollouts from all actors."""
         command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(self.run_dir), "--metric-writers"]
         command += ["--actors", str(self._count), "--evaluation", "0"]
-        command += ["--resume"] if (self.run_dir / "config.json").exists() else _OPTIONS
-        self.process = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        command += ["--resume"] if (self.run_dir / "config.json").exists() else self._options
+        self.process = psutil.Popen(command, stdout=self._output, stderr=subprocess.STDOUT, text=True)
         self._transport = urls.connect(until(self._endpoint), "observer", wait=_DEADLINE)
         until(lambda: len(seen := self._rollouts()) >= self._count and min(seen) > 1)
 
@@ -178,11 +180,12 @@ def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed
     console = Console(width=None if sys.stdout.isatty() else 140)
     results: list[Result] = []
     for kind in kinds or FAULTS:
-        with tempfile.TemporaryDirectory(prefix="congrasp-") as folder, _disk(folder, kind) as disk:
-            if disk is None:
+        disk = _DISK if kind == "full-disk" else 0
+        with tempfile.TemporaryDirectory(prefix="congrasp-") as folder, small_disk(folder, disk) as there:
+            if not there:
                 console.print(f"{kind}: left out, for file systems cannot be mounted here.")
                 continue
-            results.append(_measure(kind, Run(disk / "run", actors), repeats, random.Random(seed)))
+            results.append(_measure(kind, Run(pathlib.Path(folder, "run"), actors), repeats, random.Random(seed)))
         last = results[-1]
         console.print(f"{kind}: {'nothing lost' if last.fine else last.report.faults[:5]}; {_rest(last)}")
     console.print(_table(results, actors))
@@ -253,10 +256,7 @@ def _freeze_child(role: str) -> Fault:
 
 def _fill_disk(run: Run, rng: random.Random) -> None:
     """Lets the disk of the run be full for some seconds, and kills all processes at the end of every second time."""
-    filler = run.run_dir.parent / "filler"
-    with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
-        while True:
-            file.write(bytes(4096))
+    filler = fill(run.run_dir.parent)
     time.sleep(_FULL)
     if rng.random() < 0.5:
         run.kill()
@@ -296,19 +296,26 @@ FAULTS: dict[str, Fault] = {
 
 
 @contextlib.contextmanager
-def _disk(folder: str, kind: str) -> Iterator[pathlib.Path | None]:
-    """Where a run can be: the folder, or a small disk of its own there; None if that cannot be mounted."""
-    if kind != "full-disk":
-        yield pathlib.Path(folder)
-        return
-    command = ["mount", "-t", "tmpfs", "-o", f"size={_DISK}", "tmpfs", folder]
-    if not shutil.which("mount") or subprocess.run(command, capture_output=True, timeout=10).returncode:
-        yield None
+def small_disk(folder: str, size: int) -> Iterator[bool]:
+    """Makes a folder a disk of `size` bytes, if that is above 0; yields False if that cannot be mounted."""
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder]
+    if size and (not shutil.which("mount") or subprocess.run(command, capture_output=True, timeout=10).returncode):
+        yield False
         return
     try:
-        yield pathlib.Path(folder)
+        yield True
     finally:
-        subprocess.run(["umount", "-l", folder], timeout=10, check=True)
+        if size:
+            subprocess.run(["umount", "-l", folder], timeout=10, check=True)
+
+
+def fill(disk: pathlib.Path) -> pathlib.Path:
+    """Fills a disk; returns the file that does."""
+    filler = disk / "filler"
+    with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
+        while True:
+            file.write(bytes(1024))
+    return filler
 
 
 def _rest(result: Result) -> str:

@@ -1,4 +1,4 @@
-"""Invariants of procedural objects, for any family and seed."""
+"""Procedural objects of any family and seed, the pools made of them, and objects on disk."""
 
 import itertools
 
@@ -9,10 +9,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
+from congrasp.common.config import ObjectsConfig
 from congrasp.common.errors import CongraspError
-from congrasp.common.objects import shapes
+from congrasp.common.objects import procedural, shapes
 from congrasp.common.objects.families import BUILDERS
 from congrasp.common.objects.mjcf import add_object
+from congrasp.common.objects.pool import HELD_OUT_SEED, first_seed, load_pool
 from congrasp.common.objects.procedural import (
     BASIC_FAMILIES,
     FAMILIES,
@@ -25,7 +27,7 @@ from congrasp.common.objects.procedural import (
 from congrasp.common.objects.resting import TableScene
 from congrasp.common.objects.shapes import sample_union
 from congrasp.common.objects.spec import MAX_MESH_VERTICES, PRIMITIVE_SLOTS, SURFACE_POINTS
-from congrasp.common.objects.store import digest
+from congrasp.common.objects.store import Catalogue, digest, load, save
 from tests.solids import mujoco_mass_properties
 
 MOST_MESHES = 13  # what environments have room for is sized by the object with the most
@@ -191,3 +193,92 @@ def test_unknown_families_and_negative_seeds_are_named():
         generate_many(2, 0, ("box", "cat"))
     with pytest.raises(CongraspError, match="seed -1 is negative"):
         generate(-1)
+
+
+# --- pools ---
+
+
+def test_actors_have_objects_of_their_own():
+    config = ObjectsConfig(count=2, seed=3, families=("box",))
+    pools = [[obj.name for obj in load_pool(config, shift)] for shift in (0, 1)]
+    assert pools == [["box_3", "box_4"], ["box_5", "box_6"]]
+
+
+@given(st.integers(0, HELD_OUT_SEED - 1), st.integers(1, 5000), st.integers(0, 2**32 - 1))
+def test_training_never_touches_the_objects_of_evaluation(seed, count, shift):
+    first = first_seed(ObjectsConfig(seed=seed, count=count), shift)
+    assert first >= 0 and first + count <= HELD_OUT_SEED
+
+
+@given(st.integers(0, HELD_OUT_SEED - 1), st.integers(1, 5000), st.integers(0, 2**32), st.integers(0, 2**32))
+def test_actors_share_no_object_while_there_are_enough(seed, count, one, other):
+    actors = (HELD_OUT_SEED - seed % count) // count
+    firsts = [first_seed(ObjectsConfig(seed=seed, count=count), shift % actors) for shift in (one, other)]
+    assert one % actors == other % actors or abs(firsts[0] - firsts[1]) >= count
+
+
+def test_evaluation_has_the_same_objects_everywhere():
+    config = ObjectsConfig(count=2, seed=HELD_OUT_SEED + 7)
+    assert first_seed(config, 0) == first_seed(config, 123) == HELD_OUT_SEED + 7
+
+
+def test_a_folder_gives_all_its_objects_whoever_asks(tmp_path):
+    catalogue = Catalogue(tmp_path)
+    for seed in (2, 1):
+        catalogue.add(procedural.generate(seed, "box"))
+    config = ObjectsConfig(folder=str(tmp_path), count=1)
+    for shift in (0, 5):
+        assert [obj.name for obj in load_pool(config, shift)] == ["box_1", "box_2"]
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        (ObjectsConfig(count=0), "pool is empty: objects.count is 0"),
+        (ObjectsConfig(folder="/nonexistent"), "no folder /nonexistent"),
+        (ObjectsConfig(count=1, families=("unicorn",)), "unicorn"),
+    ],
+)
+def test_pools_that_cannot_be_are_refused_in_words(config, words):
+    with pytest.raises(CongraspError, match=words):
+        load_pool(config)
+
+
+def test_an_empty_folder_says_how_to_fill_it(tmp_path):
+    with pytest.raises(CongraspError, match=r"holds no object\. .*objects import"):
+        load_pool(ObjectsConfig(folder=str(tmp_path)))
+
+
+# --- on disk ---
+
+
+@pytest.mark.parametrize("family", ["mug", "bowl"])
+def test_an_object_comes_back_as_it_was(tmp_path, family):
+    obj = generate(1, family)
+    save(obj, tmp_path / "x.safetensors")
+    back = load(tmp_path / "x.safetensors")
+    assert digest(back) == digest(obj)
+    assert (back.name, back.family, back.part_names, back.mass) == (obj.name, obj.family, obj.part_names, obj.mass)
+    for name in ("graspable", "inertia", "points", "normals", "labels", "rest_poses", "visual_faces"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(obj, name))
+        assert getattr(back, name).dtype == getattr(obj, name).dtype
+    for a, b in zip(back.pieces, obj.pieces, strict=True):
+        assert (a.kind, a.size, a.part) == (b.kind, b.size, b.part)
+        np.testing.assert_array_equal(a.pos, b.pos)
+        np.testing.assert_array_equal(a.quat, b.quat)
+        np.testing.assert_array_equal(a.vertices, b.vertices)
+
+
+def test_a_catalogue_lists_what_was_added(tmp_path):
+    catalogue = Catalogue(tmp_path / "new")
+    with pytest.raises(CongraspError, match="no folder"):
+        catalogue.list()
+    for family in ("mug", "box"):
+        catalogue.add(generate(2, family))
+    assert catalogue.list() == ["box_2", "mug_2"]
+    assert digest(catalogue.get("mug_2")) == digest(generate(2, "mug"))
+    assert sorted(path.name for path in catalogue.folder.iterdir()) == ["box_2.safetensors", "mug_2.safetensors"]
+    with pytest.raises(CongraspError, match="no object file"):
+        catalogue.get("cup_2")
+    with pytest.raises(CongraspError, match="cannot name an object"):
+        catalogue.get("../mug_2")

@@ -5,10 +5,7 @@ this file as a program, which adds its own before it imports anything else.
 """
 
 import dataclasses
-import os
 import pathlib
-import subprocess
-import sys
 from typing import Annotated, NamedTuple
 
 import jax
@@ -25,7 +22,7 @@ from congrasp.common.task.constraints.base import (
     Polyline,
     Weight,
 )
-from tests.conftest import ROOT
+from tests.children import python
 
 
 class LevelGoal(NamedTuple):
@@ -92,9 +89,7 @@ def height(scene, earning):
 
 
 def test_nothing_else_must_be_changed():
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "tests.common.test_outside"]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=220)
+    done = python("-m", "tests.common.test_outside")
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines() == [
         *("episodes", "tables", "server", "command line", "file", "marker", "studio", "ONNX", "term")

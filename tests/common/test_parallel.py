@@ -13,6 +13,7 @@ import pytest
 import congrasp
 from congrasp.common.runtime import parallel
 from congrasp.common.runtime.parallel import cores, memory, parallel_map
+from tests.children import python
 
 _ROOT = pathlib.Path(congrasp.__file__).parents[1]
 _SPREAD = """
@@ -119,7 +120,7 @@ def _dedented(text):
 
 
 def test_the_public_names_change_neither_environment_nor_logging_nor_signals():
-    done = subprocess.run([sys.executable, "-c", _UNTOUCHED], capture_output=True, text=True, cwd=_ROOT, timeout=120)
+    done = python("-c", _UNTOUCHED)
     assert done.stdout == "[]\n", done.stderr
 
 

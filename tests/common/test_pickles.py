@@ -1,11 +1,12 @@
-"""Arrays out of pickles, and pickles that want more than to be read."""
+"""Arrays out of pickles and NPZ files, and those that want more than to be read."""
 
+import functools
+import io
 import os
 import pickle
 import re
-import subprocess
-import sys
 import threading
+import zipfile
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ import scipy.sparse
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io import pickles
+from congrasp.common.io.inputs import read_npz
 from congrasp.common.io.pickles import read_pickle, read_pickles
+from tests.children import python
 from tests.limits import limited
 from tests.mano_file import Reduced, dumps, mano_pickle, selection
 
@@ -54,9 +57,8 @@ def test_several_files_are_read_in_one_process_and_the_wrong_one_is_named(monkey
 def test_the_process_imports_no_package_but_numpy(tmp_path):
     (tmp_path / "pickles.zip").write_bytes(b"PK\x05\x06" + bytes(18))
     listed = "import runpy, sys; runpy.run_path(sys.argv.pop(1), run_name='__main__'); print(*sys.modules)"
-    files = map(str, (pickles._CHILD, tmp_path / "pickles.zip", tmp_path / "answer.npz"))
-    command = [sys.executable, "-c", listed, *files, str(1 << 30), "10", str(1 << 20)]
-    modules = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout.split()
+    files = pickles._CHILD, tmp_path / "pickles.zip", tmp_path / "answer.npz"
+    modules = python("-c", listed, *files, 1 << 30, 10, 1 << 20).stdout.split()
     assert "numpy" in modules and not {"jax", "congrasp", "scipy", "zenoh"}.intersection(modules)
 
 
@@ -186,3 +188,60 @@ def test_a_small_pickle_takes_little_memory_and_time(data, word, monkeypatch):
 
 def parse(data):
     return type(read_pickles([("a.pkl", data)]))
+
+
+# --- NPZ files ---
+
+
+def _npy(shape, kind="<f8", body=b""):
+    text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}"
+    text += " " * (63 - (len(text) + 10) % 64) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode() + body
+
+
+def _zip(path, members, method=zipfile.ZIP_DEFLATED):
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+
+
+def test_arrays_come_back(tmp_path):
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array("text"), "c": np.asfortranarray(np.eye(3, 2))}
+    arrays["d"] = np.ones(0)
+    np.savez_compressed(tmp_path / "a.npz", **arrays)
+    read = read_npz(tmp_path / "a.npz", "")
+    assert read.keys() == arrays.keys()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(read[name], array)
+        assert read[name].flags.f_contiguous == array.flags.f_contiguous and read[name].flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("members", "why"),
+    [
+        pytest.param({"a.npy": _npy((32 << 20,), "|u1", bytes(32 << 20))}, "4 MB", id="inflates to 32 MB"),
+        pytest.param({f"{i}.npy": _npy((1 << 19,), "|u1", bytes(1 << 19)) for i in range(9)}, "4 MB", id="nine"),
+        pytest.param({"a.npy": _npy((1 << 40,))}, "bytes, which is not", id="claims 8 TB"),
+        pytest.param({"a.npy": _npy((1 << 62, 8))}, "bytes, which is not", id="claims more than there is"),
+        pytest.param({"a.npy": _npy((1 << 40,), "|V0")}, "type", id="values of no size"),
+        pytest.param({"a.npy": _npy((1 << 40,), "<U0")}, "bytes, which is not", id="texts of no size"),
+        pytest.param({"a.npy": _npy((1,), "|O", b"\x80\x04N.")}, "type", id="an object"),
+        pytest.param({f"{i}.npy": _npy((0,)) for i in range(2000)}, "more than 1000 arrays", id="many"),
+        pytest.param({"a.npy": b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535}, "not an NPZ file", id="deep header"),
+        pytest.param({"a.txt": b""}, "else than arrays", id="a text"),
+    ],
+)
+def test_what_is_larger_than_it_looks_is_refused_before_it_is_in_memory(tmp_path, members, why):
+    _zip(tmp_path / "a.npz", members)
+    read = functools.partial(read_npz, largest=4 << 20)
+    said = limited(read, tmp_path / "a.npz", "Get it again.", memory=24 << 20)
+    assert said.startswith(f"CongraspError: {tmp_path / 'a.npz'}") and why in said and said.endswith("Get it again.")
+
+
+def test_a_directory_that_lies_about_sizes_inflates_no_further(tmp_path):
+    _zip(tmp_path / "a.npz", {"a.npy": _npy((1 << 30,), "|u1", bytes(1 << 27))})
+    data = (tmp_path / "a.npz").read_bytes()
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        size = archive.infolist()[0].file_size.to_bytes(4, "little")
+    (tmp_path / "a.npz").write_bytes(data.replace(size, (1000).to_bytes(4, "little")))
+    assert "CongraspError" in limited(read_npz, tmp_path / "a.npz", "", memory=64 << 20)

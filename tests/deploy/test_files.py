@@ -12,8 +12,11 @@ import kubernetes_validate
 import pytest
 import yaml
 
+from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import load
+from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, exposed
 from tests.conftest import ROOT
+from tests.services.ops.test_metrics import STATUS, scrape
 
 DEPLOY = ROOT / "deploy"
 KUBERNETES = DEPLOY / "kubernetes"
@@ -216,3 +219,42 @@ def test_nodes_of_a_cloud_are_a_learner_and_its_actors(tmp_path, rank, learner, 
         done = subprocess.run(check, input=task[part], capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 0, done.stdout
     assert {path.partition("/")[0] for path in task["file_mounts"].values()} == {"certs"}
+
+
+# --- Grafana ---
+
+
+DASHBOARD = json.loads((ROOT / "deploy" / "grafana" / "congrasp.json").read_text())
+UPDATE = ("episode/success", "episode/return", "update_seconds", "wait_seconds")
+WORDS = {"min", "max", "sum", "by", "le", "rate", "histogram_quantile", "outcome"}
+
+
+def test_every_expression_names_metrics_that_are_exposed():
+    learner, actor, server, port = LearnerMetrics(lambda: STATUS), ActorMetrics(), ServerMetrics(), free_port()
+    learner.update(dict.fromkeys(UPDATE, 1.0))
+    server.health = lambda: {"ready": True, "version": 5, "queue": 2}
+    server.answer("answered", 0.01)
+    server.batch(3)
+    with exposed(port, "127.0.0.1", learner, actor, server):
+        found = scrape(port)
+    names, labels = {name for name, *_ in found}, {label for _, *rest in found for label in rest}
+    expressions = [target["expr"] for panel in DASHBOARD["panels"] for target in panel.get("targets", [])]
+    assert len(expressions) > 20
+    for expression in expressions:
+        bare = re.sub(r"\{[^}]*\}|\[[^]]*\]", "", expression)
+        used = set(re.findall(r"[a-z_]+", bare)) - WORDS
+        assert used and used <= names, expression
+        for value in re.findall(r'(?:figure|outcome|role)="([^"]+)"', expression):
+            assert value in labels, expression
+        assert all(expression.count(pair[0]) == expression.count(pair[1]) for pair in ("()", "{}", "[]"))
+        assert all('job=~"$job"' in selector for selector in re.findall(r"\{[^}]*\}", expression))
+
+
+def test_the_panels_do_not_overlap():
+    taken = set()
+    for panel in DASHBOARD["panels"]:
+        at = panel["gridPos"]
+        cells = {(x, y) for x in range(at["x"], at["x"] + at["w"]) for y in range(at["y"], at["y"] + at["h"])}
+        assert not cells & taken and max(x for x, _ in cells) < 24
+        taken |= cells
+    assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])

@@ -1,9 +1,6 @@
 """A disk that is full or slow under a run: training goes on and says so in one line, and nothing is lost."""
 
 import dataclasses
-import pathlib
-import shutil
-import subprocess
 import threading
 
 import numpy as np
@@ -20,6 +17,7 @@ from congrasp.services.ops.audit import compare as audit
 from congrasp.services.ops.status import ask
 from congrasp.services.record.reader import read_metrics
 from congrasp.services.record.recorder import Recorder
+from tests.benchmarks.faults import fill, small_disk
 from tests.learner.made_up_actor import MadeUpActor
 from tests.learner.test_process import CONFIG
 from tests.waits import eventually
@@ -30,20 +28,10 @@ def disk(tmp_path):
     """A file system of 800 kB."""
     place = tmp_path / "disk"
     place.mkdir()
-    mount = shutil.which("mount") or "mount"
-    command = [mount, "-t", "tmpfs", "-o", "size=800k", "tmpfs", str(place)]
-    if not shutil.which("mount") or subprocess.run(command, capture_output=True, timeout=10).returncode:
-        pytest.skip("file systems cannot be mounted here")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], timeout=10, check=True)
-
-
-def fill(place: pathlib.Path) -> pathlib.Path:
-    filler = place / "filler"
-    with filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
-        while True:
-            file.write(bytes(1024))
-    return filler
+    with small_disk(str(place), 800 << 10) as there:
+        if not there:
+            pytest.skip("file systems cannot be mounted here")
+        yield place
 
 
 def publish_noise(transport):

@@ -50,8 +50,7 @@ from congrasp.services.serve.server import PolicyServer
 from congrasp.services.train.command import untrained
 from tests.episodes import episode
 from tests.rollouts import bundle, learner_hub, rollout
-from tests.services.test_hostile_files import constraint_set
-from tests.services.test_hostile_inputs import BVH
+from tests.services.test_hostile_files import BVH, constraint_set
 
 SECONDS = float(os.environ.get("CONGRASP_FUZZ_SECONDS", "4")) / 2
 SEED = int(os.environ.get("CONGRASP_FUZZ_SEED", "0"))

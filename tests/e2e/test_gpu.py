@@ -1,13 +1,12 @@
 """What only a machine with an NVIDIA GPU shows: `python -m pytest -m gpu`."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 
 from congrasp.common.policy import bundle as bundles
 from congrasp.learner.run_directory import POLICY_FILE
+from tests.children import python
 
 pytestmark = [pytest.mark.gpu, pytest.mark.timeout(600)]
 
@@ -16,7 +15,7 @@ pytestmark = [pytest.mark.gpu, pytest.mark.timeout(600)]
 def gpus():
     """Their number, counted by another process: this one would take their memory."""
     count = "import jax; print(jax.device_count() if jax.default_backend() == 'gpu' else 0)"
-    done = subprocess.run([sys.executable, "-c", count], capture_output=True, text=True, timeout=120)
+    done = python("-c", count)
     assert done.returncode == 0, done.stderr
     if not int(done.stdout):
         pytest.skip("JAX sees no NVIDIA GPU here")
@@ -24,8 +23,7 @@ def gpus():
 
 
 def congrasp(*arguments):
-    command = [sys.executable, "-m", "congrasp", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    done = python("-m", "congrasp", *arguments, timeout=500)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

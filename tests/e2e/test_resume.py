@@ -4,8 +4,6 @@ import dataclasses
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -18,7 +16,7 @@ from congrasp.common.wire.codec import Message, decode
 from congrasp.learner.hub.used_rollouts import journal_path, replay
 from congrasp.learner.process import run_learner
 from congrasp.learner.run_directory import create_run, open_run
-from tests.conftest import ROOT
+from tests.children import python
 from tests.learner.made_up_actor import random_steps
 from tests.learner.test_process import CONFIG
 
@@ -80,9 +78,7 @@ def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
         create_run(tmp_path / name, RUN)
     train(tmp_path / "straight")
     script = "import pathlib, sys; from tests.e2e.test_resume import train; train(pathlib.Path(sys.argv[1]), "
-    command = [sys.executable, "-c", script + f"killed_after={KILLED_AFTER})", str(tmp_path / "killed")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=environment, timeout=240, stderr=subprocess.PIPE, text=True)
+    done = python("-c", script + f"killed_after={KILLED_AFTER})", tmp_path / "killed")
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert (tmp_path / "killed" / "checkpoints" / "latest").resolve().name.endswith(f"{EVERY}.safetensors")
     train(tmp_path / "killed", resume=True)

@@ -38,12 +38,7 @@ class ToyActor(MadeUpActor):
     """Sends rollouts of the toy task with the arrays that the learner takes; the first has one more."""
 
     def rollout(self, bundle, key):
-        keys = iter(jax.random.split(key, toy.STEPS))
-
-        def act(observation):
-            return bundles.sample_action(toy.LAYOUT, bundle.inference_parameters, observation, next(keys))
-
-        recorded = toy.episode(act, WORLDS, self.rng)
+        recorded = toy.sampled(bundle, key, WORLDS, self.rng)
         return recorded if not self.outcomes else {name: recorded[name] for name in self.names}
 
 

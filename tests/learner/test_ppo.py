@@ -28,12 +28,7 @@ def changed(**settings) -> PPO:
 
 
 def rollout(bundle: bundles.PolicyBundle, seed: int, worlds: int = 64, reach: float = 1.0) -> dict[str, np.ndarray]:
-    keys = iter(jax.random.split(jax.random.PRNGKey(seed), toy.STEPS))
-
-    def act(observation):
-        return bundles.sample_action(toy.LAYOUT, bundle.inference_parameters, observation, next(keys))
-
-    return toy.episode(act, worlds, np.random.default_rng(seed), reach)
+    return toy.sampled(bundle, jax.random.PRNGKey(seed), worlds, np.random.default_rng(seed), reach)
 
 
 def leaves(state: TrainState) -> list[np.ndarray]:

@@ -7,6 +7,7 @@ steps. The goal is uniform in [-1, 1]. Standing still returns -10 E|g| = -5; hal
 
 from collections.abc import Callable
 
+import jax
 import numpy as np
 
 from congrasp.common.config import NetworkConfig, PPOConfig
@@ -55,6 +56,16 @@ def episode(
     names = ("observation", "action", "log_probability", "reward", "terminal", "truncated")
     batch = {name: np.stack(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
     return {**batch, "last_observation": observe(position, goal)}
+
+
+def sampled(bundle: PolicyBundle, key: Array, worlds: int, rng: np.random.Generator, reach: float = 1.0) -> dict:
+    """A batch of whole episodes under a policy's random actions."""
+    keys = iter(jax.random.split(key, STEPS))
+
+    def act(observation: np.ndarray) -> tuple[Array, Array]:
+        return bundles.sample_action(LAYOUT, bundle.inference_parameters, observation, next(keys))
+
+    return episode(act, worlds, rng, reach)
 
 
 def bundle_of(state: TrainState) -> PolicyBundle:

@@ -13,15 +13,20 @@ import threading
 from pathlib import Path
 from unittest import mock
 
+import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
-import congrasp.services.cli.main as cli
 from congrasp.common.errors import CongraspError, MissingPackageError
+from congrasp.common.objects.store import Catalogue, digest
 from congrasp.common.transport.ports import free_port
+from congrasp.services.assets.objects.named import find_object
 from congrasp.services.cli import console
+from congrasp.services.cli import main as cli
 from congrasp.services.cli.main import COMMANDS, load
 from congrasp.services.ops.logs import announced
+from tests.children import python
 from tests.printed import errors
 
 NO_MEMORY = "The accelerator's memory does not suffice"
@@ -30,10 +35,8 @@ ROOT = Path(__file__).parents[2]
 URDF = ROOT / "tests" / "hands" / "claw.urdf"
 
 
-def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Runs the command line in a process of its own."""
-    command = [sys.executable, "-m", "congrasp", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+congrasp = functools.partial(python, "-m", "congrasp")
+"""Runs the command line in a process of its own."""
 
 
 def is_one_line(code: int, said: str, words: str) -> None:
@@ -74,10 +77,7 @@ def test_help_names_every_command_and_every_command_exists():
         (["render", "hand", "--out", "hand.pdf"], "--out is hand.pdf, but the picture is a PNG. End its name in .png"),
         (["objects", "show", "mug:7", "--png", "x.jpg"], "--png is x.jpg, but the picture is a PNG"),
         (["export", "policy", "--out", "/"], "--out is the folder /. Pass a file"),
-        (
-            ["export", "motion", "/", "--out", "/dev/null/x.glb"],
-            "--out is /dev/null/x.glb, but",
-        ),
+        (["export", "motion", "/", "--out", "/dev/null/x.glb"], "--out is /dev/null/x.glb, but"),
         (["plot", "/nonexistent-run", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["hands", "train", "no-hand", "--out", "/dev/null"], "--out is the file /dev/null. Pass a folder"),
         (["constraints", "import", "grab", "/", "--objects", "/dev/null"], "--objects is the file /dev/null. Pass a"),
@@ -202,28 +202,22 @@ def test_a_path_that_cannot_be_used_is_one_line_and_a_fault_of_ours_is_not(numbe
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_log_on_a_full_disk_does_not_change_the_exit_code():
     """Only bad input ends a run's process for good; another code would start it again and again."""
-    command = [sys.executable, "-m", "congrasp", "levitate"]
     with open("/dev/full", "wb") as full:
-        assert subprocess.run(command, stdout=full, stderr=full, timeout=60, check=False).returncode == 2
+        assert congrasp("levitate", stdout=full, stderr=full, capture_output=False).returncode == 2
 
 
 def test_a_reader_that_is_gone_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)  # as `head` does when it has read enough
-    command = [sys.executable, "-m", "congrasp", "hands", "list", "--help"]
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    done = congrasp("hands", "list", "--help", stdout=writer, stderr=subprocess.PIPE, capture_output=False)
     os.close(writer)
     lines = errors(done.stderr)
     assert not lines and done.returncode in (0, 128 + signal.SIGPIPE)
 
 
 def test_an_output_without_some_characters_gets_escapes():
-    command, env = (
-        [sys.executable, "-m", "congrasp", "objects", "list", "ü"],
-        {**os.environ, "PYTHONIOENCODING": "ascii"},
-    )
-    done = subprocess.run(command, env=env, capture_output=True, timeout=60, check=False)
-    is_one_line(done.returncode, done.stderr.decode(), r"no folder .*\\xfc")
+    done = congrasp("objects", "list", "ü", env={"PYTHONIOENCODING": "ascii"})
+    is_one_line(done.returncode, done.stderr, r"no folder .*\\xfc")
 
 
 @pytest.mark.parametrize(
@@ -250,7 +244,7 @@ threading.Thread(target=threading.Event().wait, args=(60 if {late} else 0,), dae
 sys.argv[1:] = ["hands", "list"]
 main()
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = python("-c", code)
     assert done.returncode == 0 and "allegro" in done.stdout, done.stderr
     assert done.stdout.endswith("shut down\n") is not late
 
@@ -332,3 +326,105 @@ def test_without_a_terminal_the_current_task_and_its_counts_are_named(capsys, mo
         while len(lines) < 2:
             lines += capsys.readouterr().err.splitlines()
     assert lines[-1] == "heading, 5 of 12: 0 s so far."
+
+
+# --- `congrasp objects …` as a user meets it ---
+
+
+parse = load("objects")
+
+
+def test_generate_list_and_show(tmp_path, capsys):
+    folder = str(tmp_path / "things")
+    assert parse(["generate", "--out", folder, "--count", "4", "--seed", "3", "--families", "mug", "knife"])() == 0
+    assert Catalogue(folder).list() == ["knife_3", "knife_5", "mug_4", "mug_6"]
+    assert parse(["list", folder])() == 0
+    output = capsys.readouterr().out
+    assert "4 objects are in" in output
+    assert all(word in output for word in ("mug_6", "knife_3", "handle", "blade"))
+    assert parse(["list", folder, "--png", str(tmp_path / "all.png")])() == 0
+    assert f"The picture is {tmp_path / 'all.png'}" in capsys.readouterr().out.replace("\n", "")
+    assert Image.open(tmp_path / "all.png").width > 7 * 200
+    (tmp_path / "things" / "bad.safetensors").write_bytes(b"no object")
+    assert parse(["list", folder])() == 2
+    captured = capsys.readouterr()
+    assert "bad.safetensors cannot be read" in captured.err
+    assert "mug_6" in captured.out
+    picture = tmp_path / "knife.png"
+    assert parse(["show", "knife_3", "--folder", folder, "--png", str(picture)])() == 0
+    output = capsys.readouterr().out
+    assert "handle" in output
+    assert "resting pose 1" in output
+    image = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3).astype(int)
+    green = (image[:, 1] - image[:, 0] > 60) & (image[:, 1] - image[:, 2] > 60)
+    red = (image[:, 0] - image[:, 1] > 80) & (image[:, 0] - image[:, 2] > 60)
+    assert green.sum() > 100
+    assert red.sum() > 100
+
+
+def test_resting_poses_are_listed_and_drawn(tmp_path, capsys):
+    poses = find_object("mug:7").rest_poses
+    assert parse(["rests", "mug:7", "--png", str(tmp_path / "rests.png")])() == 0
+    rows = [line.strip("│ ").split("│") for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    assert [int(row[0]) for row in rows] == list(range(1, len(poses) + 1))
+    assert float(rows[0][1]) == pytest.approx(100 * poses[0][2], abs=0.05)
+    assert {0, 180} < {int(row[2]) for row in rows}  # it stands on its bottom, and on its rim
+    assert Image.open(tmp_path / "rests.png").width == len(poses) * (240 + 10) + 10
+
+
+def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, capsys, quick_import):
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "good.stl")
+    trimesh.creation.box((40, 50, 60)).export(tmp_path / "big.stl")
+    (tmp_path / "text.ply").write_text("no mesh")
+    paths = [str(tmp_path / name) for name in ("big.stl", "text.ply", "missing", "good.stl")]
+    common = ["--out", str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache")]
+    assert parse(["import", *paths, *common])() == 2
+    captured = capsys.readouterr()
+    lines = errors(captured.err)
+    assert len(lines) == 3
+    assert all(line.startswith("congrasp: error: ") for line in lines)
+    assert "1 of 4 imported" in captured.out
+    assert Catalogue(tmp_path / "out").list() == ["good"]
+    assert parse(["import", paths[0], "--unit", "mm", *common])() == 0
+    assert Catalogue(tmp_path / "out").list() == ["big", "good"]
+    assert parse(["import", str(tmp_path / "good.stl"), "--mass", "0.25", *common])() == 0
+    assert Catalogue(tmp_path / "out").get("good").mass == 0.25
+
+
+def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, quick_import):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    obj = find_object("mug:7")
+    path = Catalogue(tmp_path).add(obj)
+    monkeypatch.chdir(tmp_path)
+    assert digest(find_object(str(path))) == digest(find_object("mug_7", str(tmp_path))) == digest(obj)
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "block.stl")
+    assert find_object(str(tmp_path / "block.stl")).name == "block"
+    with pytest.raises(CongraspError, match="no object 'mug_8'"):
+        find_object("mug_8", str(tmp_path))
+    with pytest.raises(CongraspError, match="no object family 'cat'"):
+        find_object("cat:1")
+
+
+def test_a_name_that_is_also_a_path_is_ambiguous(tmp_path, monkeypatch, quick_import):
+    from congrasp.services.cli import constraints
+    from congrasp.services.grasp.jobs import find_objects
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    stored = Catalogue("objects").add(find_object("mug:7"))
+    (tmp_path / "mug_7").mkdir()
+    (tmp_path / "mug_7" / "grasp.npz").touch()
+    assert find_object("mug_7").name == "mug_7"  # which a folder of grasps leaves alone
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "mug_7" / "block.stl")
+    said = r"'mug_7' is a folder here, and an object in objects\. Pass \./mug_7 or objects/mug_7\.safetensors"
+    for find in (find_object, lambda name: constraints.Generate((name,))()):
+        with pytest.raises(CongraspError, match=said):
+            find("mug_7")
+    ((mesh, mug), (error,)) = find_objects(["./mug_7", str(stored), "mug_7"])
+    assert mesh.source and not mug.source and re.search(said, error.error)
+
+
+def test_a_picture_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(CongraspError, match=r"x\.png could not be written"):
+        parse(["show", "box:1", "--png", str(tmp_path / "file" / "x.png")])()

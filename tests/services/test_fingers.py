@@ -58,10 +58,7 @@ def query(example: Example) -> dict[str, np.ndarray]:
 # A policy that does not know it.
 
 
-@pytest.mark.parametrize(
-    ("name", "option"),
-    [("fingers", ["--fingers", "thumb", "index"]), ("force", ["--gentle"])],
-)
+@pytest.mark.parametrize(("name", "option"), [("fingers", ["--fingers", "thumb", "index"]), ("force", ["--gentle"])])
 def test_the_command_refuses_it_in_one_line(paper_policy, tmp_path, monkeypatch, capsys, quick_import, name, option):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     trimesh.creation.box((0.05, 0.06, 0.14)).export(tmp_path / "block.stl")

@@ -28,14 +28,7 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import draws_references, known
 from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.task.sampling.closed_poses import Poses, closed_poses
-from congrasp.common.task.sampling.headings import (
-    INWARD,
-    Headings,
-    above,
-    max_width,
-    sample_headings,
-    within_reach,
-)
+from congrasp.common.task.sampling.headings import INWARD, Headings, above, max_width, sample_headings, within_reach
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import Message
 
@@ -288,8 +281,7 @@ def headings_of(
     usable = np.flatnonzero(reachable[0].any(-1))
     if len(usable) == 0:
         raise CongraspError(
-            f"The object '{obj.name}' cannot be approached in any of its resting poses.",
-            "Scale it or remove it.",
+            f"The object '{obj.name}' cannot be approached in any of its resting poses.", "Scale it or remove it."
         )
     reachable = reachable[:, usable]
     # (V, R, H, 3), the positions that the table leaves.

@@ -252,10 +252,7 @@ def clear_table(
 
 
 def feasible(
-    headings: Headings,
-    rest_pose: np.ndarray,
-    outline: Outline = CENTER,
-    width: np.ndarray | float = 0.0,
+    headings: Headings, rest_pose: np.ndarray, outline: Outline = CENTER, width: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """(H,) bool: headings that can be followed while the object rests on the table in a resting pose.
 

@@ -231,13 +231,7 @@ def make_sets(
     rows = rows_of(bank or build_bank(hand, dataclasses.replace(task, constraints=OURS), fitting, seed))
     scale = object_scale(hand, task)
     return [
-        set_of(
-            hand,
-            rows[n],
-            fitting[n],
-            seed,
-            {"object_scale": scale, "object_digest": store.digest(obj)},
-        )
+        set_of(hand, rows[n], fitting[n], seed, {"object_scale": scale, "object_digest": store.digest(obj)})
         for n, obj in enumerate(objects)
     ]
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from congrasp.common.hands.spec import Coupling, Joint, Motor
+from congrasp.services.assets.hands.compile import listed
 
 FINGERTIP_FORCE = 15.0
 """Force with which a joint without a torque limit can press its fingertip, N."""
@@ -234,10 +235,8 @@ class Drive:
         self._strong: list[str] = []
         self._damped: list[str] = []
         passive = [name for j, name in joints.items() if j not in driven and j not in self._leaders]
-        if driven and passive:
-            self.notes.append(
-                f"no motor in the file, one each is added ('couplings' in the hand file): {', '.join(passive)}"
-            )
+        if driven:
+            self.notes += listed("no motor in the file, one each is added ('couplings' in the hand file)", passive)
         pulls = [self._reduced(servo) for servo in found]
         self._pulls = list(zip(found, _shared_out(pulls), strict=True))
         if idle := sum(bool(before) and not after for before, (_, after) in zip(pulls, self._pulls, strict=True)):
@@ -307,22 +306,10 @@ class Drive:
 
     def remarks(self) -> list[str]:
         """Returns the proposals, once all joints and tendons have been requested."""
-        found = []
-        if self._limitless:
-            found.append(
-                f"no torque limit, {FINGERTIP_FORCE:g} N at the fingertip is proposed ('torque_limit'): "
-                + ", ".join(self._limitless)
-            )
-        if self._strong:
-            found.append(
-                f"torque limits above {LARGEST_FORCE:g} N at the fingertip are lowered to that ('torque_limit'): "
-                + ", ".join(self._strong)
-            )
-        if self._damped:
-            found.append(
-                f"damping that holds joints for more than {_SLOW:g} s is lowered ('damping' in the hand file): "
-                + ", ".join(self._damped)
-            )
+        proposed = f"no torque limit, {FINGERTIP_FORCE:g} N at the fingertip is proposed ('torque_limit')"
+        lowered = f"torque limits above {LARGEST_FORCE:g} N at the fingertip are lowered to that ('torque_limit')"
+        damped = f"damping that holds joints for more than {_SLOW:g} s is lowered ('damping' in the hand file)"
+        found = listed(proposed, self._limitless) + listed(lowered, self._strong) + listed(damped, self._damped)
         return [*self.notes, *found]
 
     def _reduced(self, servo: Servo) -> dict[int, float]:

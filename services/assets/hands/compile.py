@@ -10,7 +10,7 @@ import urllib.parse
 import xml.etree.ElementTree as ET
 import xml.parsers.expat
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import mujoco
@@ -122,6 +122,11 @@ def robot_spec(path: pathlib.Path, notes: list[str]) -> tuple[mujoco.MjSpec, muj
     except (ValueError, OSError, MemoryError, RuntimeError, mujoco.FatalError) as error:
         raise CongraspError(_unread(path, error)) from None
     return spec, model
+
+
+def listed(what: str, names: Sequence[str]) -> list[str]:
+    """Returns a note on parts of a robot, if there are any of these names."""
+    return [f"{what}: {', '.join(names)}"] if names else []
 
 
 def _unread(path: pathlib.Path, error: Exception) -> str:
@@ -266,8 +271,8 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
         light, thin = model.body_mass == LEAST[0], (model.body_inertia == LEAST[1]).any(1)
         given = (light, f"mass get {1e3 * LEAST[0]:g} g"), (thin & ~light, f"inertia get {1e6 * LEAST[1]:g} kg.mm²")
         for links, text in given:
-            if names := ", ".join(model.body(i).name for i in np.flatnonzero(links)):
-                notes.append(f"links without {text} ('<inertial>' in the file), as do those with less: {names}")
+            what = f"links without {text} ('<inertial>' in the file), as do those with less"
+            notes += listed(what, [model.body(i).name for i in np.flatnonzero(links)])
     return model
 
 
@@ -399,13 +404,10 @@ def _complete_inertias(robot: ET.Element, notes: list[str]) -> None:
             raised.append(link.get("name", ""))
         for name in _INERTIA:
             inertia.set(name, str(_value(inertia, name, link)))
-    if guessed:
-        what = "links with one axis of inertia or without '<inertia>'"
-        notes.append(f"{what} get that of a ball of their mass, 4 cm wide: {', '.join(guessed)}")
-    if raised:
-        notes.append(f"links with inertia about two axes get the least possible about the third: {', '.join(raised)}")
-    if weightless:
-        notes.append(f"'<inertial>' without mass, which follows from the link's shapes: {', '.join(weightless)}")
+    what = "links with one axis of inertia or without '<inertia>'"
+    notes += listed(f"{what} get that of a ball of their mass, 4 cm wide", guessed)
+    notes += listed("links with inertia about two axes get the least possible about the third", raised)
+    notes += listed("'<inertial>' without mass, which follows from the link's shapes", weightless)
 
 
 def _value(element: ET.Element, name: str, owner: ET.Element, missing: float = 0.0) -> float:

@@ -19,7 +19,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.meshes import MAX_FACES
 from congrasp.common.hands.spec import Capsule, Solid, vector
 from congrasp.common.io.inputs import distinct_names
-from congrasp.services.assets.hands.compile import LEAST
+from congrasp.services.assets.hands.compile import LEAST, listed
 
 _CALLED = ("palm", "hand")
 _FREE = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
@@ -69,8 +69,8 @@ def identifier(name: str, other: str) -> str:
 
 def renamed(kind: str, before: Iterable[str], after: Iterable[str]) -> list[str]:
     """Returns a note on names that changed because others have them, if there are any."""
-    changed = ", ".join(f"{old} -> {new}" for old, new in zip(before, after, strict=True) if old != new)
-    return [f"{kind} renamed, as others have their names: {changed}"] if changed else []
+    changed = [f"{old} -> {new}" for old, new in zip(before, after, strict=True) if old != new]
+    return listed(f"{kind} renamed, as others have their names", changed)
 
 
 def hinges(model: mujoco.MjModel, body: int) -> list[int]:
@@ -101,8 +101,7 @@ def hand_tree(model: mujoco.MjModel, wanted: str, notes: list[str]) -> Tree:
         elif int(model.body_parentid[body]) in owner:
             owner[body] = max(palm, int(model.body_weldid[body]))
             groups.setdefault(owner[body], []).append(body)
-    if loose:
-        notes.append(f"not of the hand, and left out: {', '.join(loose)}")
+    notes += listed("not of the hand, and left out", loose)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     _to_palm(data, palm)

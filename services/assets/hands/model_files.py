@@ -19,7 +19,7 @@ from congrasp.common.hands.motors import fitting_scale, motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Link, chain_of, vector, wrist_gains
 from congrasp.common.io.inputs import distinct_names
 from congrasp.services.assets.hands.actuators import Drive
-from congrasp.services.assets.hands.compile import LEAST, confined, robot_spec
+from congrasp.services.assets.hands.compile import LEAST, confined, listed, robot_spec
 from congrasp.services.assets.hands.links import (
     Tree,
     bare,
@@ -116,15 +116,14 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
         count, shown = ("no finger", "one finger")[len(tree.ends)], identifier(palm, f"body_{tree.palm}")
         raise CongraspError(f"{path} has {count} on its palm '{shown}'.", _TWO)
     wide = np.sqrt(model.body_inertia.max(1) / np.maximum(model.body_mass, LEAST[0])) > _LINK[1]
-    if doubtful := [model.body(body).name for body in tree.owner if wide[body]]:
-        said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"
-        notes.append(f"{said}: {', '.join(doubtful)}")
+    said = f"inertias of bodies more than {_LINK[1]:g} m wide (in kg.mm²?), from which kv follows"
+    notes += listed(said, [model.body(body).name for body in tree.owner if wide[body]])
     links, drive = _links(tree, _points(path, tree), notes)
     _check_units(path, links)
     if choices.own_collision:
         links = [dataclasses.replace(x, solids=solids_of(tree, i)) for x, i in zip(links, tree.groups, strict=True)]
-        if kept := [link.name for link in links if not link.solids]:
-            notes.append(f"only meshes as collision geometry, capsules are used: {', '.join(kept)}")
+        kept = [link.name for link in links if not link.solids]
+        notes += listed("only meshes as collision geometry, capsules are used", kept)
     name = identifier(choices.name or path.stem, "hand").lower()
     hand = Hand(
         name=f"hand_{name}" if name[0].isdigit() else name,
@@ -263,10 +262,8 @@ def _links(tree: Tree, points: dict[int, list[np.ndarray]], notes: list[str]) ->
                 tip=vector(tips[link].round(6)) if link in tips else None,
             )
         )
-    if boxed:
-        notes.append(f"no geometry, capsules follow from inertias ('capsules' in the hand file): {', '.join(boxed)}")
-    if empty:
-        notes.append(f"no geometry and no inertia, thin capsules ('capsules' in the hand file): {', '.join(empty)}")
+    notes += listed("no geometry, capsules follow from inertias ('capsules' in the hand file)", boxed)
+    notes += listed("no geometry and no inertia, thin capsules ('capsules' in the hand file)", empty)
     return links, drive
 
 
@@ -274,8 +271,8 @@ def _meshes(tree: Tree, notes: list[str]) -> Meshes:
     """Visual meshes of each link, unless larger than a hand."""
     found = {tree.names[link]: link_mesh(tree, link) for link in tree.groups}
     drawn = {name: mesh for name, mesh in found.items() if mesh is not None}
-    if large := [name for name, (vertices, _) in drawn.items() if np.abs(vertices).max() > MAX_DISTANCE]:
-        notes.append(f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and dropped: {', '.join(large)}")
+    large = [name for name, (vertices, _) in drawn.items() if np.abs(vertices).max() > MAX_DISTANCE]
+    notes += listed(f"drawn more than {MAX_DISTANCE:g} m from the palm (in mm?), and dropped", large)
     return {name: mesh for name, mesh in drawn.items() if name not in large}
 
 

@@ -257,11 +257,7 @@ def _surfaces(meshes: list[trimesh.Trimesh], solid: Enclosed | None, notes: list
 
 
 def _cut(
-    source: Source,
-    given: Sequence[np.ndarray],
-    surfaces: decompose.Surfaces,
-    options: ImportOptions,
-    notes: list[str],
+    source: Source, given: Sequence[np.ndarray], surfaces: decompose.Surfaces, options: ImportOptions, notes: list[str]
 ) -> decompose.Collision:
     """Convex pieces of an object (`decompose.convex_pieces`)."""
     try:

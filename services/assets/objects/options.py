@@ -122,8 +122,7 @@ def metres_per_unit(path: object, sides: tuple[float, ...], unit: Unit, scale: f
     factor = METRES[taken] * scale
     if min(sides) * factor < _THINNEST:
         raise CongraspError(
-            f"{path} is flat: it is {length(min(sides) * factor)} thick.",
-            "Give it a thickness in a modelling program.",
+            f"{path} is flat: it is {length(min(sides) * factor)} thick.", "Give it a thickness in a modelling program."
         )
     return factor
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from congrasp.actors import initial
 from congrasp.actors.physics.scene import scene_spec
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.task import sensing
@@ -23,7 +24,7 @@ from congrasp.services.evaluate.tables import MASSES, NOISE, PEERS, SENSING, Loa
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.studio.grasping import PolicyGrasping
 from congrasp.services.train.presets import TRACKERS
-from tests import draws, task
+from tests import task
 from tests.task import HAND, OBJECTS
 
 TASK = TaskConfig(constraints=("heading",))
@@ -83,7 +84,8 @@ def test_a_level_is_what_it_says(bank):
     """At 10 ms a step: 60 ms are 6 steps, 30 Hz a sample every 10/3 steps, and no rate is more than one a step."""
     sensed = SENSING[0].task(TASK)
     one = jax.tree.map(lambda array: np.asarray(array)[:1], bank)
-    drawn = draws.sample(task.HAND, sensed, one, jax.random.key(0), 4)
+    sample = jax.jit(initial.sample, static_argnames=("hand", "task", "batch"))
+    drawn = sample(task.HAND, sensed, one, jax.random.key(0), 4)
     found = {level.label: jax.device_get(level.episodes(drawn, 0.01)) for level in SENSING}
     assert len(found) == len(SENSING)
     true, nominal = (found[level.label] for level in SENSING[:2])

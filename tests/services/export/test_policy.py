@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import pathlib
-import subprocess
-import sys
 import zipfile
 from typing import Any
 
@@ -31,6 +29,7 @@ from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surf
 from congrasp.services.client.limits import JointLimits, Limiter
 from congrasp.services.export import policy as exports
 from congrasp.services.train.command import untrained
+from tests.children import python
 from tests.examples import EXAMPLES, example
 from tests.exported_policies import difference
 
@@ -98,7 +97,7 @@ def pretrained_onnx(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 def test_the_example_grasps_with_onnxruntime_alone(pretrained_onnx: pathlib.Path, tmp_path: pathlib.Path) -> None:
     absent = "import sys, runpy; sys.modules.update(dict.fromkeys(['jax', 'flax', 'congrasp'])); "
     code = f"{absent}sys.argv[1:] = [{str(pretrained_onnx)!r}]; runpy.run_path({str(EXAMPLE)!r}, run_name='__main__')"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = python("-c", code, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "the cylinder is held" in done.stdout
 

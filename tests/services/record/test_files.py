@@ -1,11 +1,10 @@
 """Recordings survive: killed writers, full disks, cut and strange files, rotation."""
 
 import errno
+import functools
 import io
 import json
 import pathlib
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.record.reader import log_files, read_metrics, read_records
 from congrasp.services.record.writer import CONVENTIONS, Entry, JsonChannels, LogWriter, opaque_channel
+from tests.children import python
 from tests.recordings import is_complete
 
 SECOND = 10**9
@@ -42,9 +42,8 @@ def write(directory: pathlib.Path, entries: list[Entry], **options: float) -> li
     return writer.files
 
 
-def doctor(path: pathlib.Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pymcap_cli.cli", "doctor", str(path)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+doctor = functools.partial(python, "-m", "pymcap_cli.cli", "doctor", env={"COLUMNS": "400"})
+"""Runs `pymcap-cli doctor`."""
 
 
 def test_a_finished_file_is_sound_and_says_what_its_numbers_mean(tmp_path: pathlib.Path) -> None:

@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import json
-import os
 import pathlib
 import re
 import signal
@@ -26,6 +25,7 @@ from congrasp.services.record.recorder import Recorder
 from congrasp.services.record.writer import Entry, LogWriter
 from tests.episodes import episode
 from tests.recordings import is_complete
+from tests.services.record.test_files import doctor
 from tests.waits import eventually
 
 KEYS = Keys("r")
@@ -202,7 +202,7 @@ def test_a_killed_recorder_leaves_every_record_up_to_its_last_flush_and_the_run_
     assert not is_complete(path)
     steps = steps_in(tmp_path / "out")
     np.testing.assert_array_equal(steps, range(int(steps[0]), sent))
-    assert doctor(path) <= CUT
+    assert codes(path) <= CUT
 
 
 CUT = {
@@ -213,12 +213,9 @@ CUT = {
 a busy moment are small, and nothing is wrong."""
 
 
-def doctor(path: pathlib.Path) -> set[str]:
+def codes(path: pathlib.Path) -> set[str]:
     """The codes of what it says."""
-    command = [sys.executable, "-m", "pymcap_cli.cli", "doctor", str(path)]
-    environment = {**os.environ, "COLUMNS": "400"}
-    said = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=environment).stdout
-    return set(re.findall(r"\b[A-Z]+(?:_[A-Z]+)+\b", said))
+    return set(re.findall(r"\b[A-Z]+(?:_[A-Z]+)+\b", doctor(path).stdout))
 
 
 def test_a_stopped_recorder_holds_nobody_up(tmp_path: pathlib.Path) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial import cKDTree
@@ -24,13 +27,13 @@ from congrasp.common.hands.spec import link_origin
 from congrasp.common.objects.spec import Colours
 from congrasp.common.wire.codec import Message, decode
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
-from congrasp.services.record import scene
+from congrasp.services.record import palette, scene
 from congrasp.services.record.episode import active_blocks, active_constraints
-from congrasp.services.record.palette import JOINT, SKIN
+from congrasp.services.record.palette import JOINT, SKIN, colours_at, finer, painted
 from congrasp.services.record.palette import MATERIALS as COLOURS
 from congrasp.services.record.recorder import Converter
 from congrasp.services.record.scene import SPACING, check_episode, surface_parts, surface_points
-from congrasp.services.record.writer import Entry, LogWriter
+from congrasp.services.record.writer import Entry, JsonChannels, LogWriter, flatten, nest
 from tests.episodes import CONTROL_DT, FORCE, episode, older
 
 HAND = get_hand("human")
@@ -343,3 +346,117 @@ def test_an_episode_with_half_of_its_colours_or_a_name_that_is_a_path_goes_nowhe
     save_motion(tmp_path / "motion.npz", motion)
     with pytest.raises(CongraspError, match="not from 0 to 255"):
         load_motion(tmp_path / "motion.npz")
+
+
+# --- meshes cut finer for their paint ---
+
+
+@pytest.mark.parametrize("sections", [8, 512, 2048])
+def test_the_surface_stays_and_faces_are_bounded(sections):
+    mesh = trimesh.creation.cylinder(0.03, 0.15, sections=sections)  # slivers, where there are many sections
+    vertices, faces = finer(mesh.vertices, mesh.faces, 0.003, 9_000)
+    fine = trimesh.Trimesh(vertices, faces, process=False)
+    assert len(mesh.faces) < len(faces) <= 9_000
+    assert fine.area == pytest.approx(mesh.area, rel=1e-4) and fine.volume == pytest.approx(mesh.volume, rel=1e-4)
+    assert vertices.dtype == np.float32 and faces.dtype == np.int32
+
+
+def test_edges_become_short():
+    mesh = trimesh.creation.cylinder(0.03, 0.15, sections=8)
+    vertices, faces = finer(mesh.vertices, mesh.faces, 0.004, 100_000)
+    corners = vertices[faces]
+    assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max() <= 0.004 + 1e-6
+
+
+def test_a_mesh_of_many_faces_is_left_as_it_is():
+    mesh = trimesh.creation.icosphere(3)
+    vertices, faces = finer(mesh.vertices, mesh.faces, 0.001, 1_000)
+    np.testing.assert_array_equal(faces, mesh.faces)
+    np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-6)
+
+
+RED, BLUE = (255, 0, 0), (0, 0, 255)
+
+
+def test_a_colour_is_a_mean_of_those_nearby():
+    """At distances of 1 and 2 m, 1.5 on average: exp(-(1 / 1.5)^2) = .6412 to exp(-(2 / 1.5)^2) = .1690, so 79.1 %."""
+    colours = Colours(np.array([[0, 0, -1], [0, 0, 2]], np.float32), np.array([RED, BLUE], np.uint8))
+    np.testing.assert_array_equal(colours_at(np.zeros((1, 3)), colours), [[202, 0, 53]])
+
+
+def test_an_edge_between_two_colours_has_no_teeth():
+    """Along the edge the colour hardly changes, a centimetre away it is pure."""
+    rng = np.random.default_rng(0)
+    points = np.c_[rng.uniform(0, 0.1, (8000, 2)), np.zeros(8000)].astype(np.float32)
+    colours = Colours(points, np.where(points[:, :1] < 0.05, RED, BLUE).astype(np.uint8))
+    along = np.linspace(0.01, 0.09, 300)
+    red = [colours_at(np.c_[np.full(300, x), along, np.zeros(300)], colours)[:, 0].astype(float) for x in (0.04, 0.05)]
+    assert (red[0] == 255).all() and abs(red[1].mean() - 127.5) < 20
+    assert red[1].std() < 60  # of the nearest points alone 127
+
+
+def test_a_painted_mesh_is_cut_once_until_it_or_its_colours_change(monkeypatch):
+    cuts = []
+
+    def counted(*mesh):
+        cuts.append(mesh)
+        return finer(*mesh)
+
+    monkeypatch.setattr(palette, "finer", counted)
+    ball = trimesh.creation.icosphere(2, 0.0317)
+    colours = Colours(np.array([[0, 0, -1], [0, 0, 1]], np.float32), np.array([[255, 0, 0], [0, 0, 255]], np.uint8))
+    first = painted(ball.vertices, ball.faces, colours)
+    again = painted(np.array(ball.vertices), np.array(ball.faces, np.int32), Colours(*map(np.array, colours)))
+    assert len(cuts) == 1 and all(a is b for a, b in zip(first, again, strict=True))
+    with pytest.raises(ValueError, match="read-only"):
+        first[2][0] = 0
+    other = painted(ball.vertices, ball.faces, colours._replace(values=colours.values[::-1]))
+    assert len(cuts) == 2 and not np.array_equal(other[2], first[2])
+    painted(1.01 * ball.vertices, ball.faces, colours)
+    assert len(cuts) == 3
+
+
+# --- JSON channels ---
+
+
+NAMES = st.lists(st.text("abc_", min_size=1, max_size=3), min_size=1, max_size=3).map("/".join)
+
+
+@given(st.dictionaries(NAMES, st.floats(allow_nan=False), max_size=8))
+def test_flatten_undoes_nest(values: dict[str, float]) -> None:
+    assert flatten(nest(values)) == values
+
+
+def test_a_name_may_also_be_a_group() -> None:
+    assert nest({"loss": 1.0, "loss/value": 2.0}) == {"loss": {"": 1.0, "value": 2.0}}
+
+
+def test_numbers_that_json_lacks_are_left_out() -> None:
+    entry = JsonChannels().entry("/m", 5, {"a": 1.0, "b": math.nan, "c": {"d": math.inf, "e": 2}, "f": True})
+    assert json.loads(entry.data) == {"a": 1.0, "c": {"e": 2}, "f": True}
+    assert entry.time == 5
+
+
+def test_schema_grows_with_new_fields_and_keeps_the_old() -> None:
+    channels = JsonChannels()
+    first = channels.entry("/metrics/learner/0", 0, {"update": 0, "values": {"kl": 0.1}}).channel
+    again = channels.entry("/metrics/learner/0", 1, {"update": 1, "values": {"kl": 0.2}}).channel
+    grown = channels.entry("/metrics/learner/0", 2, {"values": {"success": 0.5}, "name": "x"}).channel
+    assert first is again
+    assert json.loads(grown.schema) == {
+        "type": "object",
+        "properties": {
+            "update": {"type": "number"},
+            "values": {"type": "object", "properties": {"kl": {"type": "number"}, "success": {"type": "number"}}},
+            "name": {"type": "string"},
+        },
+    }
+    assert grown.topic == first.topic and grown.schema_name == first.schema_name
+
+
+def test_topics_have_schemas_of_their_own() -> None:
+    channels = JsonChannels()
+    names = {
+        channels.entry(topic, 0, {"a": 1}).channel.schema_name for topic in ("/metrics/actor/a", "/metrics/actor/b")
+    }
+    assert len(names) == 2

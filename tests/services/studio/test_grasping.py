@@ -12,8 +12,8 @@ from congrasp.actors.stress import ASSESSED
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.services.studio import grasping
-from congrasp.services.studio.grasping import ATTEMPTS, PolicyGrasping
-from congrasp.services.studio.session import SECONDS, Jobs
+from congrasp.services.studio.grasping import ATTEMPTS, SECONDS, PolicyGrasping
+from congrasp.services.studio.session import Jobs
 from congrasp.services.studio.state import Studio
 from tests import task
 from tests.studio import objects

@@ -1,5 +1,6 @@
-"""All ranks are started again when one dies; scripts stand in for them."""
+"""Processes of a training, and trainings of a reproduction; scripts stand in for them."""
 
+import dataclasses
 import pathlib
 import subprocess
 import sys
@@ -9,8 +10,13 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
-from congrasp.services.ops.children import command
+from congrasp.services.cli import main
+from congrasp.services.ops import lifetime
+from congrasp.services.ops.lifetime import command
+from congrasp.services.reproduce.plan import RequiredPolicy
+from congrasp.services.reproduce.run import Request, train_all
 from congrasp.services.train import processes
+from congrasp.services.train.presets import get_preset
 from congrasp.services.train.processes import Child
 
 WAITS = "import time; time.sleep(60)"
@@ -25,9 +31,11 @@ class Script(Child):
     """A child whose lives are Python programs, one after the other."""
 
     def start(self) -> None:
-        life = self.arguments[min(self.restarts, len(self.arguments) - 1)]
+        self.run(self.arguments[min(self.restarts, len(self.arguments) - 1)])
+
+    def run(self, *program: str) -> None:
         with self.log.open("ab") as log:
-            self.process = subprocess.Popen([sys.executable, "-c", life], stdout=log, stderr=log)
+            self.process = subprocess.Popen([sys.executable, "-c", *program], stdout=log, stderr=log)
 
 
 @pytest.fixture
@@ -75,3 +83,78 @@ def test_bad_input_of_any_rank_ends_the_run_with_its_last_words(supervise):
 def test_each_rank_sees_one_of_the_visible_gpus(monkeypatch, visible, names):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     assert [processes._gpu(rank) for rank in range(2)] == names
+
+
+# --- trainings of a reproduction ---
+
+
+OURS, GRAPSXL, PHASES = (RequiredPolicy("human", method) for method in ("ours", "graspxl", "two-phase"))
+FINISHES = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'policy.safetensors').touch()"
+FAILS = "print('compiling'); print('congrasp: error: The disk is full.'); raise SystemExit(2)"
+HANGS = "import time; print('update 3', flush=True); time.sleep(60)"
+
+
+@pytest.fixture
+def scripts(monkeypatch):
+    """What runs for each policy, by name; and all children that were started."""
+    chosen, started = {}, []
+
+    class Training(Script):
+        def start(self):
+            started.append(self)
+            self.run(chosen[self.name], self.arguments[self.arguments.index("--run-dir") + 1])
+
+    monkeypatch.setattr(processes, "Child", Training)
+    monkeypatch.setattr(lifetime, "_POLL", 0.05)
+    yield chosen, started
+    assert all(child.process.poll() is not None for child in started)
+
+
+def request(out, patience, *options):
+    """A request whose trainings are in `out`."""
+    return Request(out, ("human",), (), {}, (), False, options, patience, "", 1, 1, 1, "native", 0)
+
+
+def silent(label, total):
+    return lambda done: None
+
+
+def test_one_that_fails_or_hangs_is_named_and_does_not_stop_the_rest(scripts, tmp_path):
+    chosen, started = scripts
+    chosen |= {OURS.name: FAILS, GRAPSXL.name: HANGS, PHASES.name: FINISHES}
+    wanted = request(tmp_path, 3.0)
+    failures = train_all(wanted, [OURS, GRAPSXL, PHASES], silent)
+    assert set(failures) == {OURS, GRAPSXL}
+    assert "human-ours failed: The disk is full." in failures[OURS] and "human-ours.log" in failures[OURS]
+    assert "human-graspxl was stopped" in failures[GRAPSXL]
+    runs = wanted.runs
+    assert processes.trained(runs / OURS.name) is None and processes.training_seconds(runs / OURS.name) is None
+    assert processes.trained(runs / PHASES.name) == runs / PHASES.name / "policy.safetensors"
+    assert processes.training_seconds(runs / PHASES.name) > 0.0
+    assert not any("--resume" in child.arguments for child in started)
+
+
+def test_a_stopped_training_goes_on_and_one_without_a_checkpoint_begins_anew(scripts, tmp_path):
+    chosen, started = scripts
+    chosen |= {OURS.name: FINISHES.replace("p.mkdir(); ", ""), GRAPSXL.name: FINISHES}
+    wanted = request(tmp_path, 20.0, "--updates", "9")
+    (wanted.runs / OURS.name / "checkpoints").mkdir(parents=True)
+    (wanted.runs / OURS.name / "checkpoints" / "checkpoint_00000003.safetensors").touch()
+    (wanted.runs / GRAPSXL.name).mkdir()
+    (wanted.runs / GRAPSXL.name / "config.json").touch()
+    assert train_all(wanted, [OURS, GRAPSXL], silent) == {}
+    ours, graspxl = (child.arguments for child in started)
+    assert "--resume" in ours and ours[-2:] == ["--updates", "9"] and "--preset" not in ours
+    run = str(wanted.runs / GRAPSXL.name)
+    assert graspxl[graspxl.index("--run-dir") + 1] == run and graspxl[graspxl.index("--evaluation") + 1] == "0"
+    assert "--resume" not in graspxl and not (wanted.runs / GRAPSXL.name / "config.json").exists()
+
+
+@pytest.mark.parametrize("policy", [OURS, GRAPSXL, RequiredPolicy("allegro", "ours")], ids=lambda policy: policy.name)
+def test_its_command_lines_are_those_of_train(policy):
+    arguments = [*policy.training, "--environments", "4096"]
+    train = main._parsed("train", main.load("train"), arguments)
+    config = train.keywords["config"]
+    assert (config.task.hand, config.environments) == (policy.hand, 4096)
+    assert train.keywords["method"] == (None if policy.method == "ours" else policy.method)
+    assert dataclasses.replace(config, environments=32_768) == get_preset("full", policy.hand)

@@ -1,10 +1,7 @@
 """Pictures show all shapes, in their places and colours."""
 
 import dataclasses
-import os
 import pathlib
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -37,7 +34,7 @@ from congrasp.services.viz.shapes import Camera, Shape, arrow, beads, between, c
 from congrasp.services.viz.sheets import contact_sheet, save_png, save_video
 from congrasp.services.viz.triangles import cut, smooth_corners
 from congrasp.services.viz.views import TOUCHING, View, camera_of, episode_shapes, view_of, views
-from tests.cluster import ROOT
+from tests.children import python
 from tests.episodes import CONTROL_DT, episode
 
 WHITE, RED, BLUE = (0.9, 0.9, 0.9), (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
@@ -314,6 +311,5 @@ def test_pictures_need_no_writable_folder() -> None:
     script = (
         "import numpy as np; from congrasp.services.viz import kernels; print(kernels.averaged(np.ones((2, 2, 3)), 2))"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": "/proc/nowhere"}
-    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120)
+    done = python("-c", script, env={"XDG_CACHE_HOME": "/proc/nowhere"})
     assert done.stdout.split() == ["[[[255", "255", "255]]]"], done.stderr

@@ -217,10 +217,7 @@ def _flat(outline, face=None):
 
 def test_a_polygon_with_a_bridge_to_its_hole_and_dented_quads_are_cut(tmp_path):
     square = [(0, 0), (4, 0), (4, 4), (0, 4), (1, 1), (1, 3), (3, 3), (3, 1)]
-    for text, area in [
-        (_flat(square, (0, 1, 2, 3, 0, 4, 5, 6, 7, 4)), 12),
-        (_flat(_ARROW), 1),
-    ]:
+    for text, area in [(_flat(square, (0, 1, 2, 3, 0, 4, 5, 6, 7, 4)), 12), (_flat(_ARROW), 1)]:
         (tmp_path / "a.obj").write_text(text)
         assert load_geometry(tmp_path / "a.obj", "").area == pytest.approx(area)
 

@@ -1,13 +1,18 @@
-"""What a mesh of unknown unit may measure, and which unit makes it a thing for a hand."""
+"""Units and masses of imported meshes: which unit makes a thing for a hand, and masses by material."""
 
 import pathlib
 
+import numpy as np
 import pytest
 import trimesh
 
 from congrasp.common.errors import CongraspError
-from congrasp.services.assets.objects.options import METRES, guessed_unit, metres_per_unit, sizes_by_unit
-from congrasp.services.studio.app import MeshImporter
+from congrasp.common.objects.procedural import generate
+from congrasp.services.assets.objects.materials import guessed_mass, materials_of, weigh
+from congrasp.services.assets.objects.named import ObjectAt, objects_of
+from congrasp.services.assets.objects.options import METRES, ImportOptions, guessed_unit, metres_per_unit, sizes_by_unit
+from congrasp.services.grasp.jobs import _load
+from congrasp.services.studio.catalogue import Importer
 
 
 @pytest.mark.parametrize(
@@ -41,4 +46,91 @@ def test_the_size_in_every_unit_says_whether_a_hand_could_grasp_that() -> None:
 
 def test_the_sides_of_a_mesh_are_read_in_its_own_unit(tmp_path: pathlib.Path) -> None:
     trimesh.creation.box((30.0, 40.0, 50.0)).export(tmp_path / "box.stl")
-    assert MeshImporter().sides(tmp_path / "box.stl") == pytest.approx((30.0, 40.0, 50.0))
+    assert Importer().sides(tmp_path / "box.stl") == pytest.approx((30.0, 40.0, 50.0))
+
+
+# --- masses: solids, shells and sheets whose mass is worked out by hand; parts of different materials ---
+
+
+def weight(mesh, name):
+    return weigh([mesh], materials_of(name, [""]))
+
+
+def test_a_solid_weighs_its_volume():
+    block = trimesh.creation.box((0.02, 0.02, 0.1)).apply_translation((0.3, 0, 0))
+    found = weight(block, "steel")
+    assert found.mass == pytest.approx(7850 * 4e-5)
+    np.testing.assert_allclose(found.center, (0.3, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(np.diag(found.inertia), found.mass / 12 * np.array([0.0104, 0.0104, 0.0008]))
+
+
+def test_what_is_too_thick_for_its_material_weighs_its_wall():
+    ball = trimesh.creation.icosphere(4, radius=0.05)
+    found = weight(ball, "ceramic")
+    assert found.mass == pytest.approx(2400 * 0.004 * 4 * np.pi * 0.05**2, rel=0.01)
+    np.testing.assert_allclose(found.inertia, 2 / 3 * found.mass * 0.05**2 * np.eye(3), rtol=0.01, atol=1e-9)
+    assert weight(ball, "wood").mass == pytest.approx(640 * 4 / 3 * np.pi * 0.05**3, rel=0.01)
+
+
+def test_a_thin_shell_weighs_what_its_two_walls_enclose():
+    tube = trimesh.creation.annulus(0.037, 0.04, 0.1)
+    assert weight(tube, "ceramic").mass == pytest.approx(2400 * np.pi * (0.04**2 - 0.037**2) * 0.1, rel=0.01)
+
+
+def test_an_open_sheet_weighs_its_wall():
+    box = trimesh.creation.box((0.06, 0.06, 0.1))
+    box.update_faces(box.triangles_center[:, 2] < 0.049)
+    assert not box.is_volume
+    found = weight(box, "glass")
+    assert found.mass == pytest.approx(2500 * 0.003 * (0.06**2 + 4 * 0.06 * 0.1))
+    assert found.center[2] == pytest.approx(-0.05 * 0.06**2 / (0.06**2 + 4 * 0.06 * 0.1))
+    flat = trimesh.Trimesh([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)], [(0, 1, 2)], process=False)
+    assert weight(flat, "paper").mass == pytest.approx(900 * 0.001 * 0.005)
+
+
+@pytest.fixture
+def hammer(tmp_path):
+    """A folder with a handle of 2.5 x 2.5 x 25 cm along z, under a head of 2.5 x 9 x 2.5 cm."""
+    folder = tmp_path / "hammer"
+    folder.mkdir()
+    handle = trimesh.creation.box((0.025, 0.025, 0.25))
+    head = trimesh.creation.box((0.025, 0.09, 0.025)).apply_translation((0, 0, 0.1375))
+    handle.export(folder / "hammer_handle.stl")
+    head.export(folder / "hammer_head.stl")
+    trimesh.util.concatenate([handle, head]).export(folder / "hammer.stl")
+    return folder
+
+
+def imported(folder: pathlib.Path, **options):
+    (obj,) = objects_of(folder, ImportOptions(cache_dir=str(folder.parent / "cache"), **options))
+    return obj
+
+
+def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer, quick_import):
+    obj = imported(hammer, material="head=steel,handle=wood")
+    head, handle = 7850 * 0.025**2 * 0.09, 640 * 0.025**2 * 0.25
+    assert obj.mass == pytest.approx(head + handle, rel=1e-4) and 0.4 < obj.mass < 0.6
+    # The file's origin is the handle's middle, so that the centre of mass is high up.
+    assert -obj.origin[2] == pytest.approx(0.1375 * head / (head + handle), rel=1e-3)
+    for text in ("wood,head=steel", "handle=wood,steel"):
+        assert imported(hammer, material=text).mass == obj.mass
+    given = imported(hammer, material="head=steel,handle=wood", mass=0.5)
+    assert given.mass == 0.5 and given.origin == obj.origin
+    np.testing.assert_allclose(given.inertia / 0.5, obj.inertia / obj.mass)
+
+
+def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_mass():
+    assert guessed_mass(1e-6, 6e-4) == pytest.approx(0.0024)  # a centimetre's cube, at 2,400 kg/m^3
+    assert guessed_mass(2e-4, 0.02) == pytest.approx(0.1)  # 500 kg/m^3
+    assert guessed_mass(1e-5, 0.05) == pytest.approx(0.025)  # 2,500 kg/m^3
+    assert guessed_mass(1e-2, 0.3) == 0.5
+
+
+def test_options_weigh_objects_of_the_generator_too():
+    at, before = ObjectAt("mug_7", pathlib.Path("mug:7"), None), generate(7, "mug")
+    heavy = _load(at, ImportOptions(mass=0.4))
+    assert heavy.mass == 0.4
+    np.testing.assert_allclose(heavy.inertia, before.inertia * 0.4 / before.mass)
+    steel, wood = (_load(at, ImportOptions(material=name)).mass for name in ("body=wood,handle=steel", "wood"))
+    assert steel > 1.2 * wood
+    assert _load(at, ImportOptions()).mass == before.mass

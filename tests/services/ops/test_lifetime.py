@@ -10,7 +10,7 @@ import pytest
 
 STUCK = """
 import threading
-from congrasp.services.ops.shutdown import on_signal
+from congrasp.services.ops.lifetime import on_signal
 with on_signal(grace=0.2):
     print("ready", flush=True)
     lock = threading.Lock()
@@ -20,7 +20,7 @@ with on_signal(grace=0.2):
 PARENT = """
 import os, subprocess, sys, time
 child = subprocess.Popen(
-    [sys.executable, "-c", "import time; from congrasp.services.ops.shutdown import follow_parent; follow_parent();"
+    [sys.executable, "-c", "import time; from congrasp.services.ops.lifetime import follow_parent; follow_parent();"
      "print('ready', flush=True); time.sleep(60)"],
     env={**os.environ, "CONGRASP_PARENT": str(os.getpid())}, stdout=subprocess.PIPE, start_new_session=True)
 child.stdout.readline()
@@ -55,9 +55,9 @@ def test_a_second_signal_ends_a_process_that_drains_for_long():
 def test_a_forced_end_takes_the_children_along():
     child = "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'], start_new_session=True)"
     code = STUCK.replace("import threading", "import subprocess, sys, threading").replace(
-        "    print(", f"    child = {child}\n    register_child(child)\n    print(child.pid, end=' ')\n    print("
+        "    print(", f"    child = {child}\n    _children.add(child)\n    print(child.pid, end=' ')\n    print("
     )
-    with start(code.replace("import on_signal", "import on_signal, register_child")) as process:
+    with start(code.replace("import on_signal", "import _children, on_signal")) as process:
         pid, ready = process.stdout.readline().split()
         child = psutil.Process(int(pid))
         process.send_signal(signal.SIGTERM)

@@ -1,0 +1,388 @@
+"""References from captures: when fingers have closed, fingers apart, resting poses, and other hands."""
+
+import dataclasses
+import pathlib
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from congrasp.common import rotations
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.closure import widest_gap
+from congrasp.common.hands.files import HUMAN
+from congrasp.common.hands.kinematics import capsules, grasp_frame, keypoints, link_transforms
+from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.spec import Capsule, Coupling, Hand, Joint, Link
+from congrasp.common.objects.procedural import generate, plain_object
+from congrasp.common.objects.spec import Piece
+from congrasp.common.task.plausibility import hand_hand
+from congrasp.common.task.sampling.build import HEADINGS
+from congrasp.common.task.sampling.sets import bank_of, describe
+from congrasp.common.wire.codec import Message
+from congrasp.services.assets.captures.build import Report, _from_below, _resting_poses
+from congrasp.services.assets.captures.extract import LATER, Surface, _before_carried, _opposed
+from congrasp.services.assets.captures.human import joint_positions
+from congrasp.services.assets.captures.references import (
+    DEEPEST,
+    OVERLAP,
+    check_reference,
+    deepest,
+    depth,
+    separated,
+    width,
+)
+from congrasp.services.assets.captures.sequence import Dropped, Sequence
+from congrasp.services.cli.constraints import _print_report
+from tests.scenes import pointing
+from tests.services.assets.captures import known
+from tests.services.assets.captures.test_myohand import write
+
+# --- when fingers have closed, and references that no hand can take: synthetic motions ---
+
+
+FRAMES, FIRST = 40, 5
+BALL = plain_object("ball", (Piece("ellipsoid", (0.01, 0.01, 0.01), (0.5, 0.5, 0.5)),), 500.0)
+"""Far from the hand."""
+THUMB, INDEX = 0.010, 0.009
+"""Radii of the thickest skin, m."""
+
+
+class Slab:
+    """A surface |x| = 2 cm of which all is known."""
+
+    def distance(self, points):
+        return np.abs(points[..., 0]) - 0.02
+
+    def normals(self, points):
+        return np.sign(points[..., :1]) * [1.0, 0.0, 0.0]
+
+
+def moving(joints, lift, wrist=0.0, present=True):
+    """An object that does not turn, at heights (T,), and a wrist so far above it, with fingers at (T, 5, 4, 3)."""
+    count, up = len(joints), np.array([0.0, 0.0, 1.0])
+    return Sequence(
+        name="lift",
+        object_name="box",
+        mesh=pathlib.Path("box.stl"),
+        wrist_position=np.outer(lift + wrist * np.ones(count), up),
+        wrist_rotation=np.tile(np.eye(3), (count, 1, 1)),
+        joints=joints,
+        object_position=np.outer(lift * np.ones(count), up),
+        object_rotation=np.tile(np.eye(3), (count, 1, 1)),
+        present=np.broadcast_to(present, count),
+    )
+
+
+def opposed(thumb, index, lift=0.0, present=True, surface=None):
+    """Frame found for skins of thumb and index so far (T,) from a slab, m, which rises by `lift` (T,)."""
+    joints = np.full((FRAMES, 5, 4, 3), 0.3)  # other fingers stay away
+    joints[:, 0, :, 0] = (0.02 + THUMB + thumb * np.ones(FRAMES))[:, None]
+    joints[:, 1, :, 0] = -(0.02 + INDEX + index * np.ones(FRAMES))[:, None]
+    return _opposed(moving(joints, lift, present=present), surface or Slab(), joints, FIRST)
+
+
+AT = np.arange(FRAMES)
+CLOSING = 0.0005 * np.maximum(FIRST + 8 - AT, 0)  # 4 mm off at the first touch, half a millimetre less a frame
+
+
+def test_the_reference_is_taken_when_thumb_and_finger_have_closed():
+    assert opposed(CLOSING, 0.0) == FIRST + 4  # 2 mm
+    assert opposed(0.0, CLOSING) == FIRST + 4
+    assert opposed(0.0, 0.0) == FIRST
+
+
+def test_fingers_that_never_close_give_the_nearest_frame_within_reach():
+    assert opposed(0.003 + CLOSING, 0.0) == FIRST + 8
+    slow = 0.01 - 0.0001 * AT
+    assert opposed(slow, 0.0) == FIRST + LATER
+    # The object is lifted by 1 cm a frame from the eighth frame on: three centimetres at the eleventh.
+    assert opposed(slow, 0.0, 0.01 * np.maximum(AT - 8, 0)) == 10
+    assert opposed(CLOSING, 0.0, present=(AT != FIRST + 4)) == FIRST + 5
+
+
+def test_fingers_on_one_side_do_not_oppose():
+    side = Slab()
+    side.normals = lambda points: np.tile([0, 1.0, 0], (*points.shape[:-1], 1))
+    assert opposed(CLOSING, 0.0, surface=side) == FIRST
+
+
+# For 11 frames the wrist comes down by 2 cm a frame; then the object rises by 6 mm a frame, 6 cm at frame 20.
+WRIST = np.concatenate([np.arange(0.30, 0.095, -0.02), np.full(10, 0.10)])
+LIFT = np.concatenate([np.zeros(11), 0.006 * np.arange(1, 11)])
+
+
+def picked(wrist, lift, present=True):
+    """Frame found for a grasp that is noticed at frame 20."""
+    motion = moving(np.zeros((21, 5, 4, 3)), lift, wrist, present)
+    return _before_carried(motion, np.outer(wrist, [0.0, 0.0, 1.0]), 20)
+
+
+def test_a_grasp_that_is_noticed_late_belongs_to_where_the_object_was_picked_up():
+    assert picked(WRIST, LIFT) == 11  # the last frame within a centimetre of the place
+    # Missing frames do not count: at frame 9 the wrist is 2 cm from where it will be.
+    assert picked(WRIST, LIFT, ~np.isin(np.arange(21), (10, 11))) == 9
+
+
+@pytest.mark.parametrize(
+    ("wrist", "lift"),
+    [
+        (WRIST, 0.45 * LIFT),  # 2.7 cm: nudged
+        (WRIST, 0 * LIFT),
+        (np.linspace(0.30, 0.10, 21), LIFT),  # another hand lifts it while this one comes
+    ],
+)
+def test_an_object_that_this_hand_does_not_carry_leaves_the_frame_as_it_is(wrist, lift):
+    assert picked(wrist, lift) == 20
+
+
+@pytest.fixture
+def pinch(tmp_path, run_import):
+    """Imports a pinched box, of which `grow` m are added to the edge between the fingers."""
+
+    def run(grow, code=0):
+        case = known.make("MyoHand_box_lift", "box")
+        write(case, tmp_path / "data" / f"{case.name}.npz")
+        wider = dataclasses.replace(case, size=case.size + np.array([grow, 0, 0]))
+        known.write_mesh(wider, tmp_path / "meshes" / "box.stl")
+        return run_import("myohand", tmp_path / "data", "--meshes", tmp_path / "meshes", code=code)
+
+    return run
+
+
+def test_a_reference_that_is_deep_in_its_object_is_dropped_and_counted(pinch):
+    sets, report = pinch(0.004)
+    assert not report.dropped and list(sets) == ["box"]
+    _, report = pinch(0.03, code=2)
+    assert report.rules()[0][:2] == ("too deep", 1)
+    assert "mm deep in the object (10 mm at most)" in report.rules()[0][2]
+
+
+def straight(contact):
+    """A demonstration with the hand's frame that of the object, which is touched at points (n, 3)."""
+    return types.SimpleNamespace(
+        name="wide",
+        q=HUMAN.q_open,
+        position=np.zeros((1, 3)),
+        quaternion=np.array([[1.0, 0, 0, 0]]),
+        contact=np.asarray(contact, float),
+    )
+
+
+def test_what_is_wider_than_the_hand_opens_is_too_wide():
+    opening, cross = widest_gap(HUMAN), np.asarray(grasp_frame(HUMAN).cross)
+    fitting, wide = (straight(np.outer([0, share * opening], cross)) for share in (0.97, 1.03))
+    assert width(fitting) == pytest.approx(0.97 * opening)
+    check_reference(HUMAN, fitting, BALL, 1.0)
+    with pytest.raises(Dropped, match="cm apart, but the hand opens only") as error:
+        check_reference(HUMAN, wide, BALL, 1.0)
+    assert error.value.rule == "too wide"
+    with pytest.raises(Dropped):  # lengths grow with a robot hand's objects
+        check_reference(HUMAN, straight(np.outer([0, 0.9 * opening], cross)), BALL, 1.4)
+    assert width(straight(np.zeros((0, 3)))) == 0.0
+
+
+def test_depth_is_that_of_the_deepest_skin():
+    """By hand: below the open hand, a block rises into its lowest skin."""
+    held = straight(np.zeros((0, 3)))
+    ends = np.asarray(capsules(HUMAN, link_transforms(HUMAN, jnp.array(HUMAN.q_open)))).reshape(-1, 3)
+    lowest = (ends[:, 2] - np.repeat(HUMAN.capsule_radii, 2)).min()
+
+    def block(deep):
+        return plain_object("block", (Piece("box", (0.3, 0.3, 0.1), (0.0, 0.0, lowest + deep - 0.1)),), 500.0)
+
+    for deep in (-0.02, 0.003, 0.012):
+        assert depth(held, block(deep)) == pytest.approx(deep, abs=1e-6)
+    check_reference(HUMAN, held, block(0.9 * DEEPEST), 1.0)
+    with pytest.raises(Dropped, match="12 mm deep in the object"):
+        check_reference(HUMAN, held, block(0.012), 1.0)
+    check_reference(get_hand("allegro"), held, block(0.012), 1.0)  # it closes around the object by itself
+
+
+def test_normals_of_a_surface_point_outwards():
+    obj = generate(3, "ball")
+    points = 1.2 * obj.points.astype(float)
+    normals = Surface(obj).normals(points)
+    assert (np.einsum("ni,ni->n", normals, obj.normals) > 0.9).all()
+
+
+# --- fingers moved apart, worked out by hand for two of them ---
+
+
+ASIDE, LONG, RADIUS = 0.02, 0.05, 0.005
+
+
+def two_fingers(upper=1.0, couplings=()):
+    """Fingers of 5 cm at x = -2 and 2 cm along y, that turn about z: `a` towards -x and `b` towards +x.
+
+    So +x of `a` needs a negative angle: turned by -t and t, their tips are 2 (2 cm - 5 cm sin t) apart.
+    """
+    links = [Link("palm", "", (), (Capsule((0, -0.05, 0), (0, -0.04, 0), RADIUS),), 0.1, 1.0)]
+    for name, x, limits in (("a", -ASIDE, (-upper, 1.0)), ("b", ASIDE, (-1.0, 1.0))):
+        joint = Joint(name, (0, 0, 1), (x, 0, 0), *limits, kp=1.0, kv=0.1, torque_limit=1.0)
+        shape = Capsule((x, 0, 0), (x, LONG, 0), RADIUS)
+        links.append(Link(name, "palm", (joint,), (shape,), 0.05, 1.0, tip=(x, LONG, 0)))
+    return Hand("two", tuple(links), "a", {}, {}, HUMAN.wrist, couplings=couplings)
+
+
+def test_two_fingers_part_evenly():
+    """Turned by 0.38 rad each they overlap by 7 mm; at t with 2 (2 cm - 5 cm sin t) = 1 cm - 1 mm by 1 mm."""
+    hand, q = two_fingers(), np.array([[-0.38, 0.38]], np.float32)
+    overlap = 2 * RADIUS - 2 * (ASIDE - LONG * np.sin(0.38))
+    np.testing.assert_allclose(deepest(hand, q), overlap, atol=1e-6)
+    angle = np.arcsin((ASIDE - RADIUS + OVERLAP / 2) / LONG)
+    np.testing.assert_allclose(separated(hand, q), [[-angle, angle]], atol=2e-4)
+
+
+def test_where_one_may_not_go_the_other_does():
+    """`a` cannot leave -0.38 rad, where its tip is at 2 cm - 5 cm sin(0.38) from the middle: `b` makes all the room."""
+    stiff = two_fingers()
+    a = dataclasses.replace(stiff.links[1].joints[0], upper=-0.38)
+    hand = dataclasses.replace(
+        stiff, links=(stiff.links[0], dataclasses.replace(stiff.links[1], joints=(a,)), stiff.links[2])
+    )
+    hand = dataclasses.replace(hand, open_pose={"a": -0.38}, closed_pose={"a": -0.38})
+    found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
+    assert found[0, 0] == np.float32(-0.38) and found[0, 1] < 0.3
+    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
+
+
+def test_followers_still_follow():
+    hand = two_fingers(couplings=(Coupling("b", "a", -1.0),))
+    found = separated(hand, np.array([[-0.38, 0.38]], np.float32))
+    np.testing.assert_allclose(found, coupled(hand, found), atol=1e-6)
+    np.testing.assert_allclose(deepest(hand, found), OVERLAP, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", ["human", "sharpa"])
+@pytest.mark.slow
+def test_poses_end_within_limits_and_apart_and_others_stay_as_they_are(name):
+    hand, rng = get_hand(name), np.random.default_rng(3)
+    share = rng.uniform(0.0, 1.0, (12, 1))
+    q = hand.q_open + share * (hand.q_closed - hand.q_open) + rng.normal(0, 0.25, (12, len(hand.joints)))
+    q = np.clip(q, hand.lower, hand.upper).astype(np.float32)
+    before, found = np.asarray(deepest(hand, q)), separated(hand, q)
+    deep = before > OVERLAP
+    assert deep.any() and not deep.all()
+    np.testing.assert_array_equal(found[~deep], q[~deep])
+    assert np.all(found >= hand.lower) and np.all(found <= hand.upper)
+    np.testing.assert_array_less(hand_hand(hand, link_transforms(hand, jnp.asarray(found))), OVERLAP + 5e-5)
+    np.testing.assert_allclose(separated(hand, found), found, atol=1e-3)
+
+
+# --- resting poses ---
+
+
+def test_the_hand_is_not_in_the_table_or_as_little_as_can_be():
+    """A hand from straight above, in resting poses in which the table is 1 mm, 15 mm and 45 mm too high for it.
+
+    Further hands are 3 and 15 mm lower: one is requested in the first of them alone, 4 mm in the table, and the other,
+    16 mm in it, in none.
+    """
+    turn = pointing(-1.0)
+    ends = np.asarray(capsules(HUMAN, link_transforms(HUMAN, jnp.array(HUMAN.q_open)))).reshape(-1, 3)
+    ends = np.asarray(rotations.rotate(jnp.broadcast_to(turn, (len(ends), 4)), jnp.array(ends)))
+    reach = -(ends[:, 2] - np.repeat(HUMAN.capsule_radii, 2)).min()
+    path = np.zeros((3, 4, 3), np.float32)
+    path[:, :, 2] = reach + np.linspace(0.1, 0, 4)
+    path[1:, :, 2] -= np.array([[0.003], [0.015]])
+    quaternion = np.broadcast_to(np.asarray(turn), (3, 4, 4))
+    rest = np.array([[0, 0, -depth, 1, 0, 0, 0] for depth in (0.001, 0.015, 0.045)], np.float32)
+    q = np.stack([HUMAN.q_open] * 3).astype(np.float32)
+    allowed = _resting_poses(HUMAN, q, path, quaternion, rest)
+    np.testing.assert_array_equal(allowed, [[True, False, False], [True, False, False], [False, False, False]])
+    rest[1, 2] = 0.02
+    allowed = _resting_poses(HUMAN, q, path, quaternion, rest)
+    np.testing.assert_array_equal(allowed, [[True, True, False], [False, True, False], [False, True, False]])
+
+
+# --- sequences of which no episode is drawn ---
+
+
+def test_from_below_is_what_only_the_direction_of_the_approach_excludes():
+    """By hand: an object whose centre is 10 cm high; wrists 5 cm over it and 9 cm under, coming down, up and up."""
+    turns = [pointing(z) for z in (-1.0, 1.0, 1.0)]
+    path = np.zeros((2, 3, 15, 3), np.float32)
+    path[..., 2] = np.array([0.05, 0.05, -0.09])[:, None]
+    arrays = {
+        "trajectory/position": path,
+        "pose/quaternion": np.stack([np.stack(turns)] * 2),
+        "rest": np.array([[0, 0, 0.1, 1, 0, 0, 0]], np.float32),
+    }
+    np.testing.assert_array_equal(_from_below(HUMAN, Message(arrays, {})), [False, True, False])
+
+
+def test_the_report_names_them(capsys):
+    def row(name: str, *, clear: bool, below: bool, overlap: float = 0.0, moved: float = 0.0) -> dict:
+        place = {"clear_of_table": clear, "from_below": below, "split": "held-out" if name == "dig" else "training"}
+        apart = {"overlap_m": overlap, "moved_apart_rad": moved}
+        later = {"frames_after_touch": 4 if below else 0}
+        return {"sequence": name, "object": "box", "residual_rad": 0.0} | place | apart | later
+
+    kept = [
+        row("lift", clear=True, below=False),
+        row("scoop", clear=False, below=True, overlap=0.004, moved=0.1),
+        row("push", clear=False, below=False, overlap=0.003, moved=0.2),
+        row("dig", clear=False, below=True),
+    ]
+    _print_report(Report(kept), "human", pathlib.Path("sets"), pathlib.Path("objects"))
+    said = capsys.readouterr().out
+    assert "room for 1 of 4" in said
+    assert "In 2 of 4, thumb and fingers oppose only after the first touch" in said
+    assert "the reference is taken then, 4 frames later on average" in said
+    assert "of 2 overlapped, by up to 4.0 mm (scoop)" in said
+    assert "by 0.15 rad on average, at most 0.20 rad (push)" in said
+    assert "No episode is drawn from 2, whose hand comes from below, which no episode does: scoop, dig." in said
+    assert "No episode is drawn from 1, whose hand comes too near to the table: push." in said
+    assert "3 sequences are for training, 1 held out." in said
+
+
+# --- robot hands ---
+
+
+def axes(hand):
+    frame = grasp_frame(hand)
+    return np.stack([frame.heading, frame.cross])
+
+
+@pytest.mark.parametrize("name", ["allegro", pytest.param("sharpa", marks=pytest.mark.slow)])
+def test_the_hand_centre_and_grasp_axes_follow_the_human_ones(run_import, tmp_path, capsys, name):
+    cases = [known.make(f"MyoHand_box_lift{seed}", "box", seed, tail=0.04) for seed in range(2)]
+    for case in cases:
+        write(case, tmp_path / "data" / f"{case.name}.npz")
+    # Beyond what a human finger can do, which does not matter to another hand.
+    far = np.load(tmp_path / "data" / f"{cases[1].name}.npz")["robot"]
+    far[:, 9 + 19] = HUMAN.upper[19] + 0.5
+    write(cases[1], tmp_path / "data" / f"{cases[1].name}.npz", robot=far)
+    known.write_mesh(cases[0], tmp_path / "meshes" / "box.stl")
+    options = ["--meshes", tmp_path / "meshes", "--headings", "demonstrated"]
+    sets, report = run_import("myohand", tmp_path / "data", "--hand", name, *options)
+    assert not report.dropped and "finger angles do not fit" in " ".join(capsys.readouterr().out.split())
+
+    hand, scale = get_hand(name), get_hand(name).object_scale
+    made = sets["box"]
+    arrays = made.arrays
+    assert made.meta["hand"] == name and made.meta["object_scale"] == scale
+    assert len(describe(made)["captured"].split(", ")) == 2
+    for m, case in enumerate(cases):
+        q = arrays["pose/q"][0, m]
+        assert q.shape == hand.lower.shape and (q >= hand.lower).all() and (q <= hand.upper).all()
+        tips = np.asarray(keypoints(hand, link_transforms(hand, jnp.asarray(q))))[len(hand.links) :]
+        center = (tips[0] + tips[1:].mean(0)) / 2
+        human = np.clip(far[-1, 9:] if m else case.q, HUMAN.lower, HUMAN.upper)
+        human_tips = joint_positions(human)[:, 3]
+        position, turns = case.waypoints()
+        wanted = scale * (position + turns.apply((human_tips[0] + human_tips[1:].mean(0)) / 2))
+        found = Rotation.from_quat(arrays["trajectory/quaternion"][0, m], scalar_first=True)
+        path = arrays["trajectory/position"][0, m]
+        held = found[-1].inv().apply(wanted[-1] - path[-1])  # the hand centre of the closed hand, wrist frame
+        np.testing.assert_allclose(path + found.apply(held), wanted, atol=1e-3)
+        assert np.linalg.norm(held - center) < 0.03  # fingers that close again move it a little
+        for own, theirs in zip(axes(hand), axes(HUMAN), strict=True):
+            assert (np.linalg.norm(found.apply(own) - turns.apply(theirs), axis=-1) < 0.01).all()
+        np.testing.assert_allclose(arrays["heading/position"][0, m], wanted[-1], atol=1e-3)
+        np.testing.assert_array_equal(arrays["pose/position"][0, m], arrays["trajectory/position"][0, m, -1])
+    assert arrays["heading/position"].shape[1] == HEADINGS
+    assert bank_of([made]).pose_q.shape[-1] == len(hand.joints)
