@@ -248,6 +248,7 @@ CAMERAS = SensingConfig(
 The points' depth has errors of up to 4 mm, half of them may be missing, and the hand-eye calibration is off by up to
 5 mm and 2° (standard deviations), constant in an episode."""
 _SENSING = {STUDENT: TRACKERS, CAMERA: CAMERAS}
+_STUDENT_STD = 0.15  # the action's least standard deviation: a teacher's is 0.1 once it has settled
 
 
 def student_of(config: RunConfig, teacher: str, method: str = STUDENT) -> RunConfig:
@@ -277,6 +278,9 @@ def student_of(config: RunConfig, teacher: str, method: str = STUDENT) -> RunCon
             config,
             name=f"{config.name}-{method}",
             task=task,
+            # PPO after the distillation begins with a policy that obeys all constraints, and with its teacher's noise.
+            curriculum=dataclasses.replace(config.curriculum, ramp=(0, int(config.curriculum.ramped))),
+            ppo=dataclasses.replace(config.ppo, least_std=_STUDENT_STD),
             algorithm="distill",
             distill=dataclasses.replace(
                 config.distill, teacher=str(file.resolve()) if pathlib.Path(teacher) == file else teacher

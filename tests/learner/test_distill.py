@@ -140,4 +140,7 @@ def test_the_command_line_s_teacher_is_the_whole_task(teacher, monkeypatch):
     assert (config.task.observation, config.task.sensing, config.task.hand) == ("tracked", TRACKERS, "allegro")
     assert config.task.surface_points == TASK.surface_points
     assert config.task.approach_steps == 2 * TASK.approach_steps
+    assert config.curriculum.weights(config.task.reward, 1) == config.task.reward
+    full = defaults(["--preset", "human", "--teacher", teacher.name])["config"]
+    assert full.curriculum.weights(full.task.reward, 1) == full.curriculum.reward
     Distillation(policy_spec(config.task, config.network), config)
