@@ -45,7 +45,7 @@ _COUNTS = re.compile(r"""\bcount\s*=\s*["']([^"']*)["']""")
 _NAMED = re.compile(r"""<(\w+)[^<>]*?\bfile\w*\s*=\s*["']([^"']+)["']""")
 _FOLDERS = re.compile(r"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']+)["']""")
 _CLASSES = re.compile(r"""<default\b[^<>]*?\bclass\s*=\s*["']([^"']+)["']""")
-_OPENING = re.compile(r"opening file '([^']*)'")
+_OPENING, _ELEMENT = re.compile(r"opening file '([^']*)'"), re.compile(r"Element name '([^']*)'")
 _PROLOG = re.compile(r"<!--.*?(?:-->|\Z)|<\?.*?(?:\?>|\Z)|<!ENTITY|<(?!!)", re.DOTALL)  # up to the root element
 _XACRO = re.compile(r"<xacro:|\$\{|\$\((?:find|arg|eval)\b")
 _FINITE = (
@@ -245,23 +245,27 @@ def _repeated_classes(texts: list[str], error: str) -> str:
 
 
 def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
-    """The compiled model, without the files that are missing; raises a ValueError."""
-    missing, bounded = list[str](), False
-    for _ in range(_MOST_FILES):
+    """The compiled model, without missing files and unusable meshes; raises a ValueError."""
+    lacking, bounded = dict[str, list[str]](), False  # by the reason
+    for _ in range(2 * _MOST_FILES):
         try:
             model = spec.compile()
             break
         except ValueError as error:
-            opened = _OPENING.search(str(error))
+            opened, named = _OPENING.search(str(error)), _ELEMENT.search(str(error))
             if "mass and inertia" in str(error) and not bounded:
                 spec.compiler.boundmass, spec.compiler.boundinertia = LEAST
                 bounded = True
-            elif opened and _left_out(spec, opened[1]):
-                missing.append(opened[1])
+            elif opened and (asset := _asset(spec, opened[1])):
+                lacking.setdefault("not found", []).append(opened[1])
+                _leave_out(spec, asset)
+            elif named and (mesh := spec.mesh(named[1])):
+                if why := _unusable(spec, mesh):
+                    lacking.setdefault(why, []).append(mesh.name)
+                    _leave_out(spec, mesh)
             else:
                 raise
-    if missing:
-        notes.append(_missing("not found", missing))
+    notes += [_missing(why, files) for why, files in lacking.items()]
     if bounded:
         light, thin = model.body_mass == LEAST[0], (model.body_inertia == LEAST[1]).any(1)
         given = (light, f"mass get {1e3 * LEAST[0]:g} g"), (thin & ~light, f"inertia get {1e6 * LEAST[1]:g} kg.mm²")
@@ -271,21 +275,34 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
     return model
 
 
-def _left_out(spec: mujoco.MjSpec, file: str) -> bool:
-    """Removes the asset of a missing file, and what shows it; False if there is none."""
+def _asset(spec: mujoco.MjSpec, file: str) -> Any:
+    """The asset of a file; None if there is none."""
     for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins):
         files = [asset.file, *getattr(asset, "cubefiles", ())]
-        if not any(name and file.endswith(pathlib.PurePosixPath(name).name) for name in files):
-            continue
-        for geom in [geom for geom in spec.geoms if asset.name and asset.name in (geom.meshname, geom.hfieldname)]:
-            spec.delete(geom)
-        for material in spec.materials:
-            for i, name in enumerate(material.textures):
-                if name == asset.name and isinstance(asset, mujoco.MjsTexture):
-                    material.textures[i] = ""
-        spec.delete(asset)
-        return True
-    return False
+        if any(name and file.endswith(pathlib.PurePosixPath(name).name) for name in files):
+            return asset
+    return None
+
+
+def _unusable(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
+    """Converts the file of a mesh that MuJoCo does not take; the reason if that is impossible."""
+    file = _there(pathlib.Path(spec.modelfiledir, spec.meshdir, mesh.file)) if mesh.file not in spec.assets else None
+    content, kind = _readable(file) if file else (b"", "not usable")
+    if content:
+        mesh.file = f"{mesh.file}.{kind}"
+        spec.assets = {**spec.assets, mesh.file: content}
+    return "" if content else kind
+
+
+def _leave_out(spec: mujoco.MjSpec, asset: Any) -> None:
+    """Removes an asset, and what shows it."""
+    for geom in [geom for geom in spec.geoms if asset.name and asset.name in (geom.meshname, geom.hfieldname)]:
+        spec.delete(geom)
+    for material in spec.materials:
+        for i, name in enumerate(material.textures):
+            if name == asset.name and isinstance(asset, mujoco.MjsTexture):
+                material.textures[i] = ""
+    spec.delete(asset)
 
 
 def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
