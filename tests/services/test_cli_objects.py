@@ -1,5 +1,6 @@
 """`congrasp objects …` as a user meets it."""
 
+import os
 import re
 
 import numpy as np
@@ -71,6 +72,26 @@ def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, 
     assert Catalogue(tmp_path / "out").list() == ["big", "good"]
     assert parse(["import", str(tmp_path / "good.stl"), "--mass", "0.25", *common])() == 0
     assert Catalogue(tmp_path / "out").get("good").mass == 0.25
+
+
+def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(tmp_path, capsys, quick_import):
+    things = tmp_path / "things"
+    (things / "folder.stl").mkdir(parents=True)
+    os.mkfifo(things / "pipe.obj")
+    (things / "gone.obj").symlink_to("nowhere.obj")
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(things / "good.ply", encoding="ascii")
+    text = (things / "good.ply").read_text()
+    (things / "x.ply").write_text(text.replace("float x", "float X"))
+    (things / "list.ply").write_text(text.replace("vertex_indices", "corners"))
+    (things / "zip.obj").write_text("PK\3\4 box.obj\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert parse(["import", str(things), "--out", str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache")])() == 2
+    captured = capsys.readouterr()
+    assert "1 of 7 imported" in captured.out and len(errors(captured.err)) == 6
+    for words in (
+        *("folder.stl is not a regular", "pipe.obj is not a regular", "gone.obj cannot be read: No such file"),
+        *("x.ply .* lack x, y or z", "list.ply .* lack vertex_indices", "zip.obj is a zip archive that is damaged"),
+    ):
+        assert re.search(words, captured.err)
 
 
 def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, quick_import):

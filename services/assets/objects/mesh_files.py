@@ -32,6 +32,7 @@ SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CONVERT = "Convert it to STL, OBJ, PLY or GLB."
 MAX_BYTES = 512 << 20
 """Bytes of a mesh file."""
+CHECK = f"Check the path and its permissions, or export it with less than {MAX_BYTES >> 20} MB."
 _AGAIN = "Export it again, or convert it."
 _UNPACK = "Unpack it and name the mesh inside."
 _SURFACE = "Make a surface of it (in MeshLab: Filters, Remeshing, Screened Poisson) and export that."
@@ -181,8 +182,7 @@ def _content(path: pathlib.Path) -> tuple[str, bytes]:
     Raises:
       CongraspError: it cannot be read, is empty, or is not a mesh; the remedy describes how to get one.
     """
-    limit = f"Check the path and its permissions, or export it with less than {MAX_BYTES >> 20} MB."
-    data = read_file(path, MAX_BYTES, limit)
+    data = read_file(path, MAX_BYTES, CHECK)
     if not data:
         raise CongraspError(f"{path} is empty (0 bytes).", "Export or download it again.")
     start, suffix = data[:_START], path.suffix.lower()
@@ -208,7 +208,7 @@ def _supported(start: bytes, size: int) -> str:
         return "stl"
     lines = [line.split() for line in start.splitlines()]
     points = sum(len(words) >= 4 and words[0] == b"v" for words in lines)
-    return "obj" if points >= 3 else ""
+    return "obj" if points >= 3 and not start.startswith(b"PK\3\4") else ""
 
 
 def _foreign(text: bytes, data: bytes) -> tuple[str, str] | None:

@@ -70,6 +70,11 @@ def plain_ply(data: bytes, notes: list[str]) -> bytes:
     for element in elements:
         if element.rows < 0 or (element.rows and not element.properties):
             raise ValueError(f"it announces an element of {element.rows} rows without values")
+        names = {words[-1] for words in element.properties}
+        if element.name == "vertex" and not names >= set("xyz"):
+            raise ValueError("its vertices lack x, y or z")
+        if element.name == "face" and element.rows and not names & {_INDEX, "vertex_index"}:
+            raise ValueError(f"its faces lack {_INDEX}")
         if element.name == "edge" and element.rows:
             notes.append(f"its {element.rows} edges were left out")
         least += element.rows * (2 * len(element.properties) if kind == "ascii" else element.row("<").itemsize)
