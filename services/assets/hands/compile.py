@@ -325,7 +325,9 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
         if repeated := [name for name, count in names.items() if count > 1]:
             raise _Known(f"several {kind}s are called '{repeated[0]}'. Rename all but one")
     _check_joints(robot, notes)
-    children = {child.get("link") for child in robot.findall("joint/child")}
+    children = Counter(child.get("link") for child in robot.findall("joint/child"))
+    if held := [name for name, count in children.items() if count > 1]:
+        raise _Known(f"the link '{held[0]}' is the child of several joints. Remove all but one of them")
     if robot.find("link") is not None and all(link.get("name") in children for link in robot.findall("link")):
         raise _Known("its links form a loop, and none is the root. Remove the joint that closes it")
     _complete_inertias(robot, notes)
@@ -339,7 +341,7 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
                 used = file, mesh.get("scale", "")  # MuJoCo shares a mesh among shapes of one name and scale
                 if used not in shared:
                     content, kind = _readable(file) if file else (b"", "not found")
-                    shared[used] = f"{len(assets)}.{kind}" if content else kind
+                    shared[used] = f"{len(assets)} {file and file.stem}.{kind}" if content else kind
                     assets |= {shared[used]: content} if content else {}
                 if shared[used] not in assets:
                     lacking.setdefault(shared[used], {})[mesh.get("filename", "")] = None
