@@ -58,6 +58,7 @@ def test_help_names_every_command_and_every_command_exists():
         (["train", "--updates", "many"], "--updates.*'many'"),
         (["train", "--physics", "abacus"], "'abacus'.*'native'"),
         (["render", "hnad"], "hnad.*--help"),
+        (["render", "episode", "/dev/null", "--moments", "0"], "--frames is 0. It must be at least 1"),
         (["warmup", "--preset", "nonsense"], "no preset 'nonsense'"),
         (["train", "--method", "pd"], "'pd' does not learn.*evaluate --method pd"),
         (["evaluate", "--method", "graspxl"], "has the method 'ours', not 'graspxl'.*train --method graspxl"),
