@@ -280,7 +280,7 @@ def _colours(
     try:
         found = sample_colours(paths, seed, up, notes)
     except CongraspError as error:
-        notes.append(f"its colours are left out: {error}")
+        notes.append(f"its colours are left out: {str(error).rstrip('.')}")
         return None
     return found and found._replace(points=(factor * found.points - center).astype(np.float32))
 
