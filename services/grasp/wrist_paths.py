@@ -32,8 +32,7 @@ _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.
 _TIME = re.compile(
     r"(?:.*[.%])?(?:t|time|(?:time[_ ]?)?stamp|secs?|seconds?)(?: ?\[.*|[_ ](?:[mnuµ]?s|secs?|seconds?))?"
 )
-_SECONDS = re.compile(r"(.*?)(n|nano|u|micro|)s(?:ecs?|econds?)?")
-_SHARES = {"": 1.0, "n": 1e-9, "nano": 1e-9, "u": 1e-6, "micro": 1e-6}
+_SECONDS = re.compile(r"(.*?)(n(?:ano)?)?s(?:ecs?|econds?)?")
 _JITTER = 1e-3  # of a file's time, by which it may fall
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
@@ -167,6 +166,7 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
     return found, column, names
 
 
+@np.errstate(invalid="ignore")  # of times that are not finite, which are not compared
 def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines.
 
@@ -219,11 +219,11 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         stamps.append([_number(cells[place]) for place in clock])
     if not rows:
         raise CongraspError(f"{path} has no numbers.", remedy)
-    if fallen := _fallen(np.array(stamps, float) @ [*clock.values()]):
-        raise CongraspError(
-            f"line {numbers[fallen]} of {path} is earlier than one before.",
-            "Sort the lines by time, and cut the file to one motion.",
-        )
+    times = np.array(stamps, float) @ [*clock.values()]
+    falls = np.fmax.accumulate(times) - times > _JITTER * (np.fmax.reduce(times) - np.fmin.reduce(times))
+    if falls.any():
+        late = f"line {numbers[falls.argmax()]} of {path} is earlier than one before."
+        raise CongraspError(late, "Sort the lines by time, and cut the file to one motion.")
     table = np.array(rows)
     if np.abs(np.linalg.norm(table[:, 3:], axis=-1) - 1).max() > _UNIT_LENGTH:
         raise CongraspError(f"{path} holds quaternions that are not of length one.", remedy)
@@ -237,15 +237,7 @@ def _clock(names: list[str]) -> dict[int, float]:
         return {}
     parts = {place: part.groups() for place, name in enumerate(names) if (part := _SECONDS.fullmatch(name))}
     stem = parts[first][0] if first in parts else None
-    return {place: _SHARES[unit] for place, (of, unit) in parts.items() if of == stem} or {first: 1.0}
-
-
-def _fallen(times: np.ndarray) -> int:
-    """Place of the first of the known times (T,) that is earlier than one before; 0 if there is none."""
-    known = np.flatnonzero(np.isfinite(times))
-    now = times[known]
-    falls = np.maximum.accumulate(now) - now > _JITTER * (now.max(initial=-np.inf) - now.min(initial=np.inf))
-    return int(known[falls.argmax()]) if falls.any() else 0
+    return {place: 1e-9 if nano else 1.0 for place, (of, nano) in parts.items() if of == stem} or {first: 1.0}
 
 
 def _mark(line: str) -> str:

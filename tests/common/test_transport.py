@@ -417,11 +417,8 @@ def test_admission_sends_requests_away_unread(pair):
 
 
 def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
-    """Of Zenoh's runtime, which a process reads from its environment."""
-    script = (
-        "import os, sys; from congrasp.common.transport.zenoh_transport import ZenohTransport\n"
-        "ZenohTransport(listen=sys.argv[1:]); print(len(os.listdir('/proc/self/task')), os.environ['ZENOH_RUNTIME'])"
-    )
+    script = "import os, sys; from congrasp.common.transport.zenoh_transport import ZenohTransport as T; "
+    script += "T(listen=sys.argv[1:]); print(len(os.listdir('/proc/self/task')), os.environ['ZENOH_RUNTIME'])"
     command = [sys.executable, "-c", script, f"tcp/127.0.0.1:{free_port()}"]
     env = {**os.environ, "ZENOH_RUNTIME": "(tx: (worker_threads: 2))"}
     threads, settings = subprocess.run(command, capture_output=True, env=env, check=True).stdout.split(b" ", 1)

@@ -26,6 +26,7 @@ from tests.printed import errors
 
 ROOT = Path(__file__).parents[2]
 URDF = ROOT / "tests" / "hands" / "claw.urdf"
+MESH = str(ROOT / "examples" / "mug.obj")
 
 
 def congrasp(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -102,6 +103,15 @@ def test_help_names_every_command_and_every_command_exists():
         (["grasp", "mug:7", "--lift", "nan"], "--lift is nan. It must be from 0 to"),
         (["objects", "generate", "--out", "/nonexistent-out", "--count", "0"], "--count is 0"),
         (["objects", "import"], "nothing to import"),
+        (["objects", "import", "nothing"], "no file or folder nothing. Check the path"),
+        *(
+            (["objects", "import", MESH, f"--{name}", value], f"--{name} is .*It must be positive, and at most {most}")
+            for name, value, most in (
+                *(("mass", "0", "50 kg"), ("mass", "300", "50 kg"), ("density", "-1", "25000")),
+                *(("scale", "0", "1e9"), ("scale", "inf", "1e9"), ("time-limit", "nan", "1e6 s")),
+            )
+        ),
+        (["objects", "import", MESH, "--material", "wood", "--density", "3"], "--material and --density both say"),
         (["objects", "list", "/nonexistent-folder"], "no folder"),
         (["serve", "--metrics-port", "99999999"], "metrics cannot be served at .*:99999999.*--metrics-port"),
         (["view", "--recordings", "/dev/null", "--port", "0"], "/dev/null is no recording"),

@@ -10,8 +10,9 @@ from PIL import Image
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.store import Catalogue, digest
+from congrasp.services.assets.objects import decompose
 from congrasp.services.assets.objects.named import find_object
-from congrasp.services.cli.main import load
+from congrasp.services.cli.main import load, run
 from tests.printed import errors
 
 parse = load("objects")
@@ -92,6 +93,22 @@ def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(tmp_path, 
         *("x.ply .* lack x, y or z", "list.ply .* lack vertex_indices", "zip.obj is a zip archive that is damaged"),
     ):
         assert re.search(words, captured.err)
+    with pytest.raises(CongraspError, match=r"no file .*gone\.obj\. Did you mean .*pipe\.obj"):
+        run(["objects", "import", str(things / "gone.obj")])
+
+
+@pytest.mark.parametrize(
+    ("material", "fault"),
+    [
+        ("adamantium", r"--material is 'adamantium'\. Materials: aluminium,"),
+        ("handle=wood", r"--material names the part 'handle'\. The parts are: none\."),
+    ],
+)
+def test_a_material_is_refused_before_a_mesh_is_cut(tmp_path, monkeypatch, capsys, material, fault):
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "a.stl")
+    monkeypatch.setattr(decompose, "convex_pieces", None)
+    assert parse(["import", str(tmp_path / "a.stl"), "--material", material, "--cache-dir", str(tmp_path)])() == 2
+    assert re.search(fault, capsys.readouterr().err)
 
 
 def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, quick_import):

@@ -247,22 +247,18 @@ def _repeated_classes(texts: list[str], error: str) -> str:
 def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
     """The compiled model, without missing files and unusable meshes; raises a ValueError."""
     lacking, bounded = dict[str, list[str]](), False  # by the reason
-    for _ in range(2 * _MOST_FILES):
+    for _ in range(_MOST_FILES):
         try:
             model = spec.compile()
             break
         except ValueError as error:
-            opened, named = _OPENING.search(str(error)), _ELEMENT.search(str(error))
+            asset, why, name = _rejected(spec, str(error))
             if "mass and inertia" in str(error) and not bounded:
                 spec.compiler.boundmass, spec.compiler.boundinertia = LEAST
                 bounded = True
-            elif opened and (asset := _asset(spec, opened[1])):
-                lacking.setdefault("not found", []).append(opened[1])
+            elif asset:
+                lacking.setdefault(why, []).append(name)
                 _leave_out(spec, asset)
-            elif named and (mesh := spec.mesh(named[1])):
-                if why := _unusable(spec, mesh):
-                    lacking.setdefault(why, []).append(mesh.name)
-                    _leave_out(spec, mesh)
             else:
                 raise
     notes += [_missing(why, files) for why, files in lacking.items()]
@@ -275,23 +271,16 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
     return model
 
 
-def _asset(spec: mujoco.MjSpec, file: str) -> Any:
-    """The asset of a file; None if there is none."""
-    for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins):
-        files = [asset.file, *getattr(asset, "cubefiles", ())]
-        if any(name and file.endswith(pathlib.PurePosixPath(name).name) for name in files):
-            return asset
-    return None
-
-
-def _unusable(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
-    """Converts the file of a mesh that MuJoCo does not take; the reason if that is impossible."""
-    file = _there(pathlib.Path(spec.modelfiledir, spec.meshdir, mesh.file)) if mesh.file not in spec.assets else None
-    content, kind = _readable(file) if file else (b"", "not usable")
-    if content:
-        mesh.file = f"{mesh.file}.{kind}"
-        spec.assets = {**spec.assets, mesh.file: content}
-    return "" if content else kind
+def _rejected(spec: mujoco.MjSpec, error: str) -> tuple[Any, str, str]:
+    """The asset that MuJoCo's error is about, the reason and a name; None if there is no such asset."""
+    if opened := _OPENING.search(error):
+        for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins):
+            files = [asset.file, *getattr(asset, "cubefiles", ())]
+            if any(name and opened[1].endswith(pathlib.PurePosixPath(name).name) for name in files):
+                return asset, "not found", opened[1]
+    named = _ELEMENT.search(error)
+    name = named[1] if named else ""
+    return spec.mesh(name), error.partition("\n")[0].removeprefix("Error: "), name
 
 
 def _leave_out(spec: mujoco.MjSpec, asset: Any) -> None:

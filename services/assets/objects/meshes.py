@@ -167,11 +167,11 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     if solid and solid.overlaps:
         notes.append("its bodies overlap: what lies in several of them weighs once")
     surfaces = _surfaces(meshes, solid, notes)
+    names = [part.part for part in source.parts]
+    weighed = weigh_parts(meshes, parts or meshes, options.material, names) if options.material else None
     hulls, owners, errors = _cut(source, [factor * piece - middle for piece in given], surfaces, options, notes)
-    if options.material:
-        found = weigh_parts(meshes, parts or meshes, options.material, [part.part for part in source.parts])
-    else:
-        found = weigh_evenly(whole, solid, hulls if source.pieces else [np.asarray(whole.vertices)], options.density)
+    hull = hulls if source.pieces else [np.asarray(whole.vertices)]
+    found = weighed or weigh_evenly(whole, solid, hull, options.density)
     mass, center = found.mass if options.mass is None else options.mass, found.center
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
     whole.apply_translation(-center)

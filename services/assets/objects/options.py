@@ -65,7 +65,7 @@ class ImportOptions:
 
 
 def check_options(options: ImportOptions) -> None:
-    """Raises a CongraspError for numbers that are not positive, or above `_MOST`, and for both a material and a density.
+    """Raises a CongraspError for numbers that are not positive or too large, and for both a material and a density.
 
     A cache that cannot be written is logged.
     """

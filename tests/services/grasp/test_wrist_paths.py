@@ -216,6 +216,7 @@ def test_a_column_that_may_fall_is_no_clock(tmp_path, name):
         ("stamp.sec,stamp.nanosec", ("7,999999000", "8,0", "8,900000000")),
         ("t", ("5.000003", "5", "5.01")),
         ("t", ("", "5", "6")),
+        ("t", ("nan", "inf", "6")),
     ],
 )
 def test_a_clock_has_one_or_two_columns_and_jitter_from_its_first_line_on(tmp_path, clock, times):

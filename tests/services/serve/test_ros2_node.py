@@ -185,10 +185,7 @@ def schema(kind):
 
 
 def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
-    """The robot's messages are written and read by mcap-ros2-support, the node's by rosbags.
-
-    The robot shares memory, as is Zenoh's default, for messages of more than three kilobytes.
-    """
+    """The robot's messages are written and read by mcap-ros2-support, the node's by rosbags; long ones share memory."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     write = {k: serialize_dynamic(*schema(k))[schema(k)[0]] for k in set(example.INPUTS.values())}
     read = {k: generate_dynamic(*schema(k))[schema(k)[0]] for k in set(OUTPUTS.values())}
