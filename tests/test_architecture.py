@@ -6,6 +6,8 @@ import io
 import itertools
 import pathlib
 import re
+import subprocess
+import sys
 import tokenize
 from collections.abc import Iterator, Sequence
 
@@ -166,6 +168,12 @@ def test_docstrings_open_plainly_and_no_banned_word_is_used(read, wrong):
     modules = trees(*FOLDERS).items()
     found = [f"{path}:{line}: {text[:100]}" for path, tree in modules for line, text in read(tree) if wrong(text)]
     assert not found, "\n".join(found)
+
+
+def test_benchmarks_need_no_pytest():
+    script = "import sys; sys.modules['pytest'] = None; import importlib, tests.benchmarks.__main__ as benchmarks; "
+    script += "[importlib.import_module(f'tests.benchmarks.{name}') for name in benchmarks.NAMES]"
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 def test_the_modules_of_make_check_exist():

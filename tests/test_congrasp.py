@@ -96,9 +96,13 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
 
 @pytest.mark.parametrize(
     ("options", "fault"),
-    [({"policy": "none.safetensors"}, "none.safetensors cannot be read"), ({"attempts": 0}, "There are 0 attempts")],
+    [
+        ({"policy": "none.safetensors"}, "none.safetensors cannot be read"),
+        ({"attempts": 0}, "There are 0 attempts"),
+        ({"seed": -1}, "The seed is -1"),
+    ],
 )
-def test_a_grasp_names_a_missing_policy_and_no_attempts(options, fault):
+def test_a_grasp_names_a_missing_policy_no_attempts_and_an_impossible_seed(options, fault):
     with pytest.raises(congrasp.CongraspError, match=fault):
         congrasp.grasp("mug:7", **options)
 

@@ -171,7 +171,7 @@ def _check_files(arguments: Sequence[str]) -> None:
         if path.suffix.lower() not in _READ or option in _WRITTEN or _is_there(path):
             continue
         named = f"{option}: there" if option else "There"
-        siblings = [one.name for one in path.parent.iterdir()] if path.parent.is_dir() else []
+        siblings = [one.name for one in path.parent.iterdir() if one.exists()] if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, siblings, 1)
         remedy = f"Did you mean {path.parent / near[0]}?" if near else "Check the path."
         raise CongraspError(f"{named} is no file {path}.", remedy)

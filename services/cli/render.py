@@ -50,12 +50,14 @@ def episode(
       congrasp render episode runs/mine --success
       congrasp render episode runs/mine --index 0 --video grasp.mp4
     """
+    from congrasp.services.cli.console import in_range
     from congrasp.services.grasp.files import save_robot_video
     from congrasp.services.record.episode import arm_of_episode
     from congrasp.services.record.reader import pick_episode
     from congrasp.services.viz.render import Film, episode_sheet, save_episode_video
     from congrasp.services.viz.sheets import save_png
 
+    in_range(1, frames=frames)
     chosen = pick_episode(path, index, success=success)
     save_png(out, episode_sheet(chosen, frames=frames))
     print(out)

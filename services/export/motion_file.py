@@ -264,10 +264,12 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
         _check_arrays({**arrays, **goal}, {**_ARRAYS, **own, **{name: _GOALS[name] for name in goal}})
         colours = Colours(arrays[_POINTS], arrays[_VALUES].astype(np.uint8)) if own else None
         arm = arm_of(str(meta["arm"]), arrays, len(arrays["time"])) if "arm" in meta else None
-        return GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal, arm=arm)
+        motion = GraspMotion(**facts, **{name: arrays[name] for name in _ARRAYS}, colours=colours, goal=goal, arm=arm)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         raise CongraspError(f"{path} is not a grasp motion ({reason[:200]}).", remedy) from None
+    _check(motion, path)
+    return motion
 
 
 def _check_facts(facts: dict[str, Any]) -> None:
@@ -354,7 +356,7 @@ def export_motions(
         raise CongraspError(f"The folder {path} exists already.", "Remove it or pass another with --out.")
     check_free(path, force=force)
     for motion in motions:
-        _check(motion)
+        _check(motion, "The motion")
     module = importlib.import_module(f"congrasp.services.export.{kind}")
     with os_errors_as(f"{path} cannot be written", "Pass another with --out."):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -372,12 +374,12 @@ def default_name(motion: GraspMotion, kind: str) -> pathlib.Path:
     return pathlib.Path(f"{motion.object}{FORMATS[kind] or f'-{kind}'}")
 
 
-def _check(motion: GraspMotion) -> None:
-    """Raises a CongraspError for quaternions that are not normalised; files and recordings are not checked for that."""
+def _check(motion: GraspMotion, what: object) -> None:
+    """Raises a CongraspError for quaternions that are not normalised, which recordings may also hold."""
     for owner in (motion, motion.arm):
         for name in _QUATERNIONS:
             values = getattr(owner, name, None)
             if values is not None and not (np.abs(np.linalg.norm(values, axis=-1) - 1) <= _UNIT).all():
                 raise CongraspError(
-                    f"The motion's {name} has quaternions that are not normalised.", "Run 'congrasp grasp' again."
+                    f"{what}'s {name} has quaternions that are not normalised.", "Run 'congrasp grasp' again."
                 )

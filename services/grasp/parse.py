@@ -6,7 +6,7 @@ sets, which are in the object frame, are used unchanged.
 
 import os
 import pathlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,8 +74,9 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
       obj: the object.
       hand: the hand.
       waypoints: K, of wrist trajectories.
-      **texts: by the names of the constraints' options (`Constraint.options`); an empty text omits the option. Text is
-        split at blanks and commas if an option takes several words; a sequence of words or numbers equals such a text.
+      **texts: by the names of the constraints' options (`Constraint.options`); None or an empty text omits the option.
+        Text is split at blanks and commas if an option takes several words; a number, and a sequence or an array of
+        words or numbers, equal such a text.
 
     Raises:
       CongraspError: an option is unknown, cannot be read or does not fit the object; the message names it.
@@ -83,15 +84,15 @@ def read_request(obj: GraspObject, hand: Hand, waypoints: int, **texts: Any) -> 
     options = {option.name: option for constraint in CONSTRAINTS for option in constraint.options}
     if unknown := sorted(set(texts) - set(options)):
         raise CongraspError(f"There is no constraint option '{unknown[0]}'.", f"Known: {', '.join(options)}.")
+    plain = {name: _plain(option, texts.get(name)) for name, option in options.items()}
     given = {
-        name: _read(option, _plain(option, texts.get(name, "")), Target(f"--{name}", obj, hand, waypoints))
-        for name, option in options.items()
+        name: _read(option, plain[name], Target(f"--{name}", obj, hand, waypoints)) for name, option in options.items()
     }
     parsed = {constraint: constraint.parse(given, hand, obj) for constraint in CONSTRAINTS}
     found = {constraint.name: arrays for constraint, arrays in parsed.items() if arrays is not None}
     regions = [constraint.avoid_region(given, obj) for constraint in CONSTRAINTS if constraint.name in found]
     avoid = next((region for region in regions if region is not None), None)
-    return GraspRequest({"heading": {}, **found}, avoid, above=texts.get("heading") == ABOVE)
+    return GraspRequest({"heading": {}, **found}, avoid, above=plain["heading"] == ABOVE)
 
 
 def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
@@ -106,13 +107,14 @@ def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
         raise CongraspError(str(error) if str(error).startswith(target.name) else f"{target.name}: {error}") from None
 
 
-def _plain(option: Option, value: float | str | os.PathLike[str] | Iterable[Any]) -> str | tuple[str, ...]:
+def _plain(option: Option, value: Any) -> str | tuple[str, ...]:
     """Returns the text of an option, or its words if it takes several; a flag that is off is an empty text."""
-    if option.switch:
+    if option.switch or value is None:
         return "yes" if value else ""
-    if isinstance(value, int | float):
-        return f"{value:g}"
-    text = os.fspath(value) if isinstance(value, str | os.PathLike) else ",".join(map(str, value))
+    if not isinstance(value, str | os.PathLike):
+        words = np.array([*value] if np.iterable(value) else value, object)
+        value = ",".join(map(str, words.ravel()))
+    text = os.fspath(value)
     return tuple(text.replace(",", " ").split()) if option.many else text
 
 

@@ -32,7 +32,8 @@ _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.
 _TIME = re.compile(
     r"(?:.*[.%])?(?:t|time|(?:time[_ ]?)?stamp|secs?|seconds?)(?: ?\[.*|[_ ](?:[mnuµ]?s|secs?|seconds?))?"
 )
-_JITTER = 1e-3  # of a file's time so far, by which it may fall
+_SECONDS = re.compile(r"(.*?)(n(?:ano)?)?s(?:ecs?|econds?)?")
+_JITTER = 1e-3  # of a file's time, by which it may fall
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
@@ -161,6 +162,7 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
     return found, column, names
 
 
+@np.errstate(invalid="ignore")  # of times that are not finite, which are not compared
 def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines.
 
@@ -172,7 +174,7 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         header names no position or quaternion, or several, quaternions are not of length one, or its time runs back.
     """
     columns, width, metres, named, titled, mark = list(range(7)), 7, 1.0, False, False, ""
-    clock, first, last = None, np.inf, -np.inf
+    clock, numbers, stamps = dict[int, float](), list[int](), list[list[float | None]]()
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
@@ -193,7 +195,7 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
                     advice = "Name them x, y, z, qw, qx, qy, qz."
                     if found := _columns(names, titled=titled):
                         (columns, width, metres), named, mark = found, True, _mark(text)
-                        clock = next((place for place, name in enumerate(names) if _TIME.fullmatch(name)), None)
+                        clock = _clock(names)
                     titled = titled or (any(names) and not comment)
                     continue
             if comment or not text.strip(" ,;\t"):
@@ -205,22 +207,33 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
             row = [value for value in values if value is not None and abs(value) < HUGE]
             if len(cells) < width or any(cells[width:]) or len(row) < 7:
                 raise ValueError(f"is not {width} finite numbers")
-            now = None if clock is None else _number(cells[clock])
-            if now is not None:
-                if last - now > _JITTER * (last - first):
-                    advice = "Sort the lines by time, and cut the file to one motion."
-                    raise ValueError("is earlier than one before")
-                first, last = min(first, now), max(last, now)
         except (ValueError, csv.Error) as error:
             what = f"cannot be read: {error}" if isinstance(error, csv.Error) else error
             raise CongraspError(f"line {number} of {path} {what}.", advice) from None
         rows.append(row)
+        numbers.append(number)
+        stamps.append([_number(cells[place]) for place in clock])
     if not rows:
         raise CongraspError(f"{path} has no numbers.", remedy)
+    times = np.array(stamps, float) @ [*clock.values()]
+    falls = np.fmax.accumulate(times) - times > _JITTER * (np.fmax.reduce(times) - np.fmin.reduce(times))
+    if falls.any():
+        late = f"line {numbers[falls.argmax()]} of {path} is earlier than one before."
+        raise CongraspError(late, "Sort the lines by time, and cut the file to one motion.")
     table = np.array(rows)
     if np.abs(np.linalg.norm(table[:, 3:], axis=-1) - 1).max() > _UNIT_LENGTH:
         raise CongraspError(f"{path} holds quaternions that are not of length one.", remedy)
     return metres * table[:, :3], table[:, 3:]
+
+
+def _clock(names: list[str]) -> dict[int, float]:
+    """Places of a header's first clock, with seconds per unit: of a pair such as sec and nanosec both, else of one."""
+    first = next((place for place, name in enumerate(names) if _TIME.fullmatch(name)), None)
+    if first is None:
+        return {}
+    parts = {place: part.groups() for place, name in enumerate(names) if (part := _SECONDS.fullmatch(name))}
+    stem = parts[first][0] if first in parts else None
+    return {place: 1e-9 if nano else 1.0 for place, (of, nano) in parts.items() if of == stem} or {first: 1.0}
 
 
 def _mark(line: str) -> str:

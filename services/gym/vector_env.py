@@ -59,8 +59,10 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
           **task: fields of `TaskConfig` other than those of the hand's training.
 
         Raises:
-          CongraspError: there is no such hand, engine or field of the task.
+          CongraspError: there is no environment, or no such hand, engine or field of the task.
         """
+        if num_envs < 1:
+            raise CongraspError(f"There are {num_envs} environments.", "Make one or more.")
         config = get_preset(FULL, hand)
         self.task = dataclasses.replace(config.task, **{"reward": config.curriculum.reward, **_known(task)})
         self.hand = get_hand(config.task.hand)

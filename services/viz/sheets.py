@@ -21,7 +21,8 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
 
     Args:
       images: (height, width, 3) uint8, all of one size.
-      labels: one for each picture; shrunk and cut until it fits, as is the title.
+      labels: one for each picture; shrunk and cut until it fits, as is the title. Those that would then be equal get
+        the picture's number.
       columns: pictures in a row.
       title: one line.
 
@@ -41,10 +42,12 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
     if title:
         title, font = _fitted(title, 19, sheet.width - 2 * _MARGIN)
         draw.text((_MARGIN + 2, _TITLE // 2), title, INK, font, anchor="lm")
+    cut = {label: _fitted(label, 14, width)[0] for label in labels}
     for i, (image, label) in enumerate(zip(images, labels, strict=True)):
         x, y = _MARGIN + i % columns * (width + _MARGIN), top + i // columns * (height + _LABEL)
         sheet.paste(Image.fromarray(image), (x, y))
-        label, font = _fitted(label, 14, width)
+        alike = [*cut.values()].count(cut[label]) > 1
+        label, font = _fitted(f"{i + 1}: {label}" if alike else label, 14, width)
         draw.text((x + 2, y + height + _LABEL // 2), label, _QUIET, font, anchor="lm")
     return np.asarray(sheet)
 

@@ -8,8 +8,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from tests.services.studio.conftest import SIZE, chromium
-from tests.services.studio.test_page import drag, on_object, picture
+from tests.browser import SIZE, chromium, drag, on_object, picture
 
 _PHONE = {"width": 390, "height": 844}
 _HELD = 6

@@ -416,6 +416,15 @@ def test_admission_sends_requests_away_unread(pair):
     assert client.query(KEYS.ticket("b"), Message(), timeout=60).meta == {"later": KEYS.ticket("b")}
 
 
+def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
+    script = "import os, sys; from congrasp.common.transport.zenoh_transport import ZenohTransport as T; "
+    script += "T(listen=sys.argv[1:]); print(len(os.listdir('/proc/self/task')), os.environ['ZENOH_RUNTIME'])"
+    command = [sys.executable, "-c", script, f"tcp/127.0.0.1:{free_port()}"]
+    env = {**os.environ, "ZENOH_RUNTIME": "(tx: (worker_threads: 2))"}
+    threads, settings = subprocess.run(command, capture_output=True, env=env, check=True).stdout.split(b" ", 1)
+    assert int(threads) > zenoh_session._CLOSERS and b"tx: (worker_threads: 2)" in settings
+
+
 @pytest.mark.parametrize(("hard", "files", "warnings"), [(1024, 1024, 1), (20_000, 16_384, 0)])
 def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free(
     monkeypatch, caplog, hard, files, warnings

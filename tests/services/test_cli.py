@@ -21,6 +21,7 @@ from PIL import Image
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.objects.store import Catalogue, digest
 from congrasp.common.transport.ports import free_port
+from congrasp.services.assets.objects import decompose
 from congrasp.services.assets.objects.named import find_object
 from congrasp.services.cli import console
 from congrasp.services.cli import main as cli
@@ -33,6 +34,7 @@ NO_MEMORY = "The accelerator's memory does not suffice"
 LESS = "Choose fewer --environments or a smaller --batch, or change JAX's share, XLA_PYTHON_CLIENT_MEM_FRACTION."
 ROOT = Path(__file__).parents[2]
 URDF = ROOT / "tests" / "hands" / "claw.urdf"
+MESH = str(ROOT / "examples" / "mug.obj")
 
 
 congrasp = functools.partial(python, "-m", "congrasp")
@@ -63,6 +65,7 @@ def test_help_names_every_command_and_every_command_exists():
         (["train", "--updates", "many"], "--updates.*'many'"),
         (["train", "--physics", "abacus"], "'abacus'.*'native'"),
         (["render", "hnad"], "hnad.*--help"),
+        (["render", "episode", "/dev/null", "--moments", "0"], "--frames is 0. It must be at least 1"),
         (["warmup", "--preset", "nonsense"], "no preset 'nonsense'"),
         (["train", "--method", "pd"], "'pd' does not learn.*evaluate --method pd"),
         (["evaluate", "--method", "graspxl"], "has the method 'ours', not 'graspxl'.*train --method graspxl"),
@@ -103,6 +106,15 @@ def test_help_names_every_command_and_every_command_exists():
         (["grasp", "mug:7", "--lift", "nan"], "--lift is nan. It must be from 0 to"),
         (["objects", "generate", "--out", "/nonexistent-out", "--count", "0"], "--count is 0"),
         (["objects", "import"], "nothing to import"),
+        (["objects", "import", "nothing"], "no file or folder nothing. Check the path"),
+        *(
+            (["objects", "import", MESH, f"--{name}", value], f"--{name} is .*It must be positive, and at most {most}")
+            for name, value, most in (
+                *(("mass", "0", "50 kg"), ("mass", "300", "50 kg"), ("density", "-1", "25000")),
+                *(("scale", "0", "1e9"), ("scale", "inf", "1e9"), ("time-limit", "nan", "1e6 s")),
+            )
+        ),
+        (["objects", "import", MESH, "--material", "wood", "--density", "3"], "--material and --density both say"),
         (["objects", "list", "/nonexistent-folder"], "no folder"),
         (["serve", "--metrics-port", "99999999"], "metrics cannot be served at .*:99999999.*--metrics-port"),
         (["view", "--recordings", "/dev/null", "--port", "0"], "/dev/null is no recording"),
@@ -389,6 +401,42 @@ def test_import_goes_on_after_a_bad_mesh_and_says_so_in_its_exit_code(tmp_path, 
     assert Catalogue(tmp_path / "out").list() == ["big", "good"]
     assert parse(["import", str(tmp_path / "good.stl"), "--mass", "0.25", *common])() == 0
     assert Catalogue(tmp_path / "out").get("good").mass == 0.25
+
+
+def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(tmp_path, capsys, quick_import):
+    things = tmp_path / "things"
+    (things / "folder.stl").mkdir(parents=True)
+    os.mkfifo(things / "pipe.obj")
+    (things / "gone.obj").symlink_to("nowhere.obj")
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(things / "good.ply", encoding="ascii")
+    text = (things / "good.ply").read_text()
+    (things / "x.ply").write_text(text.replace("float x", "float X"))
+    (things / "list.ply").write_text(text.replace("vertex_indices", "corners"))
+    (things / "zip.obj").write_text("PK\3\4 box.obj\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert parse(["import", str(things), "--out", str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache")])() == 2
+    captured = capsys.readouterr()
+    assert "1 of 7 imported" in captured.out and len(errors(captured.err)) == 6
+    for words in (
+        *("folder.stl is not a regular", "pipe.obj is not a regular", "gone.obj cannot be read: No such file"),
+        *("x.ply .* lack x, y or z", "list.ply .* lack vertex_indices", "zip.obj is a zip archive that is damaged"),
+    ):
+        assert re.search(words, captured.err)
+    with pytest.raises(CongraspError, match=r"no file .*gone\.obj\. Did you mean .*pipe\.obj"):
+        cli.run(["objects", "import", str(things / "gone.obj")])
+
+
+@pytest.mark.parametrize(
+    ("material", "fault"),
+    [
+        ("adamantium", r"--material is 'adamantium'\. Materials: aluminium,"),
+        ("handle=wood", r"--material names the part 'handle'\. The parts are: none\."),
+    ],
+)
+def test_a_material_is_refused_before_a_mesh_is_cut(tmp_path, monkeypatch, capsys, material, fault):
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "a.stl")
+    monkeypatch.setattr(decompose, "convex_pieces", None)
+    assert parse(["import", str(tmp_path / "a.stl"), "--material", material, "--cache-dir", str(tmp_path)])() == 2
+    assert re.search(fault, capsys.readouterr().err)
 
 
 def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, quick_import):

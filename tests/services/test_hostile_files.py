@@ -245,6 +245,7 @@ def test_json_that_is_no_hand_is_refused(tmp_path, text):
         (lambda m: {"time": m.time[:3]}, r"table has shape \(12,\), but \(T,\) requires \(3,\)"),
         (lambda m: {"object_vertices": m.object_vertices[:0]}, "object_vertices is empty"),
         (lambda m: {"object_faces": m.object_faces + 1000}, "names vertices that do not exist"),
+        (lambda m: {"wrist_quaternion": 0 * m.wrist_quaternion}, r"a\.npz's wrist_quaternion has .* not normalised"),
         (lambda m: {"wrist_quaternion": m.wrist_quaternion[:, :3]}, r"has shape \(12, 3\), but \(T, 4\) requires"),
     ],
 )

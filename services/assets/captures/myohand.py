@@ -56,7 +56,9 @@ def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
 def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     """Reads the sequence of a file."""
     name = file.stem
-    _, robot, pose = frames_of(name, "the file", read_archive(file), {"time": (), "robot": (29,), "object": (7,)})
+    time, robot, pose = frames_of(name, "the file", read_archive(file), {"time": (), "robot": (29,), "object": (7,)})
+    if (np.diff(time) < 0).any():
+        raise Dropped(name, "wrong layout", "its time runs back: sort its frames, and cut it to one motion")
     present = np.isfinite(robot).all(-1) & np.isfinite(pose).all(-1) & is_unit(pose[:, 3:])
     if not present.any():
         reason = "no frame has finite joints and an object with a unit quaternion (w, x, y, z)"

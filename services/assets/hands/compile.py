@@ -45,7 +45,7 @@ _COUNTS = re.compile(r"""\bcount\s*=\s*["']([^"']*)["']""")
 _NAMED = re.compile(r"""<(\w+)[^<>]*?\bfile\w*\s*=\s*["']([^"']+)["']""")
 _FOLDERS = re.compile(r"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']+)["']""")
 _CLASSES = re.compile(r"""<default\b[^<>]*?\bclass\s*=\s*["']([^"']+)["']""")
-_OPENING = re.compile(r"opening file '([^']*)'")
+_OPENING, _ELEMENT = re.compile(r"opening file '([^']*)'"), re.compile(r"Element name '([^']*)'")
 _PROLOG = re.compile(r"<!--.*?(?:-->|\Z)|<\?.*?(?:\?>|\Z)|<!ENTITY|<(?!!)", re.DOTALL)  # up to the root element
 _XACRO = re.compile(r"<xacro:|\$\{|\$\((?:find|arg|eval)\b")
 _FINITE = (
@@ -250,23 +250,23 @@ def _repeated_classes(texts: list[str], error: str) -> str:
 
 
 def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
-    """The compiled model, without the files that are missing; raises a ValueError."""
-    missing, bounded = list[str](), False
+    """The compiled model, without missing files and unusable meshes; raises a ValueError."""
+    lacking, bounded = dict[str, list[str]](), False  # by the reason
     for _ in range(_MOST_FILES):
         try:
             model = spec.compile()
             break
         except ValueError as error:
-            opened = _OPENING.search(str(error))
+            asset, why, name = _rejected(spec, str(error))
             if "mass and inertia" in str(error) and not bounded:
                 spec.compiler.boundmass, spec.compiler.boundinertia = LEAST
                 bounded = True
-            elif opened and _left_out(spec, opened[1]):
-                missing.append(opened[1])
+            elif asset:
+                lacking.setdefault(why, []).append(name)
+                _leave_out(spec, asset)
             else:
                 raise
-    if missing:
-        notes.append(_missing("not found", missing))
+    notes += [_missing(why, files) for why, files in lacking.items()]
     if bounded:
         light, thin = model.body_mass == LEAST[0], (model.body_inertia == LEAST[1]).any(1)
         given = (light, f"mass get {1e3 * LEAST[0]:g} g"), (thin & ~light, f"inertia get {1e6 * LEAST[1]:g} kg.mm²")
@@ -276,21 +276,27 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
     return model
 
 
-def _left_out(spec: mujoco.MjSpec, file: str) -> bool:
-    """Removes the asset of a missing file, and what shows it; False if there is none."""
-    for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins):
-        files = [asset.file, *getattr(asset, "cubefiles", ())]
-        if not any(name and file.endswith(pathlib.PurePosixPath(name).name) for name in files):
-            continue
-        for geom in [geom for geom in spec.geoms if asset.name and asset.name in (geom.meshname, geom.hfieldname)]:
-            spec.delete(geom)
-        for material in spec.materials:
-            for i, name in enumerate(material.textures):
-                if name == asset.name and isinstance(asset, mujoco.MjsTexture):
-                    material.textures[i] = ""
-        spec.delete(asset)
-        return True
-    return False
+def _rejected(spec: mujoco.MjSpec, error: str) -> tuple[Any, str, str]:
+    """The asset that MuJoCo's error is about, the reason and a name; None if there is no such asset."""
+    if opened := _OPENING.search(error):
+        for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins):
+            files = [asset.file, *getattr(asset, "cubefiles", ())]
+            if any(name and opened[1].endswith(pathlib.PurePosixPath(name).name) for name in files):
+                return asset, "not found", opened[1]
+    named = _ELEMENT.search(error)
+    name = named[1] if named else ""
+    return spec.mesh(name), error.partition("\n")[0].removeprefix("Error: "), name
+
+
+def _leave_out(spec: mujoco.MjSpec, asset: Any) -> None:
+    """Removes an asset, and what shows it."""
+    for geom in [geom for geom in spec.geoms if asset.name and asset.name in (geom.meshname, geom.hfieldname)]:
+        spec.delete(geom)
+    for material in spec.materials:
+        for i, name in enumerate(material.textures):
+            if name == asset.name and isinstance(asset, mujoco.MjsTexture):
+                material.textures[i] = ""
+    spec.delete(asset)
 
 
 def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
@@ -313,7 +319,9 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
         if repeated := [name for name, count in names.items() if count > 1]:
             raise _Known(f"several {kind}s are called '{repeated[0]}'. Rename all but one")
     _check_joints(robot, notes)
-    children = {child.get("link") for child in robot.findall("joint/child")}
+    children = Counter(child.get("link") for child in robot.findall("joint/child"))
+    if held := [name for name, count in children.items() if count > 1]:
+        raise _Known(f"the link '{held[0]}' is the child of several joints. Remove all but one of them")
     if robot.find("link") is not None and all(link.get("name") in children for link in robot.findall("link")):
         raise _Known("its links form a loop, and none is the root. Remove the joint that closes it")
     _complete_inertias(robot, notes)
@@ -327,7 +335,7 @@ def _urdf(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
                 used = file, mesh.get("scale", "")  # MuJoCo shares a mesh among shapes of one name and scale
                 if used not in shared:
                     content, kind = _readable(file) if file else (b"", "not found")
-                    shared[used] = f"{len(assets)}.{kind}" if content else kind
+                    shared[used] = f"{len(assets)} {file and file.stem}.{kind}" if content else kind
                     assets |= {shared[used]: content} if content else {}
                 if shared[used] not in assets:
                     lacking.setdefault(shared[used], {})[mesh.get("filename", "")] = None

@@ -34,6 +34,9 @@ def plain_glb(data: bytes, notes: list[str]) -> bytes:
     if len(data) < 20 or length > len(data):
         raise ValueError(f"it announces {length} bytes of JSON, but has {len(data)}")
     tree, binary = json.loads(data[20 : 20 + length]), bytearray(data[28 + length :])
+    for buffer in _list(tree, "buffers")[:1]:
+        if "uri" not in buffer and buffer.get("byteLength", 0) > len(binary):
+            raise ValueError(f"it was cut: it has {len(binary)} of {buffer['byteLength']} bytes of numbers")
     _check_extensions(tree)
     if not _list(tree, "scenes"):  # which the format allows; viewers show every node then
         inner = {child for node in _list(tree, "nodes") for child in node.get("children", ())}

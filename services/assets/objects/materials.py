@@ -77,7 +77,8 @@ def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
     """
     named = dict(_entry(entry) for entry in text.split(","))
     if unknown := sorted(named.keys() - {"", *parts}):
-        raise CongraspError(f"--material names the part '{unknown[0]}'.", f"The parts are: {', '.join(parts)}.")
+        known = ", ".join(filter(None, parts)) or "none"
+        raise CongraspError(f"--material names the part '{unknown[0]}'.", f"The parts are: {known}.")
     missing = [part for part in parts if part not in named and "" not in named]
     if missing:
         raise CongraspError(f"--material leaves out the part '{missing[0]}'.", f"Add {missing[0]}=NAME.")

@@ -32,6 +32,7 @@ SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 CONVERT = "Convert it to STL, OBJ, PLY or GLB."
 MAX_BYTES = 512 << 20
 """Bytes of a mesh file."""
+CHECK = f"Check the path and its permissions, or export it with less than {MAX_BYTES >> 20} MB."
 _AGAIN = "Export it again, or convert it."
 _UNPACK = "Unpack it and name the mesh inside."
 _SURFACE = "Make a surface of it (in MeshLab: Filters, Remeshing, Screened Poisson) and export that."
@@ -48,7 +49,7 @@ _POINTS = re.compile(rb"(?m)^[ \t]*v[ \t]+([^\n#]*)")
 _POLYGON = re.compile(rb"(?m)^[ \t]*f((?:[ \t]+\d[\d/]*){4,})[ \t\r]*$")
 _REMARK = re.compile(rb"(?m)^([ \t]*f[^\n#]*)#[^\n]*")
 _FACE = re.compile(rb"(?m)^[ \t]*f[ \t][^\n#]*")
-_INDEX = re.compile(rb"[ \t](\d{1,18})")
+_INDEX, _LINE = re.compile(rb"[ \t](\d{1,18})"), re.compile(rb"(?m)^l ")
 _NO_POINT = "a face refers to a point that is not in the file"
 _START = 4096
 _MARK = b"\xef\xbb\xbf"  # of UTF-8
@@ -181,8 +182,7 @@ def _content(path: pathlib.Path) -> tuple[str, bytes]:
     Raises:
       CongraspError: it cannot be read, is empty, or is not a mesh; the remedy describes how to get one.
     """
-    limit = f"Check the path and its permissions, or export it with less than {MAX_BYTES >> 20} MB."
-    data = read_file(path, MAX_BYTES, limit)
+    data = read_file(path, MAX_BYTES, CHECK)
     if not data:
         raise CongraspError(f"{path} is empty (0 bytes).", "Export or download it again.")
     start, suffix = data[:_START], path.suffix.lower()
@@ -208,7 +208,7 @@ def _supported(start: bytes, size: int) -> str:
         return "stl"
     lines = [line.split() for line in start.splitlines()]
     points = sum(len(words) >= 4 and words[0] == b"v" for words in lines)
-    return "obj" if points >= 3 else ""
+    return "obj" if points >= 3 and not start.startswith(b"PK\3\4") else ""
 
 
 def _foreign(text: bytes, data: bytes) -> tuple[str, str] | None:
@@ -331,6 +331,8 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
     data = _INDENT.sub(b"", data).replace(b"\t", b" ")
+    if lines := len(_LINE.findall(data)):
+        notes.append(f"its {lines} edges were left out")
     if _ZERO.search(data):
         raise ValueError("a face has the index 0, but OBJ counts from 1")
     data = _REMARK.sub(rb"\1", re.sub(rb"\\\r?\n", b" ", data))

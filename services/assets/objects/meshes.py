@@ -16,6 +16,7 @@ from scipy.spatial import QhullError, cKDTree
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import cache_folder
+from congrasp.common.io.inputs import read_file
 from congrasp.common.objects import shapes, store
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.shapes import halves, sample_mesh
@@ -25,7 +26,7 @@ from congrasp.services.assets.objects import decompose, repair
 from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
 from congrasp.services.assets.objects.fidelity import Enclosed, enclosed
 from congrasp.services.assets.objects.materials import weigh_evenly, weigh_parts
-from congrasp.services.assets.objects.mesh_files import read_mesh, sample_colours, up_of
+from congrasp.services.assets.objects.mesh_files import CHECK, MAX_BYTES, read_mesh, sample_colours, up_of
 from congrasp.services.assets.objects.options import METRES, ImportOptions, Up, check_options, metres_per_unit
 from congrasp.services.assets.objects.repair import encloses
 
@@ -143,7 +144,7 @@ def _key(source: Source, options: ImportOptions) -> str:
     content = hashlib.sha256(f"{_DRAWS} {source.name} {settings}".encode())
     for file in source.files():
         content.update(f" {file.path.name} {file.role} {file.part} ".encode(errors="surrogateescape"))
-        content.update(hashlib.sha256(file.path.read_bytes()).digest())
+        content.update(hashlib.sha256(read_file(file.path, MAX_BYTES, CHECK)).digest())
     return content.hexdigest()[:24]
 
 
@@ -166,11 +167,11 @@ def _build(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     if solid and solid.overlaps:
         notes.append("its bodies overlap: what lies in several of them weighs once")
     surfaces = _surfaces(meshes, solid, notes)
+    names = [part.part for part in source.parts]
+    weighed = weigh_parts(meshes, parts or meshes, options.material, names) if options.material else None
     hulls, owners, errors = _cut(source, [factor * piece - middle for piece in given], surfaces, options, notes)
-    if options.material:
-        found = weigh_parts(meshes, parts or meshes, options.material, [part.part for part in source.parts])
-    else:
-        found = weigh_evenly(whole, solid, hulls if source.pieces else [np.asarray(whole.vertices)], options.density)
+    hull = hulls if source.pieces else [np.asarray(whole.vertices)]
+    found = weighed or weigh_evenly(whole, solid, hull, options.density)
     mass, center = found.mass if options.mass is None else options.mass, found.center
     pieces = tuple(_piece(hull, center, owner) for hull, owner in zip(hulls, owners, strict=True))
     whole.apply_translation(-center)
@@ -275,7 +276,7 @@ def _colours(
     try:
         found = sample_colours(paths, seed, up, notes)
     except CongraspError as error:
-        notes.append(f"its colours are left out: {error}")
+        notes.append(f"its colours are left out: {str(error).rstrip('.')}")
         return None
     return found and found._replace(points=(factor * found.points - center).astype(np.float32))
 

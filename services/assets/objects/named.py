@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import distinct_names, safe_name
+from congrasp.common.io.inputs import distinct_names, read_file, safe_name
 from congrasp.common.objects import store
 from congrasp.common.objects.procedural import family_turns, generate
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.parallel import parallel_map
-from congrasp.services.assets.objects.mesh_files import CONVERT, SUFFIXES, read_mesh
+from congrasp.services.assets.objects.mesh_files import CHECK, CONVERT, MAX_BYTES, SUFFIXES, read_mesh
 from congrasp.services.assets.objects.meshes import MeshFile, Source, import_source, import_sources
 from congrasp.services.assets.objects.options import ImportOptions
 
@@ -59,7 +59,8 @@ class ObjectAt(NamedTuple):
         if not self.source and not self.path.exists():
             return str(self.path)
         files = [file.path for file in self.source.files()] if self.source else [self.path]
-        return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
+        contents = (read_file(file, MAX_BYTES, CHECK) for file in files)
+        return hashlib.sha256(b"".join(hashlib.sha256(content).digest() for content in contents)).hexdigest()
 
 
 def objects_at(path: pathlib.Path) -> list[ObjectAt]:

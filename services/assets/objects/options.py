@@ -21,6 +21,7 @@ LONGEST = 1.0
 _POSSIBLE = (0.005, LONGEST)  # m
 _LIKELY = (0.02, 0.4)  # m, longest side for which a unit is proposed
 _THINNEST = 2e-4  # m
+_MOST = {"scale": "1e9", "density": "25000 kg/m^3", "mass": "50 kg", "time_limit": "1e6 s", "max_pieces": "1e6"}
 _SCALES = ((0.01, 1000.0, "mm"), (1.0, 100.0, "cm"), (1000.0, 1.0, "m"))
 """Upper end of the lengths (m) shown in a unit, number of these units in a metre, and the unit."""
 _COMMON = (
@@ -64,16 +65,14 @@ class ImportOptions:
 
 
 def check_options(options: ImportOptions) -> None:
-    """Raises a CongraspError for numbers that are not positive, and for both a material and a density.
+    """Raises a CongraspError for numbers that are not positive or too large, and for both a material and a density.
 
     A cache that cannot be written is logged.
     """
-    for name in ("scale", "density", "time_limit", "max_pieces"):
+    for name, most in _MOST.items():
         value = getattr(options, name)
-        if value is not None and not value > 0:
-            raise CongraspError(f"--{name.replace('_', '-')} is {value}.", "It must be positive.")
-    if options.mass is not None and not options.mass > 0:
-        raise CongraspError(f"--mass is {options.mass}.", "It must be positive, in kilograms.")
+        if value is not None and not 0 < value <= float(most.partition(" ")[0]):
+            raise CongraspError(f"--{name.replace('_', '-')} is {value}.", f"It must be positive, and at most {most}.")
     if options.material and options.density is not None:
         raise CongraspError("--material and --density both say how dense it is.", "Leave one of them out.")
     if options.cache_dir:

@@ -50,7 +50,7 @@ def plain_ply(data: bytes, notes: list[str]) -> bytes:
 
     Args:
       data: content of the file.
-      notes: the number of polygons that could not be cut is appended.
+      notes: the numbers of edges, and of polygons that could not be cut, are appended.
     """
     header, end, _ = data[:_HEADER].partition(b"end_header")
     if not end:
@@ -70,6 +70,13 @@ def plain_ply(data: bytes, notes: list[str]) -> bytes:
     for element in elements:
         if element.rows < 0 or (element.rows and not element.properties):
             raise ValueError(f"it announces an element of {element.rows} rows without values")
+        names = {words[-1] for words in element.properties}
+        if element.name == "vertex" and not names >= set("xyz"):
+            raise ValueError("its vertices lack x, y or z")
+        if element.name == "face" and element.rows and not names & {_INDEX, "vertex_index"}:
+            raise ValueError(f"its faces lack {_INDEX}")
+        if element.name == "edge" and element.rows:
+            notes.append(f"its {element.rows} edges were left out")
         least += element.rows * (2 * len(element.properties) if kind == "ascii" else element.row("<").itemsize)
     if least > len(data):
         raise ValueError(f"it announces {max(x.rows for x in elements)} rows, but has {len(data)} bytes")

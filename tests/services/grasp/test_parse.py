@@ -48,7 +48,9 @@ def test_headings_are_numbers_or_a_word(block):
     np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
     np.testing.assert_allclose(given.given("heading", "position"), [0, 0, 0.04], atol=1e-6)
     for written in ((0, 0, -2), [0.0, 0.0, -1.0], np.array([0, 0, -1], np.float32)):
-        np.testing.assert_allclose(asked(block, heading=written).given("heading", "direction"), [0, 0, -1])
+        given = asked(block, heading=written, at=None, force=np.float32(2))
+        np.testing.assert_allclose(given.given("heading", "direction"), [0, 0, -1])
+        assert given.above is False and given.given("force", "limit") == 2
     above = asked(block, heading="above")
     assert above.above and above.given("heading", "direction") is None
     with pytest.raises(CongraspError, match=r"--at lies 39.* m from 'block'"):

@@ -185,6 +185,7 @@ def test_a_header_without_one_position_and_one_quaternion_is_refused(tmp_path, h
             (f"{clock},{ROS}\n2,0,0,0,0,0,0,1\n1,0,0,1,0,0,0,1", "line 3 .*earlier")
             for clock in ("Time (s)", "%time", "timestamp_ns", "timeStamp", "t_ms", "seconds", "stamp.sec")
         ),
+        (f"stamp_sec,stamp_ns,{ROS}\n7,5,0,0,0,0,0,0,1\n7,4,0,0,0,0,0,0,1", "line 3 .*earlier"),
         (f"header.stamp.secs,{ROS}\n-1,0,0,0,0,0,0,1\n-2,0,0,1,0,0,0,1", "line 3 of .* is earlier .*Sort the lines"),
         ("a" + "[ " * 300 + "_" * 40_000 + "\n", "has no numbers"),
     ],
@@ -205,6 +206,21 @@ def test_lines_that_could_be_misread_are_refused(tmp_path, text, complaint):
 def test_a_column_that_may_fall_is_no_clock(tmp_path, name):
     lines = [f"{9 - i},{t},0,0,0,0,0,0,1" for i, t in enumerate((0.0, 1.0, 0.9995))]  # the last is jitter
     (tmp_path / "a.csv").write_text("\n".join([f"{name},header.stamp.sec,{ROS}", *lines]))
+    assert len(read_wrist_path(tmp_path / "a.csv").position) == 3
+
+
+@pytest.mark.parametrize(
+    ("clock", "times"),
+    [
+        ("stamp_ns,stamp_sec", ("900000000,7", "0,8", "100000000,8")),
+        ("stamp.sec,stamp.nanosec", ("7,999999000", "8,0", "8,900000000")),
+        ("t", ("5.000003", "5", "5.01")),
+        ("t", ("", "5", "6")),
+        ("t", ("nan", "inf", "6")),
+    ],
+)
+def test_a_clock_has_one_or_two_columns_and_jitter_from_its_first_line_on(tmp_path, clock, times):
+    (tmp_path / "a.csv").write_text("\n".join([f"{clock},{ROS}", *(f"{t},0,0,0,0,0,0,1" for t in times)]))
     assert len(read_wrist_path(tmp_path / "a.csv").position) == 3
 
 

@@ -74,8 +74,9 @@ def test_gymnasium_makes_it_by_its_id():
         ({"id": "congrasp/Grasp-v9"}, r"no environment 'congrasp/Grasp-v9'.*Known: congrasp/Grasp-v0"),
         ({"gravity": 1.0}, "The task has no field 'gravity'"),
         ({"hand": "foot"}, "foot"),
+        ({"num_envs": 0}, "There are 0 environments"),
     ],
 )
-def test_unknown_names(asked, says):
+def test_unknown_names_and_no_environments(asked, says):
     with pytest.raises(CongraspError, match=says):
         congrasp.make_vec(**asked)

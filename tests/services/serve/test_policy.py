@@ -103,6 +103,7 @@ BAD_REQUESTS = [
     ({"wrist": (np.full(3, np.nan), IDENTITY)}, RefusedError),
     ({"q": "open"}, RefusedError),
     ({"constraints": {"heading": "above"}}, RefusedError),
+    ({"constraints": ["heading"]}, RefusedError),
     ({"q": np.full(20, 45.0)}, RefusedError),
     ({"surface": 1000 * np.random.default_rng(0).uniform(-0.05, 0.05, (64, 3))}, RefusedError),
     ({"wrist": np.eye(4)}, RefusedError),

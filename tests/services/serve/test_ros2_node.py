@@ -185,12 +185,12 @@ def schema(kind):
 
 
 def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
-    """The robot's messages are written and read by mcap-ros2-support, the node's by rosbags."""
+    """The robot's messages are written and read by mcap-ros2-support, the node's by rosbags; long ones share memory."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     write = {k: serialize_dynamic(*schema(k))[schema(k)[0]] for k in set(example.INPUTS.values())}
     read = {k: generate_dynamic(*schema(k))[schema(k)[0]] for k in set(OUTPUTS.values())}
     with (
-        bare_session("peer", listen=endpoint) as robot,
+        bare_session("peer", shared_memory=True, listen=endpoint) as robot,
         node_of(example, example.ZenohBus(endpoint), age=0.4) as (node, policy, obj),
     ):
         heard = {t: robot.declare_subscriber(t, zenoh.handlers.RingChannel(1)) for t in OUTPUTS}
@@ -205,7 +205,7 @@ def test_over_zenoh_robot_and_node_understand_each_other_s_cdr(example, capsys):
             return command is not None and command.mode == "follow"
 
         def refused():
-            robot.put("joint_states", b"\x00\x01\x00\x00nonsense")
+            robot.put("joint_states", b"\x00\x01\x00\x00nonsense" * 1000)
             assert node.step() is None
             return "joint_states: not a sensor_msgs/msg/JointState" in capsys.readouterr().err
 

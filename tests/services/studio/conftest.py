@@ -4,36 +4,16 @@ import contextlib
 import os
 import pathlib
 import re
-import shutil
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from congrasp.common.errors import CongraspError
+from tests.browser import SIZE, chromium
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 RESULTS = ROOT / "test-results"
-SIZE = {"width": 1280, "height": 760}
-BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-color-profile=srgb"]
-
-
-@contextlib.contextmanager
-def chromium() -> Iterator[Any]:
-    """Chromium, drawing without a graphics card; raises a CongraspError if it or its package is absent."""
-    try:
-        from playwright.sync_api import sync_playwright
-    except ModuleNotFoundError:
-        raise CongraspError("The package playwright is not installed.", "Run 'make install'.") from None
-    with sync_playwright() as running:
-        own = pathlib.Path(running.chromium.executable_path)
-        found = next(filter(None, map(shutil.which, BROWSERS)), None) or (str(own) if own.exists() else None)
-        if found is None:
-            raise CongraspError("There is no browser here.", "Run tests/install_browser.sh.")
-        started = running.chromium.launch(executable_path=found, args=ARGUMENTS)
-        yield started
-        started.close()
 
 
 @pytest.fixture(scope="session")

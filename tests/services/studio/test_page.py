@@ -1,6 +1,5 @@
 """The page in a real browser, operated with the mouse, and checked by its picture."""
 
-import io
 import json
 import pathlib
 import time
@@ -19,6 +18,7 @@ from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import Recordings, TrainingWindow
 from tests import studio as fake
+from tests.browser import drag, on_object, orange, picture
 from tests.studio import BEGIN, DIP
 from tests.waits import eventually
 
@@ -69,37 +69,8 @@ def opened(page: Any, site: Site) -> Any:
     return page
 
 
-def picture(page: Any) -> np.ndarray:
-    """(H, W, 3) the three-dimensional picture, 0 to 255, once all requests are done."""
-    page.wait_for_selector("body:not([data-busy])")
-    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    image = Image.open(io.BytesIO(page.locator("#scene").screenshot())).convert("RGB")
-    return np.asarray(image).astype(int)
-
-
-def orange(image: np.ndarray) -> np.ndarray:
-    return (image[..., 0] > 130) & (image[..., 0] > 1.25 * image[..., 1]) & (image[..., 1] > 1.6 * image[..., 2])
-
-
 def red(image: np.ndarray) -> np.ndarray:
     return (image[..., 0] > 90) & (image[..., 0] > 2.2 * image[..., 1]) & (image[..., 0] > 2.2 * image[..., 2])
-
-
-def on_object(page: Any) -> tuple[float, float]:
-    """A point of the page on the object, away from the arrow."""
-    found = orange(picture(page))
-    rows, columns = np.nonzero(found)
-    low = rows > np.percentile(rows, 70)
-    box = page.locator("#scene").bounding_box()
-    return box["x"] + float(np.median(columns[low])), box["y"] + float(np.median(rows[low]))
-
-
-def drag(page: Any, points: list[tuple[float, float]]) -> None:
-    page.mouse.move(*points[0])
-    page.mouse.down()
-    for point in points[1:]:
-        page.mouse.move(*point, steps=4)
-    page.mouse.up()
 
 
 def grasp(page: Any, site: Site) -> str:

@@ -102,6 +102,7 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     right = write(case, folder / "MyoHand_box_right.npz")
     robot, pose = right["robot"], right["object"]
     write(case, folder / "MyoHand_box_nokey.npz", object=None)
+    write(case, folder / "MyoHand_box_back.npz", time=right["time"][::-1])
     write(case, folder / "MyoHand_box_shape.npz", robot=robot[:, :28])
     write(case, folder / "MyoHand_box_words.npz", object=np.full(len(pose), "a"))
     degrees = np.concatenate([robot[:, :3], np.degrees(robot[:, 3:])], 1)
@@ -122,6 +123,7 @@ def test_what_is_wrong_with_a_file_is_said(run_import, tmp_path):
     reasons = {row["sequence"].split("_")[-1]: (row["rule"], row["reason"]) for row in report.dropped}
     for name, rule, words in (
         ("nokey", "wrong layout", "no 'object'"),
+        ("back", "wrong layout", "time runs back"),
         ("shape", "wrong layout", "(90, 28)"),
         ("words", "wrong layout", "'object' of the file holds no numbers"),
         ("degrees", "wrong units", "radians"),

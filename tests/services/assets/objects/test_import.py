@@ -329,6 +329,7 @@ def _twice(tree):
             "a.glb", _glb(lambda t: t.update(nodes=[{"mesh": 0}] * 20_000)), "more than 10000", id="GLB nodes"
         ),
         pytest.param("a.glb", b"glTF" + b"\xff" * 40, "announces", id="GLB length"),
+        pytest.param("a.glb", _glb()[:-90], "it was cut: it has 150 of 240 bytes", id="GLB cut"),
     ],
 )
 def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path, name, data, why):
