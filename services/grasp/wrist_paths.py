@@ -162,7 +162,6 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
     return found, column, names
 
 
-@np.errstate(invalid="ignore")  # of times that are not finite, which are not compared
 def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (T, 3) and quaternions (T, 4) of a CSV file's lines.
 
@@ -215,11 +214,7 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         stamps.append([_number(cells[place]) for place in clock])
     if not rows:
         raise CongraspError(f"{path} has no numbers.", remedy)
-    times = np.array(stamps, float) @ [*clock.values()]
-    falls = np.fmax.accumulate(times) - times > _JITTER * (np.fmax.reduce(times) - np.fmin.reduce(times))
-    if falls.any():
-        late = f"line {numbers[falls.argmax()]} of {path} is earlier than one before."
-        raise CongraspError(late, "Sort the lines by time, and cut the file to one motion.")
+    _check_clock(path, numbers, np.array(stamps, float) @ [*clock.values()])
     table = np.array(rows)
     if np.abs(np.linalg.norm(table[:, 3:], axis=-1) - 1).max() > _UNIT_LENGTH:
         raise CongraspError(f"{path} holds quaternions that are not of length one.", remedy)
@@ -234,6 +229,15 @@ def _clock(names: list[str]) -> dict[int, float]:
     parts = {place: part.groups() for place, name in enumerate(names) if (part := _SECONDS.fullmatch(name))}
     stem = parts[first][0] if first in parts else None
     return {place: 1e-9 if nano else 1.0 for place, (of, nano) in parts.items() if of == stem} or {first: 1.0}
+
+
+@np.errstate(invalid="ignore")  # of times that are not finite, which are not compared
+def _check_clock(path: pathlib.Path, numbers: list[int], times: np.ndarray) -> None:
+    """Raises a `CongraspError` for the first of these lines whose time runs back."""
+    falls = np.fmax.accumulate(times) - times > _JITTER * (np.fmax.reduce(times) - np.fmin.reduce(times))
+    if falls.any():
+        what = f"line {numbers[falls.argmax()]} of {path} is earlier than one before."
+        raise CongraspError(what, "Sort the lines by time, and cut the file to one motion.")
 
 
 def _mark(line: str) -> str:
