@@ -75,8 +75,9 @@ def test_client_guard_and_errors_need_numpy_and_zenoh_alone():
     ]
 
 
-def test_a_probe_of_a_server_s_health_loads_neither_jax_nor_mujoco():
-    code = "import sys, congrasp.services.cli.query, congrasp.services.serve.load as _\n"
+def test_a_probe_of_a_server_s_health_and_options_without_presets_load_neither_jax_nor_mujoco():
+    code = "import sys, congrasp.services.serve.load as _\nfrom congrasp.services.cli.main import load\n"
+    code += "[load(name) for name in ('query', 'serve', 'view', 'doctor', 'plot', 'export')]\n"
     code += "print({'jax', 'mujoco'} & {*sys.modules})"
     assert python("-c", code).stdout == "set()\n"
 

@@ -122,6 +122,7 @@ def _image(
       surface: labelled surface points, object frame.
       hand: returns the capsules of these environments' hands; None if the hands hide nothing.
     """
+    camera, time, pose, surface = jax.tree.map(jnp.asarray, (camera, time, pose, surface))  # for traced rows
     batch = len(due)
     together = min(batch, _TOGETHER)
 

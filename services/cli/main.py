@@ -64,7 +64,12 @@ UNREAD = 128 + signal.SIGPIPE
 """Exit code if the reader of the output is gone, as with `congrasp … | head`."""
 SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_NO_MEMORY = re.compile(r"(?:out of memory|failed to allocate \d+ bytes)[^[\n]*", re.IGNORECASE)
+_LESS_MEMORY = (
+    "Choose fewer --environments or a smaller --batch; on a GPU, XLA_PYTHON_CLIENT_MEM_FRACTION is JAX's share of it."
+)
+_NO_MEMORY = re.compile(
+    r"(?:out[ _]of[ _]memory|failed to allocate (?:request for )?\d)[^[\n]*|RESOURCE_EXHAUSTED", re.IGNORECASE
+)
 _PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError, FileExistsError)
 _PATH_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP)
 
@@ -93,13 +98,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         code = _fail(_said_of(error), USAGE_ERROR, debug)
     except RuntimeError as error:  # of XLA or Warp, whose types are imported late
-        if not (found := _NO_MEMORY.search(str(error))):
+        if not (found := [text[0].strip(". ") for text in _NO_MEMORY.finditer(str(error))]):
             raise
-        what = f"The accelerator's memory does not suffice: {found[0].strip('. ')}."
-        remedy = (
-            "Choose fewer --environments or a smaller --batch, or change JAX's share, XLA_PYTHON_CLIENT_MEM_FRACTION."
-        )
-        code = _fail(str(CongraspError(what, remedy)), USAGE_ERROR, debug)
+        # No bad input: a run restarts its processes, since another program may have held the memory.
+        code = _fail(f"The device's memory does not suffice: {max(found, key=len)}. {_LESS_MEMORY}", 1, debug)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package == "congrasp":

@@ -6,24 +6,20 @@ import functools
 import pathlib
 import threading
 from collections.abc import Callable, Iterator
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from congrasp.common.errors import CongraspError, TransportError
-from congrasp.common.policy.pretrained import hands_with_policy, policy_file
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.security import check_exposure
-from congrasp.learner.run_directory import LOGS, POLICY_FILE, learner_url, open_run
 from congrasp.services.ops.lifetime import on_signal
 from congrasp.services.ops.logs import announced, log
-from congrasp.services.serve.server import follow_file, follow_run
-from congrasp.services.studio.catalogue import Importer, offered
-from congrasp.services.studio.grasping import PolicyGrasping
 from congrasp.services.studio.server import PageServer, Sessions
-from congrasp.services.studio.session import Session
-from congrasp.services.studio.training import Follower, Recordings, TrainingWindow
+
+if TYPE_CHECKING:
+    from congrasp.services.studio.grasping import PolicyGrasping
 
 _RUN = "quickstart"
 
@@ -78,6 +74,8 @@ class View:
 
     def _of_folder(self, run_dir: pathlib.Path) -> "View":
         """The page of a run: of its learner if that responds, else of its newest policy."""
+        from congrasp.learner.run_directory import POLICY_FILE, learner_url, open_run
+
         if self.connect or self.policy or self.recordings or self.run != _RUN:
             raise CongraspError(
                 f"The folder {run_dir} is in place of --connect, --run, --policy and --recordings.",
@@ -96,6 +94,12 @@ class View:
     @contextlib.contextmanager
     def _page(self) -> Iterator[str]:
         """Offers the page while the block runs; yields its address."""
+        from congrasp.services.serve.server import follow_file
+        from congrasp.services.studio.catalogue import Importer, offered
+        from congrasp.services.studio.grasping import PolicyGrasping
+        from congrasp.services.studio.session import Session
+        from congrasp.services.studio.training import Follower, Recordings, TrainingWindow
+
         if self.policy is not None and self.connect:
             raise CongraspError(
                 f"The studio can take either {self.policy} or the weights of {self.connect}.",
@@ -127,8 +131,11 @@ class View:
             stack.callback(opened[0].close)
             yield server.url
 
-    def _of_run(self, watching: Transport, stack: contextlib.ExitStack) -> dict[str, Callable[[], PolicyGrasping]]:
+    def _of_run(self, watching: Transport, stack: contextlib.ExitStack) -> "dict[str, Callable[[], PolicyGrasping]]":
         """The policy of a run; the pretrained ones if there is only an observer's certificate."""
+        from congrasp.services.serve.server import follow_run
+        from congrasp.services.studio.grasping import PolicyGrasping
+
         pulling = watching
         if self.certs is not None:
             try:
@@ -140,8 +147,12 @@ class View:
         return {"of the run": functools.partial(PolicyGrasping, source, f"the run '{self.run}'")}
 
 
-def _pretrained() -> dict[str, Callable[[], PolicyGrasping]]:
+def _pretrained() -> "dict[str, Callable[[], PolicyGrasping]]":
     """The pretrained and custom policies, by the names of their hands."""
+    from congrasp.common.policy.pretrained import hands_with_policy, policy_file
+    from congrasp.services.serve.server import follow_file
+    from congrasp.services.studio.grasping import PolicyGrasping
+
     return {
         name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
         for name in hands_with_policy()
@@ -150,6 +161,8 @@ def _pretrained() -> dict[str, Callable[[], PolicyGrasping]]:
 
 def _run_of(recordings: pathlib.Path | None) -> str:
     """The name of a run, from the folder of its recordings."""
+    from congrasp.learner.run_directory import LOGS
+
     names = [part for part in recordings.resolve().parts if part != LOGS] if recordings else []
     return names[-1] if names else ""
 

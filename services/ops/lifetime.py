@@ -22,6 +22,7 @@ SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
 _PARENT = "CONGRASP_PARENT"  # environment variable with which a process makes its children end with it
 _POLL = 0.5
+_LAST = 10_000  # bytes of a log in which its last line is looked for
 _REAP = 0.5  # deadline for the end of all children, s
 _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 
@@ -133,6 +134,13 @@ class Child:
     process: subprocess.Popen[bytes] | None = None
     restarts: int = 0
     again_at: float = 0.0
+    begun: int = 0
+    """Bytes of the log when the process started."""
+
+    @property
+    def program(self) -> list[str]:
+        """Command line of the process."""
+        return [sys.executable, "-m", "congrasp", *self.arguments]
 
     def start(self) -> int:
         """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies with its parent."""
@@ -140,8 +148,9 @@ class Child:
         jax = {"JAX_TRACEBACK_FILTERING": "off"}
         environment = {**jax, **os.environ, **self.environment, _PARENT: str(os.getpid())}
         with self.log.open("ab") as log:
+            self.begun = log.tell()
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "congrasp", *self.arguments],
+                self.program,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
@@ -157,9 +166,18 @@ class Child:
         return self.process.poll() if self.process else None
 
     def last_line(self) -> str:
-        """The last line of its log."""
-        lines = self.log.read_text(errors="replace").strip().splitlines() if self.log.exists() else []
-        return lines[-1].removeprefix("congrasp: error: ") if lines else "its log is empty"
+        """The last line that it wrote to its log."""
+        with contextlib.suppress(FileNotFoundError), self.log.open("rb") as log:
+            log.seek(max(self.begun, log.seek(0, os.SEEK_END) - _LAST))
+            if lines := log.read().decode(errors="replace").strip().splitlines():
+                return lines[-1].removeprefix("congrasp: error: ")
+        return "its log is empty"
+
+    def death(self) -> str:
+        """How it ended, in a sentence: the signal that killed it, or its exit code and last line."""
+        if self.code is not None and self.code < 0:
+            return f"The {self.name} was killed by {signal.Signals(-self.code).name}."
+        return f"The {self.name} died (exit code {self.code}): {self.last_line().rstrip('. ')}."
 
 
 def wait_for(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:

@@ -275,7 +275,7 @@ def _supervise(
             if code := child.code:
                 _check_can_restart(child, code)
                 if child.again_at == 0.0:
-                    notify(f"The {child.name} died (exit code {code}): {child.last_line()} Restarting it.")
+                    notify(f"{child.death()} Restarting it.")
                     child.again_at = time.monotonic() + min(2.0**child.restarts, 15.0) - 1.0
                 if time.monotonic() >= child.again_at:
                     child.restarts += 1
@@ -294,11 +294,10 @@ def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: 
     first = next(child for child in learners if child.code)
     wait_for([child.process for child in learners if child.process], CHILD_GRACE)
     # A rank that lost another one says no more than that.
-    dead = [child for child in (first, *learners) if child.code and child.code != TransportError.exit_code]
-    cause = dead[0] if dead else first
-    died = f"The {cause.name} died (exit code {cause.code}): {cause.last_line()}"
+    dead = [child for child in learners if child.code and child.code != TransportError.exit_code] or [first]
+    died = " ".join(child.death() for child in dead)
     end_all(learners)
-    for child in (cause, *learners):
+    for child in (*dead, *learners):
         _check_can_restart(child, child.code or 0)
     notify(f"{died} Restarting {'it' if len(learners) == 1 else 'all ranks'}.")
     stop.wait(min(2.0 ** learners[0].restarts, 15.0) - 1.0)
@@ -311,7 +310,7 @@ def _restart_learners(learners: Sequence[Child], stop: threading.Event, notify: 
 def _check_can_restart(child: Child, code: int) -> None:
     """Raises a `CongraspError` if a restart would end in the same way."""
     if code == _BAD_INPUT or child.restarts >= MAX_RESTARTS:
-        raise CongraspError(f"The {child.name} failed: {child.last_line()}", f"Its log is {child.log}.")
+        raise CongraspError(child.death(), f"Its log is {child.log}.")
 
 
 _TRAINED = "trained.json"

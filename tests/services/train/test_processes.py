@@ -2,7 +2,6 @@
 
 import dataclasses
 import pathlib
-import subprocess
 import sys
 import threading
 
@@ -30,12 +29,9 @@ def test_options_become_arguments():
 class Script(Child):
     """A child whose lives are Python programs, one after the other."""
 
-    def start(self) -> None:
-        self.run(self.arguments[min(self.restarts, len(self.arguments) - 1)])
-
-    def run(self, *program: str) -> None:
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen([sys.executable, "-c", *program], stdout=log, stderr=log)
+    @property
+    def program(self) -> list[str]:
+        return [sys.executable, "-c", self.arguments[min(self.restarts, len(self.arguments) - 1)]]
 
 
 @pytest.fixture
@@ -65,17 +61,34 @@ def test_one_that_dies_takes_the_others_with_it_and_all_come_back(supervise, tmp
     assert notes == ["The rank-1 died (exit code 9): No memory. Restarting all ranks."]
 
 
+LOST = "print('Rank 1 ended.'); raise SystemExit(4)"
+FULL = "import time; print('No memory.', flush=True); time.sleep(0.5); raise SystemExit(9)"
+
+
 def test_the_rank_that_failed_is_named_and_not_those_that_lost_it(supervise):
-    fails = "import time; print('No memory.', flush=True); time.sleep(0.5); raise SystemExit(9)"
-    lost = "print('Rank 1 ended.'); raise SystemExit(4)"
-    notes = supervise([lost, "pass"], [fails, "pass"])
+    notes = supervise([LOST, "pass"], [FULL, "pass"])
     assert notes == ["The rank-1 died (exit code 9): No memory. Restarting all ranks."]
+
+
+def test_the_rank_that_failed_too_often_ends_the_run(supervise, monkeypatch):
+    monkeypatch.setattr(processes, "MAX_RESTARTS", 0)
+    with pytest.raises(CongraspError, match=r"The rank-1 died \(exit code 9\): No memory\. Its log is .*1\.log"):
+        supervise([LOST], [FULL])
+
+
+def test_a_killed_rank_is_named_with_its_signal_and_each_life_with_its_own_words(supervise):
+    """Two ranks that fail at the same time are both named, since their ends have no order."""
+    killed = "import os; print('info: Update 3.', flush=True); os.kill(os.getpid(), 9)"
+    silent = "import os, time; time.sleep(0.5); os._exit(1)"
+    first, second = supervise([killed, silent, "pass"], [FULL, LOST, "pass"])
+    assert first == "The rank-0 was killed by SIGKILL. The rank-1 died (exit code 9): No memory. Restarting all ranks."
+    assert second == "The rank-0 died (exit code 1): its log is empty. Restarting all ranks."
 
 
 def test_bad_input_of_any_rank_ends_the_run_with_its_last_words(supervise):
     complains = "import sys; print('congrasp: error: The port is in use.'); sys.exit(2)"
     follows = "import sys, time; time.sleep(0.2); print('Rank 1 ended.'); sys.exit(4)"
-    with pytest.raises(CongraspError, match="The rank-1 failed: The port is in use"):
+    with pytest.raises(CongraspError, match=r"The rank-1 died \(exit code 2\): The port is in use\. Its log is"):
         supervise([follows], [complains])
 
 
@@ -99,10 +112,12 @@ def scripts(monkeypatch):
     """What runs for each policy, by name; and all children that were started."""
     chosen, started = {}, []
 
-    class Training(Script):
-        def start(self):
+    class Training(Child):
+        @property
+        def program(self):
             started.append(self)
-            self.run(chosen[self.name], self.arguments[self.arguments.index("--run-dir") + 1])
+            folder = self.arguments[self.arguments.index("--run-dir") + 1]
+            return [sys.executable, "-c", chosen[self.name], folder]
 
     monkeypatch.setattr(processes, "Child", Training)
     monkeypatch.setattr(lifetime, "_POLL", 0.05)
