@@ -45,7 +45,7 @@ _COUNTS = re.compile(r"""\bcount\s*=\s*["']([^"']*)["']""")
 _NAMED = re.compile(r"""<(\w+)[^<>]*?\bfile\w*\s*=\s*["']([^"']+)["']""")
 _FOLDERS = re.compile(r"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']+)["']""")
 _CLASSES = re.compile(r"""<default\b[^<>]*?\bclass\s*=\s*["']([^"']+)["']""")
-_OPENING, _ELEMENT = re.compile(r"opening file '([^']*)'"), re.compile(r"Element name '([^']*)'")
+_OPENING = re.compile(r"opening file '(.*)'")
 _PROLOG = re.compile(r"<!--.*?(?:-->|\Z)|<\?.*?(?:\?>|\Z)|<!ENTITY|<(?!!)", re.DOTALL)  # up to the root element
 _XACRO = re.compile(r"<xacro:|\$\{|\$\((?:find|arg|eval)\b")
 _FINITE = (
@@ -252,6 +252,8 @@ def _repeated_classes(texts: list[str], error: str) -> str:
 def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
     """The compiled model, without missing files and unusable meshes; raises a ValueError."""
     lacking, bounded = dict[str, list[str]](), False  # by the reason
+    for i, mesh in enumerate(spec.meshes):
+        mesh.info = f"{mesh.info} (mesh {i})"  # MuJoCo's errors end with it, and do not name the kind of their element
     for _ in range(_MOST_FILES):
         try:
             model = spec.compile()
@@ -283,9 +285,8 @@ def _rejected(spec: mujoco.MjSpec, error: str) -> tuple[Any, str, str]:
             files = [asset.file, *getattr(asset, "cubefiles", ())]
             if any(name and opened[1].endswith(pathlib.PurePosixPath(name).name) for name in files):
                 return asset, "not found", opened[1]
-    named = _ELEMENT.search(error)
-    name = named[1] if named else ""
-    return spec.mesh(name), error.partition("\n")[0].removeprefix("Error: "), name
+    mesh = next((mesh for mesh in spec.meshes if error.endswith(mesh.info)), None)
+    return mesh, error.partition("\n")[0].removeprefix("Error: "), mesh.name if mesh else ""
 
 
 def _leave_out(spec: mujoco.MjSpec, asset: Any) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from congrasp.common.errors import CongraspError
 from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.meshes import MAX_FACES
@@ -158,6 +159,27 @@ def test_a_link_of_many_parts_is_drawn_by_a_coarse_hull(tmp_path):
     vertices, drawn = propose(tmp_path / "hand.xml").meshes["palm"]
     assert 1000 < len(drawn) <= MAX_FACES
     np.testing.assert_allclose(np.abs(vertices).max(), 0.03, atol=0.003)
+
+
+def _pinch(folder: pathlib.Path, assets: str, geoms: str) -> tuple[mujoco.MjModel, list[str]]:
+    """The pinch hand with further assets, and geoms of its palm, and the notes on it; `sound.stl` is a box."""
+    trimesh.creation.box((0.06, 0.1, 0.03)).export(folder / "sound.stl")
+    (folder / "flat.obj").write_text("v 0 0 0\nv 0.02 0 0\nv 0.02 0.02 0\nv 0 0.02 0\nf 1 2 3 4\n")
+    text = (PINCH / "pinch.xml").read_text().replace("<asset/>", f"<asset>{assets}</asset>")
+    (folder / "hand.xml").write_text(text.replace('<body name="palm">', f'<body name="palm">{geoms}'))
+    return compile.robot_spec(folder / "hand.xml", notes := [])[1], notes
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [('material="none"', "material 'none' not found"), ('condim="2"', "invalid condim"), ('mass="-1"', "are negative")],
+)
+def test_a_fault_of_a_geom_costs_no_mesh_of_its_name(tmp_path, fault, words):
+    with pytest.raises(CongraspError, match=f"{words}.*Element name 'it's'"):
+        mesh, geom = '<mesh name="it\'s" file="sound.stl"/>', f'<geom name="it\'s" type="mesh" mesh="it\'s" {fault}/>'
+        _pinch(tmp_path, mesh, geom)
+    model, notes = _pinch(tmp_path, mesh.replace("sound.stl", "flat.obj"), geom.replace(fault, ""))
+    assert model.nmesh == 0 and len(notes) == 1
 
 
 # --- tendons through space, whose levers are known where they run around a pulley ---
