@@ -281,12 +281,20 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
 def _rejected(spec: mujoco.MjSpec, error: str) -> tuple[Any, str, str]:
     """The asset that MuJoCo's error is about, the reason and a name; None if there is no such asset."""
     if opened := _OPENING.search(error):
-        for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins):
-            files = [asset.file, *getattr(asset, "cubefiles", ())]
-            if any(name and opened[1].endswith(pathlib.PurePosixPath(name).name) for name in files):
-                return asset, "not found", opened[1]
+        assets = (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)
+        files = {name: asset for asset in assets for name in (asset.file, *getattr(asset, "cubefiles", ())) if name}
+        name = max(files, key=lambda name: _alike(name, opened[1]), default="")
+        if _alike(name, opened[1]) > (0, 0):
+            return files[name], "not found", opened[1]
     mesh = next((mesh for mesh in spec.meshes if error.endswith(mesh.info)), None)
     return mesh, error.partition("\n")[0].removeprefix("Error: "), mesh.name if mesh else ""
+
+
+def _alike(name: str, path: str) -> tuple[int, int]:
+    """Number of last components that a file's name has in common with a path, and minus the number of the others."""
+    parts, there = (pathlib.PurePosixPath(some).parts[::-1] for some in (name, path))
+    common = next((i for i, pair in enumerate(zip(parts, there, strict=False)) if pair[0] != pair[1]), len(parts))
+    return common, common - len(parts)
 
 
 def _leave_out(spec: mujoco.MjSpec, asset: Any) -> None:

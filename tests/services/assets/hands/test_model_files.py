@@ -175,11 +175,22 @@ def _pinch(folder: pathlib.Path, assets: str, geoms: str) -> tuple[mujoco.MjMode
     [('material="none"', "material 'none' not found"), ('condim="2"', "invalid condim"), ('mass="-1"', "are negative")],
 )
 def test_a_fault_of_a_geom_costs_no_mesh_of_its_name(tmp_path, fault, words):
+    mesh, geom = '<mesh name="it\'s" file="sound.stl"/>', f'<geom name="it\'s" type="mesh" mesh="it\'s" {fault}/>'
     with pytest.raises(CongraspError, match=f"{words}.*Element name 'it's'"):
-        mesh, geom = '<mesh name="it\'s" file="sound.stl"/>', f'<geom name="it\'s" type="mesh" mesh="it\'s" {fault}/>'
         _pinch(tmp_path, mesh, geom)
     model, notes = _pinch(tmp_path, mesh.replace("sound.stl", "flat.obj"), geom.replace(fault, ""))
     assert model.nmesh == 0 and len(notes) == 1
+
+
+@pytest.mark.parametrize("missing", ["unsound.stl", "folder/sound.stl", "../sound.stl"])
+def test_a_missing_file_costs_no_mesh_of_a_similar_name(tmp_path, missing):
+    (tmp_path / "hand" / "parts").mkdir(parents=True)
+    trimesh.creation.box((0.06, 0.1, 0.03)).export(tmp_path / "hand" / "parts" / "sound.stl")
+    names = {"a": "sound.stl", "b": missing, "c": "parts/sound.stl"}
+    assets = "".join(f'<mesh name="{name}" file="{file}"/>' for name, file in names.items())
+    geoms = "".join(f'<geom type="mesh" mesh="{name}"/>' for name in names)
+    model, notes = _pinch(tmp_path / "hand", assets, geoms)
+    assert [model.mesh(i).name for i in range(model.nmesh)] == ["a", "c"] and len(notes) == 1
 
 
 # --- tendons through space, whose levers are known where they run around a pulley ---
