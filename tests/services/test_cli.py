@@ -424,7 +424,7 @@ def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(tmp_path, 
     trimesh.creation.box((0.04, 0.05, 0.06)).export(things / "good.ply", encoding="ascii")
     text = (things / "good.ply").read_text()
     (things / "x.ply").write_text(text.replace("float x", "float X"))
-    (things / "list.ply").write_text(text.replace("vertex_indices", "corners"))
+    (things / "list.ply").write_text(text.replace("list uchar int vertex_indices", "int corners"))
     (things / "zip.obj").write_text("PK\3\4 box.obj\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     assert parse(["import", str(things), "--out", str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache")])() == 2
     captured = capsys.readouterr()

@@ -3,6 +3,7 @@
 trimesh reads no binary files whose faces differ in their number of corners, which Blender and others write.
 """
 
+import re
 import struct
 from typing import NamedTuple
 
@@ -74,7 +75,11 @@ def plain_ply(data: bytes, notes: list[str]) -> bytes:
         if element.name == "vertex" and not names >= set("xyz"):
             raise ValueError("its vertices lack x, y or z")
         if element.name == "face" and element.rows and not names & {_INDEX, "vertex_index"}:
-            raise ValueError(f"its faces lack {_INDEX}")
+            lists = [words for words in element.properties if words[0] == "list"]
+            if len(lists) != 1 or _TYPES[lists[0][2]] in "fd":
+                raise ValueError(f"its faces lack {_INDEX}")
+            named = re.compile(rb"(\n\s*property\s+list(?:\s+\w+){2}\s+)" + re.escape(lists[0][3].encode("latin-1")))
+            data, header = (named.sub(rb"\1" + _INDEX.encode(), text, count=1) for text in (data, header))
         if element.name == "edge" and element.rows:
             notes.append(f"its {element.rows} edges were left out")
         least += element.rows * (2 * len(element.properties) if kind == "ascii" else element.row("<").itemsize)

@@ -338,6 +338,15 @@ def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path
     assert said.startswith(f"CongraspError: {tmp_path / name}") and why in said, said
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+@pytest.mark.parametrize("name", ["vertex_list", "vert_indices"])
+def test_a_ply_whose_only_list_of_faces_has_another_name_is_read(tmp_path, name, encoding):
+    data = trimesh.creation.box().export(file_type="ply", encoding=encoding)
+    assert b"vertex_indices" in data
+    (tmp_path / "a.ply").write_bytes(data.replace(b"vertex_indices", name.encode()))
+    assert read_mesh(tmp_path / "a.ply").volume == pytest.approx(1.0)
+
+
 def test_a_scene_that_shows_a_mesh_often_is_read_in_bounded_memory(tmp_path):
     (tmp_path / "a.glb").write_bytes(_glb(_many))
     assert "Trimesh" in limited(read_mesh, tmp_path / "a.glb")
