@@ -11,6 +11,7 @@ MAX_FACES = 20_000_000
 """Triangles of a mesh file, those of a GLB file counted wherever the scene shows them."""
 MAX_NODES = 10_000
 """Nodes, meshes and accessors of a GLB file, each."""
+_LONGEST = 1 << 32  # bytes of a GLB file, by its format
 _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COMPRESSED = {
@@ -34,10 +35,8 @@ def plain_glb(data: bytes, notes: list[str]) -> bytes:
     if len(data) < 20 or length > len(data):
         raise ValueError(f"it announces {length} bytes of JSON, but has {len(data)}")
     tree, binary = json.loads(data[20 : 20 + length]), bytearray(data[28 + length :])
-    for buffer in _list(tree, "buffers")[:1]:
-        if "uri" not in buffer and buffer.get("byteLength", 0) > len(binary):
-            raise ValueError(f"it was cut: it has {len(binary)} of {buffer['byteLength']} bytes of numbers")
     _check_extensions(tree)
+    _check_views(tree, len(binary))
     if not _list(tree, "scenes"):  # which the format allows; viewers show every node then
         inner = {child for node in _list(tree, "nodes") for child in node.get("children", ())}
         tree["scenes"] = [{"nodes": sorted(set(range(len(_list(tree, "nodes")))) - inner)}]
@@ -62,8 +61,6 @@ def plain_glb(data: bytes, notes: list[str]) -> bytes:
         binary += values.tobytes()
         view = len(tree["bufferViews"]) - 1
         accessors[index] = {"bufferView": view, "componentType": 5126, "count": len(values), "type": part["type"]}
-    if _list(tree, "buffers"):
-        tree["buffers"][0]["byteLength"] = max(len(binary), tree["buffers"][0].get("byteLength", 0))
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     binary += bytes(-len(binary) % 4)
@@ -127,12 +124,22 @@ def _floats(tree: dict[str, Any], part: dict[str, Any], binary: bytearray) -> np
     return found
 
 
+def _check_views(tree: dict[str, Any], held: int) -> None:
+    """Raises a ValueError for a view of numbers that are not in the chunk of `held` bytes."""
+    ends = [0]
+    for view in _list(tree, "bufferViews"):
+        _check_counts(view, _LONGEST)
+        if not view.get("buffer", 0):
+            ends.append(view.get("byteOffset", 0) + view.get("byteLength", 0))
+    if max(ends) > held and not any("uri" in buffer for buffer in _list(tree, "buffers")[:1]):
+        raise ValueError(f"it was cut: it has {held} of {max(ends)} bytes of numbers")
+
+
 def _check_scene(tree: dict[str, Any], size: int) -> None:
     """Accessors lie in the file, and the scene, which may show a mesh many times, has a bounded number of triangles."""
     accessors, meshes, nodes = (_list(tree, name) for name in ("accessors", "meshes", "nodes"))
-    for name in ("accessors", "bufferViews"):
-        for part in _list(tree, name):
-            _check_counts(part, size)
+    for part in accessors:
+        _check_counts(part, size)
     taken = sum(part["count"] * _COLUMNS[part["type"]] * int(_NUMBERS[part["componentType"]][2]) for part in accessors)
     if taken > 16 * size + (1 << 20):
         raise ValueError(f"its accessors take {taken} bytes, but it has {size}")
@@ -156,11 +163,11 @@ def _list(tree: dict[str, Any], name: str) -> list[dict[str, Any]]:
     return found
 
 
-def _check_counts(part: dict[str, Any], size: int) -> None:
+def _check_counts(part: dict[str, Any], most: int) -> None:
     for name in ("count", "byteLength", "byteOffset", "byteStride"):
         value = part.get(name, 0)
-        if type(value) is not int or not 0 <= value <= size:
-            raise ValueError(f"it has a {name} of {value!r:.30}, but {size} bytes")
+        if type(value) is not int or not 0 <= value <= most:
+            raise ValueError(f"it has a {name} of {value!r:.30}, not a whole number up to {most}")
 
 
 def _triangles(piece: dict[str, Any], accessors: list[dict[str, Any]]) -> int:

@@ -1,5 +1,6 @@
 """Import of meshes: known solids, every kind of source, and one line for every kind of bad input."""
 
+import base64
 import dataclasses
 import json
 import re
@@ -308,6 +309,12 @@ def _twice(tree):
     tree["nodes"] = [{"children": [i + 1, i + 1]} for i in range(40)] + [{"mesh": 0}]
 
 
+def _fallback(tree):
+    """The buffer that readers of meshopt do not need comes first, without data."""
+    tree["buffers"].insert(0, {"byteLength": 999_999})
+    tree["extensionsRequired"] = ["EXT_meshopt_compression"]
+
+
 @pytest.mark.parametrize(
     ("name", "data", "why"),
     [
@@ -330,6 +337,13 @@ def _twice(tree):
         ),
         pytest.param("a.glb", b"glTF" + b"\xff" * 40, "announces", id="GLB length"),
         pytest.param("a.glb", _glb()[:-90], "it was cut: it has 150 of 240 bytes", id="GLB cut"),
+        pytest.param("a.glb", _glb(_fallback), "is compressed with meshopt", id="GLB meshopt"),
+        pytest.param(
+            "a.glb",
+            _glb(lambda t: t["bufferViews"][0].update(byteLength="x")),
+            "byteLength of 'x'",
+            id="GLB length 'x'",
+        ),
     ],
 )
 def test_what_announces_more_than_it_holds_is_refused_before_it_is_read(tmp_path, name, data, why):
@@ -345,6 +359,24 @@ def test_a_ply_whose_only_list_of_faces_has_another_name_is_read(tmp_path, name,
     assert b"vertex_indices" in data
     (tmp_path / "a.ply").write_bytes(data.replace(b"vertex_indices", name.encode()))
     assert read_mesh(tmp_path / "a.ply").volume == pytest.approx(1.0)
+
+
+def _inline(tree):
+    numbers = base64.b64encode(_glb()[-240:]).decode()
+    tree["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{numbers}"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        pytest.param(_glb(lambda t: t["buffers"][0].update(byteLength=242)), id="padding that is announced"),
+        pytest.param(_glb(lambda t: t["buffers"][0].update(byteLength="x")), id="a length that no reader needs"),
+        pytest.param(_glb(_inline)[:-248], id="numbers in the address"),
+    ],
+)
+def test_a_glb_needs_only_the_bytes_that_its_views_show(tmp_path, data):
+    (tmp_path / "a.glb").write_bytes(data)
+    assert read_mesh(tmp_path / "a.glb").volume == pytest.approx(1.0)
 
 
 def test_a_scene_that_shows_a_mesh_often_is_read_in_bounded_memory(tmp_path):
