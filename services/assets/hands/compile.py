@@ -46,6 +46,7 @@ _NAMED = re.compile(r"""<(\w+)[^<>]*?\bfile\w*\s*=\s*["']([^"']+)["']""")
 _FOLDERS = re.compile(r"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']+)["']""")
 _CLASSES = re.compile(r"""<default\b[^<>]*?\bclass\s*=\s*["']([^"']+)["']""")
 _OPENING = re.compile(r"opening file '(.*)'")
+_REASONS = {"coplanar|too small": "flat", "decoder": "not readable", "orient": "inside out", "": "rejected by MuJoCo"}
 _PROLOG = re.compile(r"<!--.*?(?:-->|\Z)|<\?.*?(?:\?>|\Z)|<!ENTITY|<(?!!)", re.DOTALL)  # up to the root element
 _XACRO = re.compile(r"<xacro:|\$\{|\$\((?:find|arg|eval)\b")
 _FINITE = (
@@ -251,10 +252,10 @@ def _repeated_classes(texts: list[str], error: str) -> str:
 
 def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
     """The compiled model, without missing files and unusable meshes; raises a ValueError."""
-    lacking, bounded = dict[str, list[str]](), False  # by the reason
+    bounded, errors, lacking = False, list[ValueError](), dict[str, list[str]]()  # by the reason
     for i, mesh in enumerate(spec.meshes):
         mesh.info = f"{mesh.info} (mesh {i})"  # MuJoCo's errors end with it, and do not name the kind of their element
-    for _ in range(_MOST_FILES):
+    while True:  # until there is nothing more to leave out
         try:
             model = spec.compile()
             break
@@ -264,10 +265,11 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
                 spec.compiler.boundmass, spec.compiler.boundinertia = LEAST
                 bounded = True
             elif asset:
+                errors.append(error)
                 lacking.setdefault(why, []).append(name)
                 _leave_out(spec, asset)
-            else:
-                raise
+            else:  # a pair or a tendon may name a geom that was left out
+                raise (errors[0] if errors and "geom '" in str(error) else error) from None
     notes += [_missing(why, files) for why, files in lacking.items()]
     if bounded:
         light, thin = model.body_mass == LEAST[0], (model.body_inertia == LEAST[1]).any(1)
@@ -285,9 +287,10 @@ def _rejected(spec: mujoco.MjSpec, error: str) -> tuple[Any, str, str]:
         files = {name: asset for asset in assets for name in (asset.file, *getattr(asset, "cubefiles", ())) if name}
         name = max(files, key=lambda name: _alike(name, opened[1]), default="")
         if _alike(name, opened[1]) > (0, 0):
-            return files[name], "not found", opened[1]
+            return files[name], "not found", name
     mesh = next((mesh for mesh in spec.meshes if error.endswith(mesh.info)), None)
-    return mesh, error.partition("\n")[0].removeprefix("Error: "), mesh.name if mesh else ""
+    why = next(why for pattern, why in _REASONS.items() if re.search(pattern, error.partition("\n")[0]))
+    return mesh, why, mesh.name if mesh else ""
 
 
 def _alike(name: str, path: str) -> tuple[int, int]:

@@ -193,6 +193,19 @@ def test_a_missing_file_costs_no_mesh_of_a_similar_name(tmp_path, missing):
     assert [model.mesh(i).name for i in range(model.nmesh)] == ["a", "c"] and len(notes) == 1
 
 
+def test_a_mesh_that_a_pair_needs_is_the_error(tmp_path):
+    pair = '<contact><pair geom1="a" geom2="b"/></contact>'
+    geoms = '<geom name="a" type="mesh" mesh="flat"/><geom name="b" size=".01"/>'
+    with pytest.raises(CongraspError, match="mesh 'flat' has coplanar vertices"):
+        _pinch(tmp_path, f'<mesh file="flat.obj"/></asset>{pair}<asset>', geoms)
+
+
+def test_many_missing_meshes_are_one_note(tmp_path):
+    _, notes = _pinch(tmp_path, "".join(f'<mesh file="folder/{i}.stl"/>' for i in range(301)), "")
+    (note,) = notes
+    assert re.fullmatch("not found, .*: folder/0.stl, .* and 296 more", note)
+
+
 # --- tendons through space, whose levers are known where they run around a pulley ---
 
 
