@@ -49,7 +49,7 @@ _POINTS = re.compile(rb"(?m)^[ \t]*v[ \t]+([^\n#]*)")
 _POLYGON = re.compile(rb"(?m)^[ \t]*f((?:[ \t]+\d[\d/]*){4,})[ \t\r]*$")
 _REMARK = re.compile(rb"(?m)^([ \t]*f[^\n#]*)#[^\n]*")
 _FACE = re.compile(rb"(?m)^[ \t]*f[ \t][^\n#]*")
-_INDEX, _LINE = re.compile(rb"[ \t](\d{1,18})"), re.compile(rb"(?m)^l ")
+_INDEX, _LINE = re.compile(rb"[ \t](\d{1,18})"), re.compile(rb"(?m)^l +\S+ +([^\n#]*)")
 _NO_POINT = "a face refers to a point that is not in the file"
 _START = 4096
 _MARK = b"\xef\xbb\xbf"  # of UTF-8
@@ -331,11 +331,11 @@ def _plain_obj(data: bytes, notes: list[str]) -> bytes:
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
     data = _INDENT.sub(b"", data).replace(b"\t", b" ")
-    if lines := len(_LINE.findall(data)):
-        notes.append(f"its {lines} edges were left out")
     if _ZERO.search(data):
         raise ValueError("a face has the index 0, but OBJ counts from 1")
     data = _REMARK.sub(rb"\1", re.sub(rb"\\\r?\n", b" ", data))
+    if edges := sum(len(rest.split()) for rest in _LINE.findall(data)):
+        notes.append(f"edges left out: {edges}")
     if _RELATIVE.search(data):
         data = _absolute_obj(data)
     return _cut_polygons(data, notes) if _POLYGON.search(data) else data

@@ -81,7 +81,7 @@ def plain_ply(data: bytes, notes: list[str]) -> bytes:
             named = re.compile(rb"(\n\s*property\s+list(?:\s+\w+){2}\s+)" + re.escape(lists[0][3].encode("latin-1")))
             data, header = (named.sub(rb"\1" + _INDEX.encode(), text, count=1) for text in (data, header))
         if element.name == "edge" and element.rows:
-            notes.append(f"its {element.rows} edges were left out")
+            notes.append(f"edges left out: {element.rows}")
         least += element.rows * (2 * len(element.properties) if kind == "ascii" else element.row("<").itemsize)
     if least > len(data):
         raise ValueError(f"it announces {max(x.rows for x in elements)} rows, but has {len(data)} bytes")
