@@ -23,6 +23,7 @@ from congrasp.common.objects.store import Catalogue, digest
 from congrasp.common.transport.ports import free_port
 from congrasp.services.assets.objects import decompose
 from congrasp.services.assets.objects.named import find_object
+from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.cli import console
 from congrasp.services.cli import main as cli
 from congrasp.services.cli.main import COMMANDS, load
@@ -106,10 +107,11 @@ def test_help_names_every_command_and_every_command_exists():
         (["objects", "import"], "nothing to import"),
         (["objects", "import", "nothing"], "no file or folder nothing. Check the path"),
         *(
-            (["objects", "import", MESH, f"--{name}", value], f"--{name} is .*It must be positive, and at most {most}")
-            for name, value, most in (
-                *(("mass", "0", "50 kg"), ("mass", "300", "50 kg"), ("density", "-1", "25000")),
-                *(("scale", "0", "1e9"), ("scale", "inf", "1e9"), ("time-limit", "nan", "1e6 s")),
+            (["objects", "import", MESH, f"--{key}", value], f"--{key} is .*It must be positive, and at most {end}[.]")
+            for key, value, end in (
+                *(("mass", "0", "50 kg"), ("mass", "300", "50 kg. Give kilograms"), ("density", "-1", "25000 kg/m.3")),
+                *(("density", "25001", "25000 kg/m.3"), ("scale", "0", "1e9"), ("scale", "1e10", "1e9")),
+                *(("scale", "inf", "1e9"), ("time-limit", "nan", "1e6 s"), ("max-pieces", "0", "1e19")),
             )
         ),
         (["objects", "import", MESH, "--material", "wood", "--density", "3"], "--material and --density both say"),
@@ -442,7 +444,8 @@ def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(tmp_path, 
     ("material", "fault"),
     [
         ("adamantium", r"--material is 'adamantium'\. Materials: aluminium,"),
-        ("handle=wood", r"--material names the part 'handle'\. The parts are: none\."),
+        ("handle=wood", r"--material names the part 'handle'\. Name the material alone"),
+        ("=wood", r"--material is '=wood'\. Materials: aluminium,"),
     ],
 )
 def test_a_material_is_refused_before_a_mesh_is_cut(tmp_path, monkeypatch, capsys, material, fault):
@@ -450,6 +453,10 @@ def test_a_material_is_refused_before_a_mesh_is_cut(tmp_path, monkeypatch, capsy
     monkeypatch.setattr(decompose, "convex_pieces", None)
     assert parse(["import", str(tmp_path / "a.stl"), "--material", material, "--cache-dir", str(tmp_path)])() == 2
     assert re.search(fault, capsys.readouterr().err)
+
+
+def test_numbers_at_their_limits_are_accepted():
+    check_options(ImportOptions(scale=1e9, density=25_000, mass=50, time_limit=1e6, max_pieces=sys.maxsize))
 
 
 def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, quick_import):

@@ -253,7 +253,7 @@ def write_pieces(folder: pathlib.Path, method: str, volume: float | None, max_pi
         import vhacdx
 
         rows = np.insert(faces, 0, 3, axis=1).astype(np.uint32)  # the number of corners comes first, as in VTK
-        found = [piece[0] for piece in vhacdx.compute_vhacd(vertices, rows, maxConvexHulls=max_pieces)]
+        found = [piece[0] for piece in vhacdx.compute_vhacd(vertices, rows, maxConvexHulls=min(max_pieces, 1 << 20))]
     solid = [hull for hull in (solid_hull(np.asarray(piece, np.float64)) for piece in found) if hull is not None]
     np.savez(folder / _PIECES, *merge([hull.points for hull in solid], max_pieces, shown, volume))
 

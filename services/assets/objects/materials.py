@@ -77,8 +77,9 @@ def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
     """
     named = dict(_entry(entry) for entry in text.split(","))
     if unknown := sorted(named.keys() - {"", *parts}):
-        known = ", ".join(filter(None, parts)) or "none"
-        raise CongraspError(f"--material names the part '{unknown[0]}'.", f"The parts are: {known}.")
+        known = ", ".join(filter(None, parts))
+        remedy = f"The parts are: {known}." if known else "Name the material alone: the object has no parts."
+        raise CongraspError(f"--material names the part '{unknown[0]}'.", remedy)
     missing = [part for part in parts if part not in named and "" not in named]
     if missing:
         raise CongraspError(f"--material leaves out the part '{missing[0]}'.", f"Add {missing[0]}=NAME.")
@@ -88,6 +89,7 @@ def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
 def _entry(text: str) -> tuple[str, Material]:
     """Part (empty for the rest) and material of one entry of `--material`."""
     part, _, name = text.strip().rpartition("=")
+    name = name if part else text.strip()  # of '=wood' too, which names no part
     if name not in MATERIALS:
         raise CongraspError(f"--material is '{name}'.", f"Materials: {', '.join(MATERIALS)}.")
     return part, MATERIALS[name]

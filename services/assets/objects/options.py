@@ -21,7 +21,8 @@ LONGEST = 1.0
 _POSSIBLE = (0.005, LONGEST)  # m
 _LIKELY = (0.02, 0.4)  # m, longest side for which a unit is proposed
 _THINNEST = 2e-4  # m
-_MOST = {"scale": "1e9", "density": "25000 kg/m^3", "mass": "50 kg", "time_limit": "1e6 s", "max_pieces": "1e6"}
+_MOST = {"scale": "1e9", "density": "25000 kg/m^3", "mass": "50 kg. Give kilograms"}
+_MOST |= {"time_limit": "1e6 s", "max_pieces": "1e19"}
 _SCALES = ((0.01, 1000.0, "mm"), (1.0, 100.0, "cm"), (1000.0, 1.0, "m"))
 """Upper end of the lengths (m) shown in a unit, number of these units in a metre, and the unit."""
 _COMMON = (
