@@ -23,7 +23,6 @@ from congrasp.common.objects.store import Catalogue, digest
 from congrasp.common.transport.ports import free_port
 from congrasp.services.assets.objects import decompose
 from congrasp.services.assets.objects.named import find_object
-from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.cli import console
 from congrasp.services.cli import main as cli
 from congrasp.services.cli.main import COMMANDS, load
@@ -453,10 +452,6 @@ def test_a_material_is_refused_before_a_mesh_is_cut(tmp_path, monkeypatch, capsy
     monkeypatch.setattr(decompose, "convex_pieces", None)
     assert parse(["import", str(tmp_path / "a.stl"), "--material", material, "--cache-dir", str(tmp_path)])() == 2
     assert re.search(fault, capsys.readouterr().err)
-
-
-def test_numbers_at_their_limits_are_accepted():
-    check_options(ImportOptions(scale=1e9, density=25_000, mass=50, time_limit=1e6, max_pieces=sys.maxsize))
 
 
 def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, quick_import):

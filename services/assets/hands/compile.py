@@ -157,10 +157,9 @@ def _spec(path: pathlib.Path, notes: list[str]) -> mujoco.MjSpec:
     """The model of a file, not compiled; raises a ValueError or an OSError if it cannot be read."""
     text, included, attached = _texts(path)
     texts = [text, *included.values(), *attached.values()]
-    for other in texts:
-        for count in _COUNTS.findall(other):
-            if any(float(number) > MAX_COUNT for number in count.split()):
-                raise ValueError(f"it repeats a part {count[:40]} times, more than {MAX_COUNT}")
+    for count in _COUNTS.findall("\n".join(texts)):
+        if any(float(number) > MAX_COUNT for number in count.split()):
+            raise ValueError(f"it repeats a part {count[:40]} times, more than {MAX_COUNT}")
     root = re.search(r"<\s*([A-Za-z_][\w:.-]*)", text)
     kind = root[1] if root else ""
     if kind == "robot" and _XACRO.search(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)):
@@ -285,19 +284,12 @@ def _rejected(spec: mujoco.MjSpec, error: str) -> tuple[Any, str, str]:
     if opened := _OPENING.search(error):
         assets = (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)
         files = {name: asset for asset in assets for name in (asset.file, *getattr(asset, "cubefiles", ())) if name}
-        name = max(files, key=lambda name: _alike(name, opened[1]), default="")
-        if _alike(name, opened[1]) > (0, 0):
+        if same := [name for name in files if pathlib.PurePath(name).name == pathlib.PurePath(opened[1]).name]:
+            name = max(same, key=lambda name: (opened[1].endswith(name), len(name)))  # folders may have equal names
             return files[name], "not found", name
     mesh = next((mesh for mesh in spec.meshes if error.endswith(mesh.info)), None)
     why = next(why for pattern, why in _REASONS.items() if re.search(pattern, error.partition("\n")[0]))
     return mesh, why, mesh.name if mesh else ""
-
-
-def _alike(name: str, path: str) -> tuple[int, int]:
-    """Number of last components that a file's name has in common with a path, and minus the number of the others."""
-    parts, there = (pathlib.PurePosixPath(some).parts[::-1] for some in (name, path))
-    common = next((i for i, pair in enumerate(zip(parts, there, strict=False)) if pair[0] != pair[1]), len(parts))
-    return common, common - len(parts)
 
 
 def _leave_out(spec: mujoco.MjSpec, asset: Any) -> None:
@@ -454,10 +446,8 @@ def _mesh_file(path: pathlib.Path, name: str) -> pathlib.Path | None:
 
 def _there(path: pathlib.Path) -> pathlib.Path | None:
     """The file at a path, or one whose name differs in upper and lower case alone; None if there is none."""
-    if path.is_file() or not path.parent.is_dir():
-        return path if path.is_file() else None
-    alike = (file for file in path.parent.iterdir() if file.name.lower() == path.name.lower() and file.is_file())
-    return next(alike, None)
+    files = (file for files in ([path], path.parent.glob("*")) for file in files)
+    return next((file for file in files if file.name.lower() == path.name.lower() and file.is_file()), None)
 
 
 def _readable(file: pathlib.Path) -> tuple[bytes, str]:

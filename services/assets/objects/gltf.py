@@ -11,7 +11,6 @@ MAX_FACES = 20_000_000
 """Triangles of a mesh file, those of a GLB file counted wherever the scene shows them."""
 MAX_NODES = 10_000
 """Nodes, meshes and accessors of a GLB file, each."""
-_LONGEST = 1 << 32  # bytes of a GLB file, by its format
 _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COMPRESSED = {
@@ -36,7 +35,11 @@ def plain_glb(data: bytes, notes: list[str]) -> bytes:
         raise ValueError(f"it announces {length} bytes of JSON, but has {len(data)}")
     tree, binary = json.loads(data[20 : 20 + length]), bytearray(data[28 + length :])
     _check_extensions(tree)
-    _check_views(tree, len(binary))
+    for view in (views := _list(tree, "bufferViews")):
+        _check_counts(view, 1 << 32)  # by the format
+    ends = [x.get("byteOffset", 0) + x.get("byteLength", 0) for x in views if not x.get("buffer", 0)]
+    if max(ends, default=0) > len(binary) and not any("uri" in buffer for buffer in _list(tree, "buffers")[:1]):
+        raise ValueError(f"it was cut: it has {len(binary)} of {max(ends)} bytes of numbers")
     if not _list(tree, "scenes"):  # which the format allows; viewers show every node then
         inner = {child for node in _list(tree, "nodes") for child in node.get("children", ())}
         tree["scenes"] = [{"nodes": sorted(set(range(len(_list(tree, "nodes")))) - inner)}]
@@ -122,17 +125,6 @@ def _floats(tree: dict[str, Any], part: dict[str, Any], binary: bytearray) -> np
     if part.get("normalized") and np.dtype(kind).kind != "f":
         found = np.maximum(found / np.iinfo(kind).max, -1.0).astype(np.float32)
     return found
-
-
-def _check_views(tree: dict[str, Any], held: int) -> None:
-    """Raises a ValueError for a view of numbers that are not in the chunk of `held` bytes."""
-    ends = [0]
-    for view in _list(tree, "bufferViews"):
-        _check_counts(view, _LONGEST)
-        if not view.get("buffer", 0):
-            ends.append(view.get("byteOffset", 0) + view.get("byteLength", 0))
-    if max(ends) > held and not any("uri" in buffer for buffer in _list(tree, "buffers")[:1]):
-        raise ValueError(f"it was cut: it has {held} of {max(ends)} bytes of numbers")
 
 
 def _check_scene(tree: dict[str, Any], size: int) -> None:

@@ -44,7 +44,6 @@ _INDENT = re.compile(rb"(?m)^[ \t]+")
 _RELATIVE = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t/]-\d")
 _ZERO = re.compile(rb"(?m)^[ \t]*f[^\n]*[ \t]0+(?=[/\s]|$)")
 _COMMA = re.compile(rb"(?mi)^[ \t]*(v[ \t]+|vertex[ \t]+)?[-+]?\d+,\d+(?:e[-+]?\d+)?[ \t]")
-_POINT = re.compile(rb"(?m)^[ \t]*v[ \t]")
 _POINTS = re.compile(rb"(?m)^[ \t]*v[ \t]+([^\n#]*)")
 _POLYGON = re.compile(rb"(?m)^[ \t]*f((?:[ \t]+\d[\d/]*){4,})[ \t\r]*$")
 _REMARK = re.compile(rb"(?m)^([ \t]*f[^\n#]*)#[^\n]*")
@@ -150,8 +149,11 @@ def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: li
         raise CongraspError(f"{path} {error}") from None
     except Exception as error:  # the readers raise whatever they stumble over
         reason = (str(error) or type(error).__name__).splitlines()[0][:200].rstrip(" .!")
-        if kind == "obj" and isinstance(error, IndexError) and _lacks_points(data.replace(b"\r", b"\n")):
-            reason = _NO_POINT
+        if kind == "obj" and isinstance(error, IndexError):
+            text = data.replace(b"\r", b"\n")
+            points = len(_POINTS.findall(text))
+            if any(int(index) > points for face in _FACE.findall(text) for index in _INDEX.findall(face)):
+                reason = _NO_POINT
         raise CongraspError(f"{path} cannot be read as {kind.upper()}: {reason}.", remedy) from None
     found.metadata["kind"] = kind
     return found
@@ -381,12 +383,6 @@ def _absolute(index: bytes, count: int) -> bytes:
     if not index.startswith(b"-"):
         return index
     return b"%d" % (int(index) + 1 + count) if int(index) >= -count else b""
-
-
-def _lacks_points(data: bytes) -> bool:
-    """True if a face of an OBJ refers to a point after the last."""
-    points = len(_POINT.findall(data))
-    return any(int(index) > points for face in _FACE.findall(data) for index in _INDEX.findall(face))
 
 
 def sample_colours(

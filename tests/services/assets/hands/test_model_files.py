@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from congrasp.common.errors import CongraspError
 from congrasp.common.hands import VARIABLE, get_hand
 from congrasp.common.hands.kinematics import grasp_frame
 from congrasp.common.hands.meshes import MAX_FACES
@@ -86,8 +85,6 @@ def test_the_same_hand_as_mjcf_on_an_arm_is_the_same(claw):
 
 @pytest.mark.parametrize("name", ["allegro", "sharpa"])
 def test_a_dexterous_hand_comes_back_from_mjcf(name, tmp_path):
-    import mujoco
-
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     add_hand(spec, get_hand(name))
@@ -161,49 +158,12 @@ def test_a_link_of_many_parts_is_drawn_by_a_coarse_hull(tmp_path):
     np.testing.assert_allclose(np.abs(vertices).max(), 0.03, atol=0.003)
 
 
-def _pinch(folder: pathlib.Path, assets: str, geoms: str) -> tuple[mujoco.MjModel, list[str]]:
-    """The pinch hand with further assets, and geoms of its palm, and the notes on it; `sound.stl` is a box."""
-    trimesh.creation.box((0.06, 0.1, 0.03)).export(folder / "sound.stl")
-    (folder / "flat.obj").write_text("v 0 0 0\nv 0.02 0 0\nv 0.02 0.02 0\nv 0 0.02 0\nf 1 2 3 4\n")
-    text = (PINCH / "pinch.xml").read_text().replace("<asset/>", f"<asset>{assets}</asset>")
-    (folder / "hand.xml").write_text(text.replace('<body name="palm">', f'<body name="palm">{geoms}'))
-    return compile.robot_spec(folder / "hand.xml", notes := [])[1], notes
-
-
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [('material="none"', "material 'none' not found"), ('condim="2"', "invalid condim"), ('mass="-1"', "are negative")],
-)
-def test_a_fault_of_a_geom_costs_no_mesh_of_its_name(tmp_path, fault, words):
-    mesh, geom = '<mesh name="it\'s" file="sound.stl"/>', f'<geom name="it\'s" type="mesh" mesh="it\'s" {fault}/>'
-    with pytest.raises(CongraspError, match=f"{words}.*Element name 'it's'"):
-        _pinch(tmp_path, mesh, geom)
-    model, notes = _pinch(tmp_path, mesh.replace("sound.stl", "flat.obj"), geom.replace(fault, ""))
-    assert model.nmesh == 0 and len(notes) == 1
-
-
-@pytest.mark.parametrize("missing", ["unsound.stl", "folder/sound.stl", "../sound.stl"])
-def test_a_missing_file_costs_no_mesh_of_a_similar_name(tmp_path, missing):
-    (tmp_path / "hand" / "parts").mkdir(parents=True)
-    trimesh.creation.box((0.06, 0.1, 0.03)).export(tmp_path / "hand" / "parts" / "sound.stl")
-    names = {"a": "sound.stl", "b": missing, "c": "parts/sound.stl"}
-    assets = "".join(f'<mesh name="{name}" file="{file}"/>' for name, file in names.items())
-    geoms = "".join(f'<geom type="mesh" mesh="{name}"/>' for name in names)
-    model, notes = _pinch(tmp_path / "hand", assets, geoms)
-    assert [model.mesh(i).name for i in range(model.nmesh)] == ["a", "c"] and len(notes) == 1
-
-
-def test_a_mesh_that_a_pair_needs_is_the_error(tmp_path):
-    pair = '<contact><pair geom1="a" geom2="b"/></contact>'
-    geoms = '<geom name="a" type="mesh" mesh="flat"/><geom name="b" size=".01"/>'
-    with pytest.raises(CongraspError, match="mesh 'flat' has coplanar vertices"):
-        _pinch(tmp_path, f'<mesh file="flat.obj"/></asset>{pair}<asset>', geoms)
-
-
-def test_many_missing_meshes_are_one_note(tmp_path):
-    _, notes = _pinch(tmp_path, "".join(f'<mesh file="folder/{i}.stl"/>' for i in range(301)), "")
-    (note,) = notes
-    assert re.fullmatch("not found, .*: folder/0.stl, .* and 296 more", note)
+def test_any_number_of_meshes_may_be_missing(tmp_path):
+    meshes = "".join(f'<mesh file="{i}.stl"/>' for i in range(301))
+    text = (PINCH / "pinch.xml").read_text().replace("<asset/>", f"<asset>{meshes}</asset>")
+    (tmp_path / "hand.xml").write_text(text)
+    compile.robot_spec(tmp_path / "hand.xml", notes := [])
+    assert len(notes) == 1 and notes[0].endswith(" and 296 more")
 
 
 # --- tendons through space, whose levers are known where they run around a pulley ---

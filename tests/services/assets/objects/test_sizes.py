@@ -1,6 +1,7 @@
 """Units and masses of imported meshes: which unit makes a thing for a hand, and masses by material."""
 
 import pathlib
+import sys
 
 import numpy as np
 import pytest
@@ -8,11 +9,16 @@ import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
+from congrasp.services.assets.objects import options
 from congrasp.services.assets.objects.materials import guessed_mass, materials_of, weigh
 from congrasp.services.assets.objects.named import ObjectAt, objects_of
 from congrasp.services.assets.objects.options import METRES, ImportOptions, guessed_unit, metres_per_unit, sizes_by_unit
 from congrasp.services.grasp.jobs import _load
 from congrasp.services.studio.catalogue import Importer
+
+
+def test_numbers_at_their_limits_are_accepted() -> None:
+    options.check_options(ImportOptions(scale=1e9, density=25_000, mass=50, time_limit=1e6, max_pieces=sys.maxsize))
 
 
 @pytest.mark.parametrize(
