@@ -35,8 +35,8 @@ def plain_glb(data: bytes, notes: list[str]) -> bytes:
         raise ValueError(f"it announces {length} bytes of JSON, but has {len(data)}")
     tree, binary = json.loads(data[20 : 20 + length]), bytearray(data[28 + length :])
     _check_extensions(tree)
-    for view in (views := _list(tree, "bufferViews")):
-        _check_counts(view, 1 << 32)  # by the format
+    for part in (views := _list(tree, "bufferViews")):
+        _check_counts(part, 1 << 32)  # by the format
     ends = [x.get("byteOffset", 0) + x.get("byteLength", 0) for x in views if not x.get("buffer", 0)]
     if max(ends, default=0) > len(binary) and not any("uri" in buffer for buffer in _list(tree, "buffers")[:1]):
         raise ValueError(f"it was cut: it has {len(binary)} of {max(ends)} bytes of numbers")

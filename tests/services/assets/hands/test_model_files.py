@@ -160,8 +160,8 @@ def test_a_link_of_many_parts_is_drawn_by_a_coarse_hull(tmp_path):
 
 def test_any_number_of_meshes_may_be_missing(tmp_path):
     meshes = "".join(f'<mesh file="{i}.stl"/>' for i in range(301))
-    text = (PINCH / "pinch.xml").read_text().replace("<asset/>", f"<asset>{meshes}</asset>")
-    (tmp_path / "hand.xml").write_text(text)
+    text = (PINCH / "pinch.xml").read_text()
+    (tmp_path / "hand.xml").write_text(text.replace("<asset/>", f"<asset>{meshes}</asset>"))
     compile.robot_spec(tmp_path / "hand.xml", notes := [])
     assert len(notes) == 1 and notes[0].endswith(" and 296 more")
 
