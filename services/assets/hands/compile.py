@@ -294,12 +294,11 @@ def _rejected(spec: mujoco.MjSpec, error: str) -> tuple[Any, str, str]:
 
 def _leave_out(spec: mujoco.MjSpec, asset: Any) -> None:
     """Removes an asset, and what shows it."""
-    for geom in [geom for geom in spec.geoms if asset.name and asset.name in (geom.meshname, geom.hfieldname)]:
+    field = {mujoco.MjsMesh: "meshname", mujoco.MjsHField: "hfieldname"}.get(type(asset), "")
+    for geom in [geom for geom in spec.geoms if field and asset.name and getattr(geom, field) == asset.name]:
         spec.delete(geom)
-    for material in spec.materials:
-        for i, name in enumerate(material.textures):
-            if name == asset.name and isinstance(asset, mujoco.MjsTexture):
-                material.textures[i] = ""
+    for material in spec.materials if isinstance(asset, mujoco.MjsTexture) else ():
+        material.textures = ["" if name == asset.name else name for name in material.textures]
     spec.delete(asset)
 
 
