@@ -5,6 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from congrasp.common.errors import RefusedError
+
 Pose = tuple[np.ndarray, np.ndarray]
 """Position (3,), m, and quaternion (4,), (w, x, y, z)."""
 
@@ -41,6 +43,14 @@ class GraspRequest:
     (`TaskConfig.surface_normals`); without them, it estimates them."""
     camera: np.ndarray | None = None
     """(3,) position of the camera of the cloud, world frame, m, toward which estimated normals point."""
+
+    def __post_init__(self) -> None:
+        """Raises a `RefusedError` unless the constraints are a dict of dicts."""
+        if not isinstance(self.constraints, Mapping):
+            raise RefusedError("The constraints must be a dict of dicts.", "Pass {'heading': {'direction': …}}, say.")
+        for name, own in self.constraints.items():
+            if not isinstance(own, Mapping):
+                raise RefusedError(f"The constraint '{name}' must be a dict from its fields to arrays.")
 
     def given(self, constraint: str, field: str) -> np.ndarray | None:
         """Returns a goal array, or None if it is not requested."""

@@ -31,7 +31,7 @@ sys.meta_path.insert(0, BaseInstall())
 
 def run_in_base_install(code: str) -> subprocess.CompletedProcess[str]:
     """Runs a program that finds the standard library, numpy, zenoh and congrasp alone."""
-    return python("-c", BASE_INSTALL + code)
+    return python("-c", BASE_INSTALL + code, timeout=60)
 
 
 @contextlib.contextmanager

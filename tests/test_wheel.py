@@ -8,8 +8,6 @@ import zipfile
 
 import pytest
 
-from tests.children import python
-
 ROOT = pathlib.Path(__file__).parents[1]
 FOLDERS = ("common", "actors", "learner", "services")
 
@@ -42,7 +40,8 @@ def test_a_program_may_have_folders_of_the_same_names(wheel, tmp_path):
     for folder in FOLDERS:
         (program / folder).mkdir(parents=True)
         (program / folder / "__init__.py").write_text("raise ImportError('the module of another program')")
+    options = {"env": {"PYTHONPATH": str(installed)}, "capture_output": True, "text": True, "timeout": 60}
     code = "import congrasp; congrasp.PolicyClient, congrasp.Guard; print(congrasp.__file__)"
     for command, printed in ((["-c", code], str(installed)), (["-m", "congrasp", "--help"], "congrasp train")):
-        done = python(*command, cwd=program, env={"PYTHONPATH": str(installed)})
+        done = subprocess.run([sys.executable, *command], cwd=program, **options)
         assert done.returncode == 0 and printed in done.stdout, done.stderr

@@ -46,8 +46,8 @@ _PENDING = 4096  # most connections in a handshake, but at most a quarter of the
 _FILES = 16384  # limit of the process's open files, if the system allows it: each connection is one
 _CLOSERS = 64  # threads of a listener that accept and close connections and wait for their data
 _RUNTIME = os.environ.get("ZENOH_RUNTIME", "").strip() or "()"  # of the user; read at the first session
-if not re.search(r"\bacc\b", _RUNTIME):
-    os.environ["ZENOH_RUNTIME"] = f"(acc: (worker_threads: {_CLOSERS}), {_RUNTIME[1:]}"
+if not re.search(r"\bacc\s*:", _RUNTIME):  # other values than of the form (…) or Name(…) are the user's alone
+    os.environ["ZENOH_RUNTIME"] = re.sub(r"^\w*\s*\(", rf"\g<0>acc: (worker_threads: {_CLOSERS}), ", _RUNTIME)
 _SESSIONS = 1000  # most connected peers, but at most a quarter of the open files: Zenoh panics if none is left
 STAMP = struct.Struct("<8sQ")
 """Sender and count of a sample, by which a subscriber detects gaps."""

@@ -262,11 +262,7 @@ class Packer:
         self._layout, self._fields, self.settle = layout, layout["fields"], float(layout["settle"])
         self._past = {name: self._fields[f"past_{name}"][1] for name in _READ if f"past_{name}" in self._fields}
         needs = layout["constraints"]
-        if not isinstance(constraints, Mapping):
-            raise RefusedError("The constraints are no mapping from their names to their fields.")
         known = {name: own for name, own in constraints.items() if name in needs}
-        if plain := [name for name, own in known.items() if not isinstance(own, Mapping)]:
-            raise RefusedError(f"The constraint '{plain[0]}' is no mapping from its fields to arrays.")
         goals = {f"{name}_{field}": value for name, own in known.items() for field, value in own.items()}
         fields = {**episode, **{name: _numbers(name, value) for name, value in goals.items()}}
         _require([field for name in known for field in needs[name]], fields)

@@ -55,7 +55,7 @@ FORMATS = {"glb": ".glb", "usd": ".usda", "bvh": ".bvh", "ros2": "", "lerobot": 
 DATASETS = ("lerobot",)
 """Formats that hold several motions, and videos."""
 _QUATERNIONS = ("wrist_quaternion", "link_quaternion", "object_quaternion")
-_UNIT = 1e-3
+_UNIT = 1e-2  # largest difference of a quaternion's length from one
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -223,8 +223,9 @@ def save_motion(path: str | os.PathLike[str], motion: GraspMotion) -> None:
     """Writes a motion as NPZ, atomically.
 
     Raises:
-      CongraspError: the file cannot be written.
+      CongraspError: the file cannot be written, or a quaternion's length is more than 1 % from one.
     """
+    _check(motion, "The motion")
     own = dict(zip(_COLOURS, motion.colours, strict=True)) if motion.colours else {}
     own |= motion.arm.arrays() if motion.arm else {}
     meta = {
@@ -247,7 +248,8 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
     """Reads a motion.
 
     Raises:
-      CongraspError: there is no such file, it is another kind of file, larger than `MAX_BYTES`, or damaged.
+      CongraspError: there is no such file, it is another kind of file, larger than `MAX_BYTES`, or damaged, or a
+        quaternion's length is more than 1 % from one.
     """
     remedy = "Run 'congrasp grasp' again."
     arrays = read_npz(pathlib.Path(path), remedy, kind="a grasp motion", largest=MAX_BYTES)

@@ -32,8 +32,10 @@ _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.
 _TIME = re.compile(
     r"(?:.*[.%])?(?:t|time|(?:time[_ ]?)?stamp|secs?|seconds?)(?: ?\[.*|[_ ](?:[mnuµ]?s|secs?|seconds?))?"
 )
-_SECONDS = re.compile(r"(.*?)(n(?:ano)?)?s(?:ecs?|econds?)?")
-_JITTER = 1e-3  # of a file's time, by which it may fall
+_SECONDS = re.compile(r"(.*?)(?:(?<=[_ ])s|secs?|seconds?)")
+_NANOSECONDS = re.compile(r"(.*?)(?:(?<=[_ ])ns|n(?:ano)?(?:secs?|seconds?))")
+_SECOND = 1e9  # ns
+_JITTER = 0.1  # of a file's median step, by which its time may fall
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
@@ -173,7 +175,7 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         header names no position or quaternion, or several, quaternions are not of length one, or its time runs back.
     """
     columns, width, metres, named, titled, mark = list(range(7)), 7, 1.0, False, False, ""
-    clock, numbers, stamps = dict[int, float](), list[int](), list[list[float | None]]()
+    clock, numbers, stamps = list[int](), list[int](), list[list[float | None]]()
     remedy = "Write x, y, z, qw, qx, qy, qz in every line."
     try:
         lines = read_file(path, largest, remedy).decode("utf-8-sig").splitlines()
@@ -214,29 +216,39 @@ def read_csv(path: pathlib.Path, largest: int) -> tuple[np.ndarray, np.ndarray]:
         stamps.append([_number(cells[place]) for place in clock])
     if not rows:
         raise CongraspError(f"{path} has no numbers.", remedy)
-    _check_clock(path, numbers, np.array(stamps, float) @ [*clock.values()])
+    _check_clock(path, numbers, stamps)
     table = np.array(rows)
     if np.abs(np.linalg.norm(table[:, 3:], axis=-1) - 1).max() > _UNIT_LENGTH:
         raise CongraspError(f"{path} holds quaternions that are not of length one.", remedy)
     return metres * table[:, :3], table[:, 3:]
 
 
-def _clock(names: list[str]) -> dict[int, float]:
-    """Places of a header's first clock, with seconds per unit: of a pair such as sec and nanosec both, else of one."""
+def _clock(names: list[str]) -> list[int]:
+    """Places of a header's first clock: of seconds and nanoseconds of one name, or of one column; none without."""
     first = next((place for place, name in enumerate(names) if _TIME.fullmatch(name)), None)
     if first is None:
-        return {}
-    parts = {place: part.groups() for place, name in enumerate(names) if (part := _SECONDS.fullmatch(name))}
-    stem = parts[first][0] if first in parts else None
-    return {place: 1e-9 if nano else 1.0 for place, (of, nano) in parts.items() if of == stem} or {first: 1.0}
+        return []
+    for own, other in itertools.permutations((_SECONDS, _NANOSECONDS)):
+        if found := own.fullmatch(names[first]):
+            for place, name in enumerate(names):
+                if (partner := other.fullmatch(name)) and partner[1] == found[1]:
+                    return [first, place] if own is _SECONDS else [place, first]
+    return [first]
 
 
-@np.errstate(invalid="ignore")  # of times that are not finite, which are not compared
-def _check_clock(path: pathlib.Path, numbers: list[int], times: np.ndarray) -> None:
-    """Raises a `CongraspError` for the first of these lines whose time runs back."""
-    falls = np.fmax.accumulate(times) - times > _JITTER * (np.fmax.reduce(times) - np.fmin.reduce(times))
-    if falls.any():
-        what = f"line {numbers[falls.argmax()]} of {path} is earlier than one before."
+def _check_clock(path: pathlib.Path, numbers: list[int], stamps: list[list[float | None]]) -> None:
+    """Raises a `CongraspError` for the first of these lines whose time runs back by more than jitter."""
+    clock = np.array(stamps, float)
+    lines = np.array(numbers)[np.isfinite(clock).all(-1)]
+    clock = clock[np.isfinite(clock).all(-1)]
+    if len(clock) < 2 or not clock.size:
+        return
+    whole = clock.shape[1] == 2 and clock[:, 1].max() < _SECOND  # not a time in nanoseconds next to the same in seconds
+    times = clock[:, 0] + clock[:, 1] / _SECOND if whole else clock[:, 0]
+    falls = np.maximum.accumulate(times) - times
+    limit = _JITTER * np.median(np.abs(np.diff(times)))
+    if (falls > limit).any():
+        what = f"line {lines[np.argmax(falls > limit)]} of {path} is earlier than one before."
         raise CongraspError(what, "Sort the lines by time, and cut the file to one motion.")
 
 

@@ -174,7 +174,7 @@ class Child:
         return "its log is empty"
 
     def death(self) -> str:
-        """How it ended, in a sentence: the signal that killed it, or its exit code and last line."""
+        """Its end in a sentence: the signal that killed it, or its exit code and last line."""
         if self.code is not None and self.code < 0:
             return f"The {self.name} was killed by {signal.Signals(-self.code).name}."
         return f"The {self.name} died (exit code {self.code}): {self.last_line().rstrip('. ')}."

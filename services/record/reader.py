@@ -339,7 +339,8 @@ def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Me
                 break
     if not -count <= index < count:
         kind = "successful episodes" if success else "episodes"
-        remedy = f"Choose from {-count} to {count - 1}." if count else "Pass one of 'congrasp record'."
+        empty = "Leave out success=True." if success else "Pass one of 'congrasp record'."
+        remedy = f"Choose from {-count} to {count - 1}." if count else empty
         raise CongraspError(f"{path} holds {count} {kind}, none with index {index}.", remedy)
     return last[0 if index < 0 else -1]
 

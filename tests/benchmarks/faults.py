@@ -4,6 +4,7 @@ Each kind has a run of its own, which continues after every fault; afterwards `c
 """
 
 import contextlib
+import errno
 import functools
 import pathlib
 import random
@@ -35,7 +36,7 @@ _OPTIONS = (
     *("--updates", "1000000", "--environments", "8", "--rollout-steps", "25", "--checkpoint-every", "2"),
     *("--objects.count", "2", "--objects.families", "box", "--network.hidden", "32", "--network.encoder", "8"),
     *("--ppo.epochs", "1", "--ppo.minibatches", "2", "--collapse-patience", "0"),
-    *("--log-rollout-every", "0", "--episode-every", "1000000"),
+    *("--log-rollout-every", "0", "--episode-every", "1000000", "--metric-writers"),
 )
 _DEADLINE = 180.0  # seconds that anything may take
 _END = 15.0  # seconds in which a run must end that was signalled
@@ -59,12 +60,12 @@ class Run:
 
     def start(self) -> None:
         """Begins the run, or resumes it, and waits until its learner has taken rollouts from all actors."""
-        command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(self.run_dir), "--metric-writers"]
+        command = [sys.executable, "-m", "congrasp", "train", "--run-dir", str(self.run_dir), *self._options]
         command += ["--actors", str(self._count), "--evaluation", "0"]
-        command += ["--resume"] if (self.run_dir / "config.json").exists() else self._options
+        command += ["--resume"] if (self.run_dir / "config.json").exists() else []
         self.process = psutil.Popen(command, stdout=self._output, stderr=subprocess.STDOUT, text=True)
-        self._transport = urls.connect(until(self._endpoint), "observer", wait=_DEADLINE)
-        until(lambda: len(seen := self._rollouts()) >= self._count and min(seen) > 1)
+        self._transport = urls.connect(self.until(self._endpoint), "observer", wait=_DEADLINE)
+        self.until(lambda: len(seen := self._rollouts()) >= self._count and min(seen) > 1)
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> None:
         """Signals the run and waits until it has ended; it is killed if that takes too long."""
@@ -108,8 +109,17 @@ class Run:
 
     def child(self, role: str) -> psutil.Process:
         """The oldest process of a role, once there is one."""
-        found: list[psutil.Process] = until(lambda: self.children(role))
+        found: list[psutil.Process] = self.until(lambda: self.children(role))
         return found[0]
+
+    def until(self, look: Callable[[], Any]) -> Any:
+        """As the function `until`; a CongraspError with the run's output if that ends before."""
+        seen = until(lambda: look() or not self.alive)
+        if not self.alive:
+            assert self.process is not None
+            output = self.process.communicate()[0] or ""
+            raise CongraspError(f"The run ended by itself. {output}", f"Look at {self.run_dir / 'logs'}.")
+        return seen
 
     def status(self) -> dict[str, Any]:
         """The learner's status; empty while there is none."""
@@ -124,8 +134,6 @@ class Run:
 
     def _endpoint(self) -> str | None:
         """Where the oldest learner listens."""
-        if not self.alive:
-            raise CongraspError(f"The run in {self.run_dir} ended by itself.", f"Look at {self.run_dir / 'logs'}.")
         words = (child.cmdline() for child in self.children("learner"))
         return next((line[line.index("--listen") + 1] for line in words), None)
 
@@ -201,13 +209,13 @@ def _measure(kind: str, run: Run, repeats: int, rng: random.Random) -> Result:
                 run.stop()
             if not run.alive:
                 run.start()
-            version = until(run.status)["version"]
+            version = run.until(run.status)["version"]
             time.sleep(rng.uniform(*_TRAINS))
             FAULTS[kind](run, rng)
             began = time.monotonic()
             if not run.alive:
                 run.start()
-            until(functools.partial(_is_past, run, version + 1))
+            run.until(functools.partial(_is_past, run, version + 1))
             seconds.append(time.monotonic() - began)
     finally:
         run.stop()
@@ -312,9 +320,13 @@ def small_disk(folder: str, size: int) -> Iterator[bool]:
 def fill(disk: pathlib.Path) -> pathlib.Path:
     """Fills a disk; returns the file that does."""
     filler = disk / "filler"
-    with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
-        while True:
-            file.write(bytes(1024))
+    try:
+        with filler.open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(1024))
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
     return filler
 
 

@@ -134,6 +134,33 @@ def test_images_come_at_their_rate_or_once(monkeypatch):
         np.testing.assert_allclose(nearest, 0.0, atol=1e-5)
 
 
+def test_images_that_are_taken_in_parts_are_those_of_their_environments(monkeypatch):
+    """Other objects, poses and hands in each of seven, every second one due; arrays of NumPy outside of a program."""
+    rng = np.random.default_rng(0)
+    pose = np.tile(np.float32([0, 0, 0.05, 1, 0, 0, 0]), (7, 1))
+    pose[:, :3] += rng.normal(size=(7, 3))
+    points = rng.uniform(-0.04, 0.04, (7, POINTS, 3)).astype(np.float32)
+    surface = Surface(points, points[..., 2] > 0.02, points / 0.07)
+    task = dataclasses.replace(TASK, surface_normals=True)
+    sensors = jax.tree.map(np.asarray, draw_sensors(SensingConfig(dropout=(0.2, 0.5)), 0.01, jax.random.key(0), 7))
+    state = camera.begin(task, sensors, 3, pose, surface, heading_goal(7))
+    ends = pose[:, None, None, :3] + 0.5 * sensors.eye[:, None, None] + rng.normal(size=(7, 1, 2, 3)) * (0, 0, 0.03)
+    given = state, np.arange(7), np.arange(7) % 2 == 0, pose, surface
+
+    def hands(where):
+        return lambda rows: camera.Capsules(jnp.asarray(ends, jnp.float32)[where][rows], jnp.array([0.02]))
+
+    def alone(i):
+        return camera._image(*jax.tree.map(lambda x: x[i : i + 1], given), hands(slice(i, i + 1))).cloud
+
+    expected = jax.tree.map(lambda *clouds: jnp.concatenate(clouds), *map(alone, range(7)))
+    monkeypatch.setattr(camera, "_TOGETHER", 3)
+    found = camera._image(*given, hands(slice(None))).cloud
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-3), found, expected)
+    np.testing.assert_array_equal(np.any(found.points != state.cloud.points, (1, 2)), given[2])
+    assert np.any(found.points != camera._image(*given, None).cloud.points, (1, 2)).any()
+
+
 @functools.cache
 def bundle():
     return random_bundle(TASK, NETWORK, 100.0)

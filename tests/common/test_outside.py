@@ -89,7 +89,7 @@ def height(scene, earning):
 
 
 def test_nothing_else_must_be_changed():
-    done = python("-m", "tests.common.test_outside")
+    done = python("-m", "tests.common.test_outside", timeout=220)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines() == [
         *("episodes", "tables", "server", "command line", "file", "marker", "studio", "ONNX", "term")

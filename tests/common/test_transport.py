@@ -416,6 +416,25 @@ def test_admission_sends_requests_away_unread(pair):
     assert client.query(KEYS.ticket("b"), Message(), timeout=60).meta == {"later": KEYS.ticket("b")}
 
 
+@pytest.mark.parametrize(
+    ("given", "merged"),
+    [
+        ("(tx: (handover: acc))", "(acc: (worker_threads: 64), tx: (handover: acc))"),
+        (
+            "AbstractRuntimeParam(tx: (worker_threads: 2))",
+            "AbstractRuntimeParam(acc: (worker_threads: 64), tx: (worker_threads: 2))",
+        ),
+        ("(acc : (worker_threads: 3))", "(acc : (worker_threads: 3))"),
+        ("/* mine */ (tx: (worker_threads: 2))", "/* mine */ (tx: (worker_threads: 2))"),
+        ("", "(acc: (worker_threads: 64), )"),
+    ],
+)
+def test_threads_of_a_listener_are_added_to_the_user_s_settings_or_are_the_user_s(given, merged):
+    code = "import os, congrasp.common.transport.zenoh_session; print(os.environ['ZENOH_RUNTIME'])"
+    env = {**os.environ, "ZENOH_RUNTIME": given}
+    assert subprocess.check_output([sys.executable, "-c", code], env=env, text=True) == f"{merged}\n"
+
+
 def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
     script = "import os, sys; from congrasp.common.transport.zenoh_transport import ZenohTransport as T; "
     script += "T(listen=sys.argv[1:]); print(len(os.listdir('/proc/self/task')), os.environ['ZENOH_RUNTIME'])"

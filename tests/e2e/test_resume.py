@@ -78,7 +78,7 @@ def test_killed_and_resumed_is_bit_for_bit_the_same_as_never_killed(tmp_path):
         create_run(tmp_path / name, RUN)
     train(tmp_path / "straight")
     script = "import pathlib, sys; from tests.e2e.test_resume import train; train(pathlib.Path(sys.argv[1]), "
-    done = python("-c", script + f"killed_after={KILLED_AFTER})", tmp_path / "killed")
+    done = python("-c", script + f"killed_after={KILLED_AFTER})", tmp_path / "killed", timeout=240)
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert (tmp_path / "killed" / "checkpoints" / "latest").resolve().name.endswith(f"{EVERY}.safetensors")
     train(tmp_path / "killed", resume=True)

@@ -11,7 +11,7 @@ import pytest
 from congrasp.common.policy import bundle as bundles
 from congrasp.services.ops.audit import compare as audit
 from congrasp.services.record.reader import read_episodes, read_metrics, read_rollouts
-from tests.benchmarks.faults import Run, until
+from tests.benchmarks.faults import Run
 
 pytestmark = pytest.mark.timeout(600)
 ENVIRONMENTS, STEPS = 8, 40
@@ -24,11 +24,15 @@ SMALL = (
 )
 
 
+def version(run: Run, least: int = 0) -> int:
+    """The learner's version, once it is at least this."""
+    status = run.until(lambda: (now := run.status()).get("version", -1) >= least and now)
+    return status["version"]
+
+
 def updates(run: Run, count: int) -> None:
     """Waits for so many more versions."""
-    version = until(run.status)["version"]
-    until(lambda: run.status().get("version", -1) >= version + count or not run.alive)
-    assert run.alive, f"the run ended early: {run.process.communicate()[0]}"
+    version(run, version(run) + count)
 
 
 def kill_an_actor_and_the_learner(run: Run, count: int) -> None:
@@ -37,10 +41,13 @@ def kill_an_actor_and_the_learner(run: Run, count: int) -> None:
     assert len(actors) == count
     actors[0].kill()
     updates(run, 3)  # the run continues
-    until(lambda: len(run.children("actor")) == count)  # and the actor is replaced
+    run.until(lambda: len(run.children("actor")) == count)  # and the actor is replaced
     survivors = {child.pid for child in run.children("actor")}
     (learner,) = run.children("learner")
+    before = version(run)
     learner.kill()
+    learner.wait()
+    assert version(run) >= before
     updates(run, 3)  # resumed, with rising versions
     assert {child.pid for child in run.children("actor")} == survivors  # which did not have to restart
 
@@ -76,6 +83,7 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner_and_ends_on_a_s
     report = audit(run.run_dir)
     assert report.exit_code == 0 and report.counts["used"] >= 4
     assert [file.stem for file in (run.run_dir / "references").iterdir()] == ["actor-0"]
+    assert any((run.run_dir / "tensorboard").iterdir())
     metrics = read_metrics(run.run_dir)
     assert any(name.endswith("episode/return") for name in metrics)
     assert next(read_episodes(run.run_dir)).meta["hand"] == "human"
@@ -87,7 +95,7 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner_and_ends_on_a_s
 
 @pytest.mark.slow
 def test_with_two_actors_the_other_one_continues_alone_and_the_run_completes(start):
-    count = 20
+    count = 100  # the deaths take a fifth of them
     run = start(2, count)
     kill_an_actor_and_the_learner(run, 2)
     output, _ = run.process.communicate(timeout=300)

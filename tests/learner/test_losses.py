@@ -1,5 +1,7 @@
 """Advantages and losses, against numbers worked out by hand."""
 
+import functools
+
 import hypothesis
 import hypothesis.strategies as st
 import jax
@@ -165,23 +167,37 @@ def test_stale_data_do_not_use_up_the_trust_region(case):
     assert norm(plain) == 0.0
 
 
+HYPER = {"importance_max": 4.0, "reward_scale": 1.0, "bootstrap_truncated": True, "gamma": 0.99, "gae_lambda": 0.95}
+ROWS = {"observation": (12,), "action": (2,), "log_probability": (), "reward": ()}
+
+
+def evaluate(batch):
+    params = network.init(0, LAYOUT, 2, NetworkConfig(hidden=(64,), encoder=2))
+    one = normalizer.Affine(jnp.float32(0.0), jnp.float32(1.0))
+    given = losses.Inputs(batch, one, None, one, {**HYPER, "decoupled": True})
+    return losses.evaluate(params, given, Collectives(None), LAYOUT)
+
+
+def test_a_batch_that_is_evaluated_in_parts_has_the_same_samples(monkeypatch):
+    """Five steps of three worlds: all at once, and two steps at a time with one that remains."""
+    rng = np.random.default_rng(2)
+    batch = {name: rng.normal(size=(5, 3, *row)).astype(np.float32) for name, row in ROWS.items()}
+    batch |= {name: rng.random((5, 3)) < 0.3 for name in ("terminal", "truncated")}
+    batch |= {"lag": np.zeros(3, np.int32), "last_observation": rng.normal(size=(3, 12)).astype(np.float32)}
+    whole = evaluate(batch)
+    monkeypatch.setattr(losses, "_TOGETHER", 6)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), evaluate(batch), whole)
+
+
 def test_the_features_of_a_long_rollout_are_not_held_at_once():
     """Those of one layer of 64 units are 8 MiB a step of 2^15 worlds, 64 in all; what is kept of a step is 1 MiB."""
-    params = network.init(0, LAYOUT, 2, NetworkConfig(hidden=(64,), encoder=2))
-    worlds, hyper = 1 << 15, {"importance_max": 4.0, "reward_scale": 1.0, "bootstrap_truncated": True}
-    hyper |= {"gamma": 0.99, "gae_lambda": 0.95, "decoupled": True}
-    one = normalizer.Affine(jnp.float32(0.0), jnp.float32(1.0))
-    floats = {"observation": (12,), "action": (2,), "log_probability": (), "reward": ()}
+    worlds = 1 << 15
 
     def temporary(steps):
-        batch = {name: jax.ShapeDtypeStruct((steps, worlds, *row), jnp.float32) for name, row in floats.items()}
+        batch = {name: jax.ShapeDtypeStruct((steps, worlds, *row), jnp.float32) for name, row in ROWS.items()}
         flags = jax.ShapeDtypeStruct((steps, worlds), bool)
         batch |= {"terminal": flags, "truncated": flags, "lag": jax.ShapeDtypeStruct((worlds,), jnp.int32)}
         batch["last_observation"] = jax.ShapeDtypeStruct((worlds, 12), jnp.float32)
-
-        def evaluate(batch):
-            return losses.evaluate(params, losses.Inputs(batch, one, None, one, hyper), Collectives(None), LAYOUT)
-
         return jax.jit(evaluate).lower(batch).compile().memory_analysis().temp_size_in_bytes
 
     assert temporary(8) - temporary(1) < 7 * (2 << 20)

@@ -1,4 +1,4 @@
-"""Ranks that talk, in threads; and ranks that train and die, in processes of their own."""
+"""Ranks that talk, in threads; ranks that train and die, in processes; batches divided between two devices."""
 
 import os
 import pathlib
@@ -361,7 +361,7 @@ np.testing.assert_allclose(two.observation.mean, one.observation.mean, atol=1e-5
 def two_devices(program, *arguments):
     """What a program prints that sees two devices."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
-    done = python("-c", PREAMBLE + program, *arguments, env={"XLA_FLAGS": flags})
+    done = python("-c", PREAMBLE + program, *arguments, env={"XLA_FLAGS": flags}, timeout=280)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 

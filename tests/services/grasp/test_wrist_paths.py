@@ -217,11 +217,32 @@ def test_a_column_that_may_fall_is_no_clock(tmp_path, name):
         ("t", ("5.000003", "5", "5.01")),
         ("t", ("", "5", "6")),
         ("t", ("nan", "inf", "6")),
+        ("sec,s", ("7,3", "8,1", "9,0")),  # an arc's length, say
+        ("seconds,ns", ("7,3", "8,1", "9,0")),
+        ("time_s,time_ns", ("7.9,7900000000", "8.0,8000000000", "8.1,8100000000")),
+        ("sec,nanosec,stamp_sec,stamp_ns", ("7,0,9,0", "8,0,9,0", "9,0,3,0")),
     ],
 )
 def test_a_clock_has_one_or_two_columns_and_jitter_from_its_first_line_on(tmp_path, clock, times):
     (tmp_path / "a.csv").write_text("\n".join([f"{clock},{ROS}", *(f"{t},0,0,0,0,0,0,1" for t in times)]))
     assert len(read_wrist_path(tmp_path / "a.csv").position) == 3
+
+
+@pytest.mark.parametrize(
+    ("clock", "times"),
+    [
+        ("t", ("0", "1", "0", "1", "2000")),
+        ("t", ("0", "1", "0.5", "1000")),
+        ("t", ("0", "1732731489", "1732731488", "1732731487")),
+        ("t", ("0", "inf", "2", "1")),
+        ("stamp_sec,stamp_ns", ("7,0", "7,500000000", "7,100000000")),
+        ("stamp_ns,stamp_sec", ("0,7", "500000000,7", "100000000,7")),
+    ],
+)
+def test_a_clock_that_runs_back_is_refused_however_long_the_file_is(tmp_path, clock, times):
+    (tmp_path / "a.csv").write_text("\n".join([f"{clock},{ROS}", *(f"{t},0,0,0,0,0,0,1" for t in times)]))
+    with pytest.raises(CongraspError, match="is earlier than one before"):
+        read_wrist_path(tmp_path / "a.csv")
 
 
 def test_another_wrist_frame_is_converted(tmp_path):

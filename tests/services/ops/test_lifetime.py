@@ -17,6 +17,13 @@ with on_signal(grace=0.2):
     lock.acquire()
     lock.acquire()  # handlers run, and then it waits on for ever
 """
+CHILD = """
+import os, pathlib, signal
+from congrasp.services.ops.lifetime import Child
+child = Child("stopped", ["serve"], pathlib.Path(os.devnull))
+os.kill(child.start(), signal.SIGSTOP)  # only SIGKILL ends it
+print(child.process.pid, end=" ")
+"""
 PARENT = """
 import os, subprocess, sys, time
 child = subprocess.Popen(
@@ -53,17 +60,15 @@ def test_a_second_signal_ends_a_process_that_drains_for_long():
 
 
 def test_a_forced_end_takes_the_children_along():
-    child = "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'], start_new_session=True)"
-    code = STUCK.replace("import threading", "import subprocess, sys, threading").replace(
-        "    print(", f"    child = {child}\n    _children.add(child)\n    print(child.pid, end=' ')\n    print("
-    )
-    with start(code.replace("import on_signal", "import _children, on_signal")) as process:
+    with start(CHILD + STUCK) as process:
         pid, ready = process.stdout.readline().split()
         child = psutil.Process(int(pid))
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=20)
     assert ready == "ready" and process.returncode == 143
-    assert not child.is_running() or child.status() == psutil.STATUS_ZOMBIE
+    if running := child.is_running() and child.status() != psutil.STATUS_ZOMBIE:
+        child.kill()
+    assert not running
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="uses prctl")

@@ -1,4 +1,4 @@
-"""What a viewer is told about an episode is where the simulation had it."""
+"""An episode is drawn where the simulation had it; meshes keep their surface when painted; JSON channels keep names."""
 
 import dataclasses
 import json

@@ -2,13 +2,14 @@
 
 import os
 import pathlib
+import re
 
 import pytest
 import trimesh
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
-from congrasp.common.objects.store import digest
+from congrasp.common.objects.store import Catalogue, digest
 from congrasp.services.assets.objects.named import find_object, objects_at
 
 
@@ -50,3 +51,36 @@ def test_a_name_in_another_encoding_is_a_name(tmp_path, quick_import):
     path = tmp_path / os.fsdecode(b"m\xfcg.stl")
     trimesh.creation.box((0.05, 0.05, 0.1)).export(path)
     assert find_object(str(path)).name == "m_g"
+
+
+def test_objects_are_found_by_name_file_mesh_and_seed(tmp_path, monkeypatch, quick_import):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    obj = find_object("mug:7")
+    path = Catalogue(tmp_path).add(obj)
+    monkeypatch.chdir(tmp_path)
+    assert digest(find_object(str(path))) == digest(find_object("mug_7", str(tmp_path))) == digest(obj)
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "block.stl")
+    assert find_object(str(tmp_path / "block.stl")).name == "block"
+    with pytest.raises(CongraspError, match="no object 'mug_8'"):
+        find_object("mug_8", str(tmp_path))
+    with pytest.raises(CongraspError, match="no object family 'cat'"):
+        find_object("cat:1")
+
+
+def test_a_name_that_is_also_a_path_is_ambiguous(tmp_path, monkeypatch, quick_import):
+    from congrasp.services.cli import constraints
+    from congrasp.services.grasp.jobs import find_objects
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    stored = Catalogue("objects").add(find_object("mug:7"))
+    (tmp_path / "mug_7").mkdir()
+    (tmp_path / "mug_7" / "grasp.npz").touch()
+    assert find_object("mug_7").name == "mug_7"  # which a folder of grasps leaves alone
+    trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / "mug_7" / "block.stl")
+    said = r"'mug_7' is a folder here, and an object in objects\. Pass \./mug_7 or objects/mug_7\.safetensors"
+    for find in (find_object, lambda name: constraints.Generate((name,))()):
+        with pytest.raises(CongraspError, match=said):
+            find("mug_7")
+    ((mesh, mug), (error,)) = find_objects(["./mug_7", str(stored), "mug_7"])
+    assert mesh.source and not mug.source and re.search(said, error.error)
