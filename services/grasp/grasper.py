@@ -106,7 +106,7 @@ class Grasper:
         if attempts < 1:
             raise CongraspError(f"There are {attempts} attempts.", "Make one or more.")
         if seed < 0:
-            raise CongraspError(f"The seed is {seed}.", "Count seeds from 0.")
+            raise CongraspError(f"The seed is {seed}.", "Use 0 or more.")
         self._arm = arm
         self._hand, self._left = get_hand(policy.spec.hand), left
         self.hand = get_hand(self._hand.name + LEFT) if left else self._hand

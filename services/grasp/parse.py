@@ -112,10 +112,15 @@ def _plain(option: Option, value: Any) -> str | tuple[str, ...]:
     if option.switch or value is None:
         return "yes" if value else ""
     if not isinstance(value, str | os.PathLike):
-        words = np.array([*value] if np.iterable(value) else value, object)
-        value = ",".join(map(str, words.ravel()))
+        value = ",".join(_words(value))
     text = os.fspath(value)
     return tuple(text.replace(",", " ").split()) if option.many else text
+
+
+def _words(value: Any) -> list[str]:
+    """The words of a text, a number, or a sequence of such, also nested and of different lengths."""
+    nested = np.iterable(value) and not isinstance(value, str)
+    return [word for part in value for word in _words(part)] if nested else [str(value)]
 
 
 def _place(text: str, target: Target) -> np.ndarray:

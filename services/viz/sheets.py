@@ -21,8 +21,8 @@ def contact_sheet(images: Sequence[np.ndarray], labels: Sequence[str], columns: 
 
     Args:
       images: (height, width, 3) uint8, all of one size.
-      labels: one for each picture; shrunk and cut until it fits, as is the title. Those that would then be equal get
-        the picture's number.
+      labels: one for each picture; shrunk and cut until it fits, as is the title. Different ones that would then look
+        equal get the picture's number.
       columns: pictures in a row.
       title: one line.
 

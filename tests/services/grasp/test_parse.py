@@ -55,7 +55,9 @@ def test_headings_are_numbers_or_a_word(block):
     assert above.above and above.given("heading", "direction") is None
     with pytest.raises(CongraspError, match=r"--at lies 39.* m from 'block'"):
         asked(block, at="0 0 40")
-    for text, complaint in (("down", "'down', not 3 numbers"), ("1 2", "'1 2', not 3"), ("0 0 0", "has no direction")):
+    uneven = [np.zeros((2, 3)), np.zeros((2, 2))]
+    bad = ("down", "'down', not 3 numbers"), ("1 2", "'1 2', not 3"), ("0 0 0", "has no direction"), (uneven, "not 3")
+    for text, complaint in bad:
         with pytest.raises(CongraspError, match=complaint):
             asked(block, heading=text)
 
