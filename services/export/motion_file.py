@@ -223,9 +223,8 @@ def save_motion(path: str | os.PathLike[str], motion: GraspMotion) -> None:
     """Writes a motion as NPZ, atomically.
 
     Raises:
-      CongraspError: the file cannot be written, or a quaternion's length is more than 1 % from one.
+      CongraspError: the file cannot be written.
     """
-    _check(motion, "The motion")
     own = dict(zip(_COLOURS, motion.colours, strict=True)) if motion.colours else {}
     own |= motion.arm.arrays() if motion.arm else {}
     meta = {

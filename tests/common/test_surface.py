@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.objects import procedural, shapes
 from congrasp.common.objects.distance import MARGIN, DistanceField, _least, _slots, distance_field
 from congrasp.common.objects.spec import GraspObject, Piece
-from congrasp.common.task import camera
 from congrasp.common.task.normals import estimated_normals
 
 DIAGONAL = (0.9238795325112867, 0.0, 0.0, 0.3826834323650898)  # 45 degrees about z
@@ -230,12 +229,3 @@ def test_normals_of_a_camera_point_toward_it():
     for side in (1.0, -1.0):
         found = np.asarray(estimate(sheet[None], jnp.array([[0.0, 0.0, side]])))[0]
         np.testing.assert_allclose(found, np.tile([0, 0, side], (COUNT, 1)), atol=1e-3)
-
-
-def test_many_clouds_of_cameras_are_estimated_in_parts(monkeypatch):
-    rng = np.random.default_rng(6)
-    clouds = np.stack([sphere(rng)[0] for _ in range(5)]).astype(np.float32)
-    eyes = rng.normal(size=(5, 3)).astype(np.float32)
-    whole = jax.jit(camera._normals)(clouds, eyes)
-    monkeypatch.setattr(camera, "_TOGETHER", 2)
-    np.testing.assert_allclose(jax.jit(lambda *given: camera._normals(*given))(clouds, eyes), whole, atol=1e-4)

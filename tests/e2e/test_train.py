@@ -79,7 +79,7 @@ def test_a_run_survives_the_death_of_an_actor_and_of_its_learner_and_ends_on_a_s
     assert run.process.returncode == 128 + signal.SIGINT, output
     _, alive = psutil.wait_procs(family, timeout=5)
     assert not alive
-    assert "actor-0 died" in output and "learner died" in output
+    assert "actor-0 was killed by SIGKILL" in output and "learner was killed by SIGKILL" in output
     report = audit(run.run_dir)
     assert report.exit_code == 0 and report.counts["used"] >= 4
     assert [file.stem for file in (run.run_dir / "references").iterdir()] == ["actor-0"]
