@@ -28,6 +28,7 @@ MAX_BYTES = 512 << 20
 MAX_ARRAYS = 1000
 """Default limit of the number of arrays."""
 _KINDS = "biufUS"
+_JITTER = 0.1  # of a clock's median step, by which it may fall
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _UNREADABLE = (ValueError, LookupError, RuntimeError, OverflowError, SyntaxError, TypeError, MemoryError)
 
@@ -66,6 +67,13 @@ def safe_name(text: str) -> str:
         digits = hashlib.sha256(text.encode(errors="replace")).hexdigest()[:8]
         safe = safe[: LONGEST_NAME - 20].encode()[: _LONGEST_BYTES - 20].decode(errors="ignore") + f"-{digits}"
     return safe or "object"
+
+
+def runs_back(times: np.ndarray) -> np.ndarray:
+    """(T,) bool: where a clock (T,), in any unit, is earlier than before, by more than a tenth of its median step."""
+    if len(times) < 2:
+        return np.zeros(len(times), bool)
+    return np.maximum.accumulate(times) - times > _JITTER * np.median(np.abs(np.diff(times)))
 
 
 def distinct_names(names: Iterable[str], key: Callable[[str], str] = str.casefold) -> list[str]:

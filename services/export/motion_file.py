@@ -55,7 +55,7 @@ FORMATS = {"glb": ".glb", "usd": ".usda", "bvh": ".bvh", "ros2": "", "lerobot": 
 DATASETS = ("lerobot",)
 """Formats that hold several motions, and videos."""
 _QUATERNIONS = ("wrist_quaternion", "link_quaternion", "object_quaternion")
-_UNIT = 1e-2  # largest difference of a quaternion's length from one
+_UNIT = 1e-3  # largest difference of a quaternion's length from one
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -248,7 +248,7 @@ def load_motion(path: str | os.PathLike[str]) -> GraspMotion:
 
     Raises:
       CongraspError: there is no such file, it is another kind of file, larger than `MAX_BYTES`, or damaged, or a
-        quaternion's length is more than 1 % from one.
+        quaternion is not normalised.
     """
     remedy = "Run 'congrasp grasp' again."
     arrays = read_npz(pathlib.Path(path), remedy, kind="a grasp motion", largest=MAX_BYTES)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import read_file, read_npz
+from congrasp.common.io.inputs import read_file, read_npz, runs_back
 from congrasp.services.assets.objects.options import METRES
 
 _LARGEST, _DEEPEST = 32 << 20, 200
@@ -35,7 +35,6 @@ _TIME = re.compile(
 _SECONDS = re.compile(r"(.*?)(?:(?<=[_ ])s|secs?|seconds?)")
 _NANOSECONDS = re.compile(r"(.*?)(?:(?<=[_ ])ns|n(?:ano)?(?:secs?|seconds?))")
 _SECOND = 1e9  # ns
-_JITTER = 0.1  # of a file's median step, by which its time may fall
 _NUMBERED = re.compile(r"\bq\w*[\s.]?\d\b")
 _FROM_Y_UP, _CM = Rotation.from_euler("X", 90, degrees=True), 0.01  # frame and unit of BVH files
 _AXES = {
@@ -239,16 +238,14 @@ def _clock(names: list[str]) -> list[int]:
 def _check_clock(path: pathlib.Path, numbers: list[int], stamps: list[list[float | None]]) -> None:
     """Raises a `CongraspError` for the first of these lines whose time runs back by more than jitter."""
     clock = np.array(stamps, float)
-    lines = np.array(numbers)[np.isfinite(clock).all(-1)]
-    clock = clock[np.isfinite(clock).all(-1)]
-    if len(clock) < 2 or not clock.size:
+    if not clock.size:
         return
-    whole = clock.shape[1] == 2 and clock[:, 1].max() < _SECOND  # not a time in nanoseconds next to the same in seconds
-    times = clock[:, 0] + clock[:, 1] / _SECOND if whole else clock[:, 0]
-    falls = np.maximum.accumulate(times) - times
-    limit = _JITTER * np.median(np.abs(np.diff(times)))
-    if (falls > limit).any():
-        what = f"line {lines[np.argmax(falls > limit)]} of {path} is earlier than one before."
+    finite = np.isfinite(clock).all(-1)
+    lines, clock = np.array(numbers)[finite], clock[finite]
+    whole = clock.shape[1] == 2 and clock[:, 1].max(initial=0.0) < _SECOND  # not a whole time next to one in seconds
+    late = runs_back(clock[:, 0] + clock[:, 1] / _SECOND if whole else clock[:, 0])
+    if late.any():
+        what = f"line {lines[late.argmax()]} of {path} is earlier than one before."
         raise CongraspError(what, "Sort the lines by time, and cut the file to one motion.")
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.hands.mano import ManoModel
+from congrasp.common.io.inputs import runs_back
 from congrasp.common.io.pickles import read_archive
 from congrasp.services.assets.captures.human import joint_positions
 from congrasp.services.assets.captures.sequence import (
@@ -27,7 +28,6 @@ from congrasp.services.assets.captures.sequence import (
 )
 
 HOLDS = "MyoHand_<object>_<action>.npz"
-_JITTER = 0.1  # of the median step, by which time may fall
 _BASE = np.array([0.1, -0.55, 0.32])
 _ELBOW = np.array([0.002797970, 0.304212085, -0.000513865])
 """Origin of the forearm in the base."""
@@ -58,8 +58,7 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     """Reads the sequence of a file."""
     name = file.stem
     time, robot, pose = frames_of(name, "the file", read_archive(file), {"time": (), "robot": (29,), "object": (7,)})
-    steps = np.diff(time)
-    if (steps < -_JITTER * np.median(np.abs(steps))).any():
+    if runs_back(time).any():
         raise Dropped(name, "wrong layout", "its time runs back: sort its frames, and cut it to one motion")
     present = np.isfinite(robot).all(-1) & np.isfinite(pose).all(-1) & is_unit(pose[:, 3:])
     if not present.any():
