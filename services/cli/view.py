@@ -2,10 +2,8 @@
 
 import contextlib
 import dataclasses
-import functools
 import pathlib
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -16,10 +14,9 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.security import check_exposure
 from congrasp.services.ops.lifetime import on_signal
 from congrasp.services.ops.logs import announced, log
-from congrasp.services.studio.server import PageServer, Sessions
 
 if TYPE_CHECKING:
-    from congrasp.services.studio.grasping import PolicyGrasping
+    from congrasp.services.studio.grasping import Loaders
 
 _RUN = "quickstart"
 
@@ -94,11 +91,8 @@ class View:
     @contextlib.contextmanager
     def _page(self) -> Iterator[str]:
         """Offers the page while the block runs; yields its address."""
-        from congrasp.services.serve.server import follow_file
-        from congrasp.services.studio.catalogue import Importer, offered
-        from congrasp.services.studio.grasping import PolicyGrasping
-        from congrasp.services.studio.session import Session
-        from congrasp.services.studio.training import Follower, Recordings, TrainingWindow
+        from congrasp.services.studio import grasping, training
+        from congrasp.services.studio.session import open_page
 
         if self.policy is not None and self.connect:
             raise CongraspError(
@@ -108,33 +102,19 @@ class View:
         host = f"[{self.host}]" if ":" in self.host else self.host
         check_exposure(f"tcp/{host}:{self.port}", None, insecure=self.insecure)
         with contextlib.ExitStack() as stack:
-            window = None
+            window, hands = None, grasping.of_file(self.policy) if self.policy else None
             if self.connect or self.recordings:
-                recorded = Recordings(self.recordings) if self.recordings else None
-                window = TrainingWindow(self.run if self.connect else _run_of(self.recordings), recorded)
-                # In the background, since reading the curves of a long run takes seconds.
-                threading.Thread(target=window.load, daemon=True, name="curves").start()
+                window = training.opened_window(self.run if self.connect else "", self.recordings)
             if window is not None and self.connect:
                 watching = stack.enter_context(urls.connect(self.connect, "observer", certs=self.certs))
-                stack.callback(Follower(watching, window).close)
+                stack.callback(training.Follower(watching, window).close)
                 hands = self._of_run(watching, stack)
-            elif self.policy is not None:
-                source = follow_file(self.policy)
-                hands = {"of the policy": functools.partial(PolicyGrasping, source, self.policy.name)}
-            else:
-                hands = _pretrained()
-            loaded = {name: functools.cache(load) for name, load in hands.items()}  # all browsers share programs
-            opened: list[Sessions] = []  # the port is taken before they compile
-            server = PageServer(lambda browser: opened[0].routes(browser), self.host, self.port, self.allow_host)
-            stack.callback(server.close)
-            opened.append(Sessions(lambda: Session(loaded, offered(self.objects), Importer(), window)))
-            stack.callback(opened[0].close)
-            yield server.url
+            shown = hands or grasping.pretrained()
+            yield stack.enter_context(open_page(shown, self.objects, window, self.host, self.port, self.allow_host))
 
-    def _of_run(self, watching: Transport, stack: contextlib.ExitStack) -> "dict[str, Callable[[], PolicyGrasping]]":
-        """The policy of a run; the pretrained ones if there is only an observer's certificate."""
-        from congrasp.services.serve.server import follow_run
-        from congrasp.services.studio.grasping import PolicyGrasping
+    def _of_run(self, watching: Transport, stack: contextlib.ExitStack) -> "Loaders | None":
+        """The policy of a run; None if there is only an observer's certificate."""
+        from congrasp.services.studio.grasping import of_run
 
         pulling = watching
         if self.certs is not None:
@@ -142,29 +122,8 @@ class View:
                 pulling = stack.enter_context(urls.connect(self.connect, "server", certs=self.certs, run=self.run))
             except CongraspError as error:
                 log("warning", f"{error} The studio grasps with the pretrained policies.")
-                return _pretrained()
-        source = follow_run(pulling, self.run, urls.name_on_wire("studio", self.certs, "server"))
-        return {"of the run": functools.partial(PolicyGrasping, source, f"the run '{self.run}'")}
-
-
-def _pretrained() -> "dict[str, Callable[[], PolicyGrasping]]":
-    """The pretrained and custom policies, by the names of their hands."""
-    from congrasp.common.policy.pretrained import hands_with_policy, policy_file
-    from congrasp.services.serve.server import follow_file
-    from congrasp.services.studio.grasping import PolicyGrasping
-
-    return {
-        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
-        for name in hands_with_policy()
-    }
-
-
-def _run_of(recordings: pathlib.Path | None) -> str:
-    """The name of a run, from the folder of its recordings."""
-    from congrasp.learner.run_directory import LOGS
-
-    names = [part for part in recordings.resolve().parts if part != LOGS] if recordings else []
-    return names[-1] if names else ""
+                return None
+        return of_run(pulling, self.run, urls.name_on_wire("studio", self.certs, "server"))
 
 
 COMMAND = View

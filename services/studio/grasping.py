@@ -1,8 +1,10 @@
 """Grasps of a policy for the studio: as drawn, or a variation if that fails; and the reason if none holds."""
 
 import dataclasses
+import functools
+import pathlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,17 +16,19 @@ from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.policy.pretrained import hands_with_policy, policy_file
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime.parallel import cores
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, known, require_known
 from congrasp.common.task.constraints.priority import explain
+from congrasp.common.transport.base import Transport
 from congrasp.common.wire.codec import Message
 from congrasp.services.evaluate.pictures import cause
 from congrasp.services.grasp.approaches import repeated, surface_of
 from congrasp.services.grasp.motion import costs
 from congrasp.services.grasp.reach import with_planned_reach
-from congrasp.services.serve.server import Source
+from congrasp.services.serve.server import Source, follow_file, follow_run
 from congrasp.services.studio.state import tool_of
 
 ATTEMPTS = 8
@@ -39,6 +43,8 @@ SECONDS = "{seconds}"
 """Placeholder in the text of a job for its elapsed seconds."""
 Progress = Callable[[str, float], None]
 """(current activity, completed share from 0 to 1)."""
+Loaders = Mapping[str, Callable[[], "PolicyGrasping"]]
+"""Loaders of policies, by the names that the page shows."""
 Held = Callable[[GraspRequest, str], int]
 """(weaker request, name of the omitted constraint) -> number of attempts that hold."""
 
@@ -143,6 +149,24 @@ class PolicyGrasping:
         episodes, aside = _episodes(self.hand, self.task, obj, request)
         steps = self._attempts.steps
         return self._attempts.run(obj, episodes, lambda step: progress(step / steps)), aside
+
+
+def pretrained() -> Loaders:
+    """The pretrained and custom policies, by the names of their hands."""
+    return {
+        name: functools.partial(PolicyGrasping, follow_file(policy_file(None, name)), "pretrained policy")
+        for name in hands_with_policy()
+    }
+
+
+def of_file(path: pathlib.Path) -> Loaders:
+    """The policy of a file, reread whenever it changes."""
+    return {"of the policy": functools.partial(PolicyGrasping, follow_file(path), path.name)}
+
+
+def of_run(transport: Transport, run: str, name: str) -> Loaders:
+    """The newest policy of a run, pulled from its learner under this process's name on the wire."""
+    return {"of the run": functools.partial(PolicyGrasping, follow_run(transport, run, name), f"the run '{run}'")}
 
 
 def _episodes(

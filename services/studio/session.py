@@ -1,5 +1,6 @@
-"""The session of one browser: studio, policy, objects, motions, training window and background job; and its routes."""
+"""The session of a browser: studio, policy, objects, motions, training window, background job, routes; and the page."""
 
+import contextlib
 import functools
 import json
 import math
@@ -7,7 +8,7 @@ import pathlib
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -19,10 +20,10 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.assets.objects.materials import MATERIALS, with_mass
 from congrasp.services.assets.objects.options import METRES
 from congrasp.services.ops.logs import log
-from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads
-from congrasp.services.studio.grasping import SECONDS, PolicyGrasping, Progress
+from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads, offered
+from congrasp.services.studio.grasping import SECONDS, Loaders, PolicyGrasping, Progress
 from congrasp.services.studio.page import DATA, DRAWN, Motions, data_file, describe, drawing, for_page, hand_message
-from congrasp.services.studio.server import BadRequest, Download, Get, Picture, Routes
+from congrasp.services.studio.server import BadRequest, Download, Get, PageServer, Picture, Routes, Sessions
 from congrasp.services.studio.state import ACTIONS, History, Studio
 from congrasp.services.studio.training import TrainingWindow
 
@@ -40,13 +41,7 @@ _LATEST = 1e10
 class Session:
     """Everything behind the page; its routes are `routes`."""
 
-    def __init__(
-        self,
-        hands: Mapping[str, Callable[[], PolicyGrasping]],
-        objects: Catalogue,
-        importer: Importer,
-        window: TrainingWindow | None = None,
-    ):
+    def __init__(self, hands: Loaders, objects: Catalogue, importer: Importer, window: TrainingWindow | None = None):
         """Loads the first hand's policy and the first object.
 
         Args:
@@ -313,6 +308,34 @@ def json_object(body: bytes) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError("not an object")
     return value
+
+
+@contextlib.contextmanager
+def open_page(
+    hands: Loaders,
+    objects: pathlib.Path | None,
+    window: TrainingWindow | None,
+    host: str,
+    port: int,
+    names: Sequence[str] = (),
+) -> Iterator[str]:
+    """Offers the page, with a session for each browser, while the block runs; yields its address.
+
+    Args:
+      hands: loaders of policies, by name; all browsers share their programs.
+      objects: the user's objects, before the procedural ones (see `catalogue.offered`).
+      window: state of a run, or None.
+      host: see `PageServer`, also for `port` and `names`.
+
+    Raises:
+      CongraspError: the port is busy, or a policy or an object cannot be loaded.
+    """
+    shared = {name: functools.cache(load) for name, load in hands.items()}
+    opened: list[Sessions] = []  # the port is taken before the programs compile
+    with contextlib.closing(PageServer(lambda browser: opened[0].routes(browser), host, port, names)) as server:
+        opened.append(Sessions(lambda: Session(shared, offered(objects), Importer(), window)))
+        with contextlib.closing(opened[0]):
+            yield server.url
 
 
 class Jobs:

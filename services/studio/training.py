@@ -22,6 +22,7 @@ from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, decode
+from congrasp.learner.run_directory import LOGS
 from congrasp.services.ops import status as statuses
 from congrasp.services.ops.logs import log
 from congrasp.services.record.reader import (
@@ -302,6 +303,22 @@ def _logged(record: Record) -> tuple[float, str, str]:
     """Time (seconds since 1970), level and text of a recorded event."""
     event = Log.FromString(record.data)
     return record.time / 1e9, Log.Level.Name(event.level).lower(), event.message
+
+
+def opened_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:
+    """Returns the window on a run, which reads its recordings in the background: that takes seconds for a long run.
+
+    Args:
+      run: name of the run; empty for that of the recordings' folder.
+      recordings: recordings of the run, if there are any.
+
+    Raises:
+      CongraspError: there is no folder or recording of this name.
+    """
+    parts = [part for part in recordings.resolve().parts if part != LOGS] if recordings else []
+    window = TrainingWindow(run or parts[-1], Recordings(recordings) if recordings else None)
+    threading.Thread(target=window.load, daemon=True, name="curves").start()
+    return window
 
 
 class Follower:
