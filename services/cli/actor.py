@@ -7,8 +7,14 @@ from typing import Annotated
 import tyro
 
 from congrasp.actors.physics import PhysicsName
+from congrasp.common.io.journal import Journal
+from congrasp.common.runtime.parallel import cores
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import process_name
 from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.services.ops.lifetime import on_signal
 from congrasp.services.ops.logs import Watch, announced, log
+from congrasp.services.ops.metrics import ActorMetrics
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,13 +50,7 @@ class Actor:
     def __call__(self) -> int:
         """Acts until the run ends or a signal comes."""
         from congrasp.actors.process import run_actor
-        from congrasp.common.io.journal import Journal
-        from congrasp.common.runtime.parallel import cores
         from congrasp.common.runtime.stages import imported, since_start
-        from congrasp.common.transport import urls
-        from congrasp.common.transport.keys import process_name
-        from congrasp.services.ops.lifetime import on_signal
-        from congrasp.services.ops.metrics import ActorMetrics
 
         name, metrics = urls.name_on_wire(self.id or process_name("actor"), self.certs), ActorMetrics()
 

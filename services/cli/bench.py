@@ -2,8 +2,11 @@
 
 import dataclasses
 import pathlib
+import tempfile
 
 from congrasp.actors.physics import PhysicsName
+from congrasp.common.runtime.parallel import cores
+from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.train.presets import get_preset
 
 
@@ -22,7 +25,6 @@ def physics(environments: int = 64, threads: int = 0, repeats: int = 5, engines:
       congrasp bench physics
       congrasp bench physics --engines native warp --environments 1024
     """
-    from congrasp.common.runtime.parallel import cores
     from congrasp.services.bench import physics as bench
 
     bench.bench_physics(environments, threads or cores(), repeats, list(engines) or bench.engines())  # type: ignore[arg-type]
@@ -43,12 +45,10 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
       congrasp bench query
       congrasp bench query --repeat 5000 --concurrency 4
     """
-    import tempfile
 
     import psutil
 
     from congrasp.common.policy import bundle as bundles
-    from congrasp.services.client.policy_client import PolicyClient
     from congrasp.services.serve.load import example_episode, measure, serving
     from congrasp.services.train.command import untrained
 

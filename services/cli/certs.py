@@ -4,6 +4,10 @@ import pathlib
 from typing import Annotated, Literal
 
 import tyro
+from rich.console import Console
+from rich.table import Table
+
+from congrasp.common.transport.security import CERTIFICATE_FILE, LISTENERS, ROLES, Credentials
 
 Folder = Annotated[pathlib.Path, tyro.conf.Positional]
 Role = Literal["learner", "actor", "server", "client", "observer"]
@@ -27,7 +31,6 @@ def init(
       congrasp certs init certs --run human --host 10.0.0.5
       congrasp certs init certs --force
     """
-    from congrasp.common.transport.security import LISTENERS, ROLES
     from congrasp.services.ops.certificates import create_authority, issue
 
     create_authority(folder, run=run, force=force)
@@ -64,7 +67,6 @@ def issue(
       congrasp certs issue certs --role actor
       congrasp certs issue certs --role server --host 10.0.0.6
     """
-    from congrasp.common.transport.security import CERTIFICATE_FILE
     from congrasp.services.ops.certificates import issue, read
 
     made = issue(folder, role, run=run, number=number, hosts=host, days=days, force=force)
@@ -104,10 +106,7 @@ def show(folder: Folder = pathlib.Path("certs")) -> int:
       congrasp certs show
       congrasp certs show certs
     """
-    from rich.console import Console
-    from rich.table import Table
 
-    from congrasp.common.transport.security import Credentials
     from congrasp.services.ops.certificates import certificates
 
     revoked = Credentials(folder, "").revoked()

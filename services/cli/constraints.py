@@ -1,6 +1,7 @@
 """Constraint sets of objects: headings, reference poses and trajectories, generated as for training, or captured."""
 
 import dataclasses
+import importlib
 import json
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -8,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.mano import own_mano_model
+from congrasp.common.io.files import check_output, write_atomically
+from congrasp.common.io.inputs import distinct_names
+from congrasp.common.objects.store import Catalogue
 from congrasp.services.assets.captures import IMPORTERS
+from congrasp.services.cli.console import bars, in_range, save_drawing, say, show_facts, show_table, tracked
 
 if TYPE_CHECKING:
     from congrasp.common.hands.spec import Hand
@@ -57,13 +64,10 @@ class Generate:
 
     def __call__(self) -> int:
         """Generates the sets, and prints where they are."""
-        from congrasp.common.hands import get_hand
-        from congrasp.common.io.inputs import distinct_names
         from congrasp.common.objects.procedural import generate_many
         from congrasp.common.task.config import TaskConfig
         from congrasp.common.task.sampling.sets import make_sets, save
         from congrasp.services.assets.objects.named import located, objects_of
-        from congrasp.services.cli.console import tracked
 
         if not self.objects and self.count < 1:
             raise CongraspError("There is no object for which to generate constraints.", "Pass objects, or --count.")
@@ -152,16 +156,10 @@ class Import:
 
     def __call__(self) -> int:
         """Imports the sets, and prints what was dropped."""
-        import importlib
 
-        from congrasp.common.hands import get_hand
-        from congrasp.common.hands.mano import own_mano_model
-        from congrasp.common.io.files import check_output, write_atomically
-        from congrasp.common.objects.store import Catalogue
         from congrasp.common.task.sampling.sets import save
         from congrasp.services.assets.captures.build import Options, import_sets
         from congrasp.services.assets.captures.sequence import Meshes
-        from congrasp.services.cli.console import bars, in_range
 
         if self.format not in IMPORTERS:
             raise CongraspError(f"There is no format '{self.format}'.", f"Choose one of: {', '.join(IMPORTERS)}.")
@@ -194,7 +192,6 @@ class Import:
 
 def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathlib.Path) -> None:
     """Prints what was kept, what each rule dropped, and the locations of the results."""
-    from congrasp.services.cli.console import say, show_table
 
     kept, dropped = report.kept, report.dropped
     say(f"{len(kept)} of {len(kept) + len(dropped)} sequences kept.")
@@ -255,7 +252,6 @@ def show(
       congrasp constraints show sets/mug_7.constraints.safetensors --png mug.png --rest 2
     """
     from congrasp.common.task.sampling.sets import describe, load
-    from congrasp.services.cli.console import in_range, save_drawing, show_facts
 
     constraints = load(file)
     in_range(0, len(constraints.arrays["rest"]), rest=rest)

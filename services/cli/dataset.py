@@ -1,6 +1,7 @@
 """`congrasp dataset`: verified grasps of many objects, in shards."""
 
 import dataclasses
+import hashlib
 import pathlib
 from typing import Annotated, Literal
 
@@ -9,6 +10,7 @@ import tyro
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects.options import ImportOptions
+from congrasp.services.cli.console import in_range, tracked
 
 Verdict = Literal["all", "success", "held", "clean", "lifted", "pushed_weight", "pushed"]
 
@@ -61,13 +63,11 @@ class Dataset:
 
     def __call__(self) -> int:
         """Makes the missing shards, and the card."""
-        import hashlib
 
         from congrasp.actors.physics import resolve_physics
         from congrasp.common.policy import bundle as bundles
         from congrasp.common.policy.pretrained import policy_file
         from congrasp.common.task.constraints import require_known
-        from congrasp.services.cli.console import in_range, tracked
         from congrasp.services.dataset.make import Recipe, make, pools_of, shard_objects
         from congrasp.services.dataset.shards import Shards, write_card
         from congrasp.services.evaluate.experiment import Experiment

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import tyro
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.io.files import check_free, check_output
 
 
 def policy(
@@ -31,7 +32,6 @@ def policy(
       congrasp export policy
       congrasp export policy --hand allegro --to stablehlo
     """
-    from congrasp.common.io.files import check_free, check_output
     from congrasp.common.policy.bundle import load
     from congrasp.common.policy.pretrained import policy_file
     from congrasp.services.export.policy import SUFFIXES, export_policy
@@ -76,7 +76,6 @@ def motion(
       congrasp export motion grasps/mug/grasp.npz --to glb
       congrasp export motion runs/mine --success --to ros2 --out bag
     """
-    from congrasp.common.io.files import check_output
     from congrasp.services.export.motion_file import FORMATS, at_rate, default_name, export_motions, pick_motion
 
     if not paths:
@@ -107,7 +106,6 @@ def layout(
       congrasp export layout runs/mine
       congrasp export layout recordings/learner.mcap --out layout.json
     """
-    from congrasp.common.io.files import check_free
     from congrasp.services.export.layout import export_layout
 
     check_free(out, force=force)

@@ -14,7 +14,7 @@ from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.constraints.base import Option
 from congrasp.services.arm import ArmOptions
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.cli.console import report_error, say
+from congrasp.services.cli.console import bars, in_range, report_error, say
 
 if TYPE_CHECKING:
     from congrasp.services.grasp.jobs import Result
@@ -97,7 +97,6 @@ class Grasp:
     def __call__(self) -> int:
         """Grasps one object after another."""
         from congrasp.actors.attempts import Phases
-        from congrasp.services.cli.console import bars, in_range
         from congrasp.services.grasp.grasper import open_grasper
         from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object, save_summary
         from congrasp.services.viz.render import film_of

@@ -7,8 +7,10 @@ import pathlib
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.config import MetricWriter, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError
+from congrasp.common.transport import urls
 from congrasp.common.transport.ports import LEARNER_URL, rank_url, reachable_url
 from congrasp.services.cli.train import defaults as defaults
+from congrasp.services.ops.lifetime import on_signal
 from congrasp.services.ops.logs import Watch, log, log_error, logging_as
 from congrasp.services.train.presets import with_hand
 
@@ -77,10 +79,8 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
       congrasp learner --run-dir runs/human --resume
     """
     from congrasp.common.runtime.stages import imported
-    from congrasp.common.transport import urls
     from congrasp.learner.distributed.ranks import Ranks, end_process
     from congrasp.learner.run_directory import listening
-    from congrasp.services.ops.lifetime import on_signal
     from congrasp.services.train.learn import learn, longest_rollout
 
     run_dir, rank, config = options.run_dir, options.rank, with_hand(config, options.hand)

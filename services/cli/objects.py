@@ -3,10 +3,23 @@
 import pathlib
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands.files import HUMAN
+from congrasp.common.objects.store import Catalogue, digest
 from congrasp.services.assets.objects.options import ImportOptions, size_in_words
+from congrasp.services.cli.console import (
+    bars,
+    in_range,
+    report_error,
+    save_drawing,
+    say,
+    show_facts,
+    show_table,
+    tracked,
+)
 
 if TYPE_CHECKING:
     from congrasp.common.objects.spec import GraspObject
@@ -32,8 +45,6 @@ def generate(
       congrasp objects generate --families mug knife --out tools
     """
     from congrasp.common.objects import procedural
-    from congrasp.common.objects.store import Catalogue
-    from congrasp.services.cli.console import in_range, tracked
 
     in_range(1, count=count)
     catalogue = Catalogue(out)
@@ -67,10 +78,8 @@ def import_meshes(
       congrasp objects import examples/mug.obj
       congrasp objects import scans/ --unit mm --density 300 --out my-objects
     """
-    from congrasp.common.objects.store import Catalogue
     from congrasp.services.assets.objects.meshes import import_sources
     from congrasp.services.assets.objects.named import distinct, find_sources
-    from congrasp.services.cli.console import bars, report_error, say
 
     if not paths:
         raise CongraspError("There is nothing to import.", "Pass mesh files or folders.")
@@ -123,8 +132,6 @@ def list_objects(
       congrasp objects list --families
     """
     from congrasp.common.objects.procedural import FAMILIES
-    from congrasp.common.objects.store import Catalogue
-    from congrasp.services.cli.console import report_error, save_drawing, show_table
 
     if families:
         print("\n".join(FAMILIES))
@@ -164,12 +171,9 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
       congrasp objects show mug:7 --png mug.png
       congrasp objects show mug_7 --folder my-objects
     """
-    import numpy as np
 
-    from congrasp.common.objects.store import digest
     from congrasp.common.task.sampling.headings import sample_headings
     from congrasp.services.assets.objects.named import find_object
-    from congrasp.services.cli.console import save_drawing, say, show_facts
 
     obj = find_object(object, folder)
     share = obj.graspable[obj.labels].mean()
@@ -218,11 +222,9 @@ def rests(
       congrasp objects rests mug:7 --png rests.png
       congrasp objects rests examples/mug.obj
     """
-    import numpy as np
 
     from congrasp.common.objects.resting import rest_tilts
     from congrasp.services.assets.objects.named import find_object
-    from congrasp.services.cli.console import save_drawing, show_table
 
     obj = find_object(object, folder)
     tilts = np.degrees(rest_tilts(obj))
@@ -241,7 +243,6 @@ def rests(
 def _reach(obj: "GraspObject", headings: "Headings | None", *, region: bool = False) -> list[str]:
     """Share of the headings, or of those on the graspable region, that the human hand can use in each resting pose."""
     from congrasp.common.hands.closure import outline
-    from congrasp.common.hands.files import HUMAN
     from congrasp.common.task.sampling.headings import above, within_reach
 
     if headings is None:
@@ -284,7 +285,6 @@ def set_affordance(
       congrasp objects affordance examples/mug.obj --part-mesh examples/handle.obj --invert
       congrasp objects affordance mug_7 --half-space 0 0 1 0.02 --name upper-mug
     """
-    from congrasp.common.objects.store import Catalogue
     from congrasp.services.assets.objects import affordance
     from congrasp.services.assets.objects.named import find_object
 

@@ -5,6 +5,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.files import check_output
+
 
 def plot(
     paths: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional],
@@ -24,8 +27,6 @@ def plot(
       congrasp plot runs/mine
       congrasp plot runs/mine runs/other --out plots --formats png
     """
-    from congrasp.common.errors import CongraspError
-    from congrasp.common.io.files import check_output
     from congrasp.services.evaluate.plots import plot_evaluation
     from congrasp.services.viz.plots import plot_runs
 

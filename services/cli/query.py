@@ -6,6 +6,8 @@ from typing import Annotated
 import tyro
 
 from congrasp.common.transport.ports import SERVER_URL
+from congrasp.services.cli.console import in_range
+from congrasp.services.client.policy_client import PolicyClient
 
 
 def query(
@@ -42,9 +44,6 @@ def query(
       congrasp query --repeat 4000 --concurrency 200 --rate 2
     """
     import json as json_module
-
-    from congrasp.services.cli.console import in_range
-    from congrasp.services.client.policy_client import PolicyClient
 
     in_range(1, repeat=repeat, concurrency=concurrency, states=states)
     in_range(0, rate=rate)

@@ -5,6 +5,9 @@ from typing import Annotated
 
 import tyro
 
+from congrasp.common.hands import get_hand
+from congrasp.services.cli.console import in_range
+
 _FRAMED = 10  # control steps between the frames that the camera of a robot must contain
 
 
@@ -19,7 +22,6 @@ def hand(hand: str = "human", out: pathlib.Path = pathlib.Path("hand.png")) -> i
       congrasp render hand --hand allegro
       congrasp render hand --hand my_hand --out my-hand.png
     """
-    from congrasp.common.hands import get_hand
     from congrasp.services.viz.hand_sheets import hand_sheet
     from congrasp.services.viz.sheets import save_png
 
@@ -50,7 +52,6 @@ def episode(
       congrasp render episode runs/mine --success
       congrasp render episode runs/mine --index 0 --video grasp.mp4
     """
-    from congrasp.services.cli.console import in_range
     from congrasp.services.grasp.files import save_robot_video
     from congrasp.services.record.episode import arm_of_episode
     from congrasp.services.record.reader import pick_episode

@@ -8,6 +8,7 @@ import tyro
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
+from congrasp.services.cli.console import in_range, tracked
 
 if TYPE_CHECKING:
     from congrasp.services.evaluate.report import HandCheck
@@ -54,7 +55,6 @@ class Report:
         from congrasp.common.policy import bundle as bundles
         from congrasp.common.policy.pretrained import policy_file
         from congrasp.services.assets.objects.named import objects_of
-        from congrasp.services.cli.console import in_range, tracked
         from congrasp.services.evaluate.experiment import Experiment
         from congrasp.services.evaluate.pools import exam_pool
         from congrasp.services.evaluate.report import report_on

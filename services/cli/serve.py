@@ -1,10 +1,18 @@
 """`congrasp serve`: the live policy."""
 
+import contextlib
 import dataclasses
+import os
 import pathlib
+import secrets
 
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport import urls
+from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import SERVER_URL
+from congrasp.services.ops.lifetime import on_signal
 from congrasp.services.ops.logs import Watch, announced, log
+from congrasp.services.ops.metrics import ServerMetrics
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,9 +46,6 @@ class Serve:
 
     def __call__(self) -> int:
         """Serves until a signal."""
-        import contextlib
-        import os
-        import secrets
 
         starting = contextlib.ExitStack()
         starting.enter_context(announced("Loading and compiling the policy"))
@@ -49,12 +54,7 @@ class Serve:
 
         import jax
 
-        from congrasp.common.errors import CongraspError
         from congrasp.common.policy.pretrained import policy_file
-        from congrasp.common.transport import urls
-        from congrasp.common.transport.keys import Keys
-        from congrasp.services.ops.lifetime import on_signal
-        from congrasp.services.ops.metrics import ServerMetrics
         from congrasp.services.serve.server import PolicyServer, follow_file, follow_run
 
         if self.policy is not None and self.connect:

@@ -11,11 +11,13 @@ from collections.abc import Iterator
 from typing import Annotated, Any
 
 import tyro
+from rich.console import Console
 
 import congrasp.actors.physics  # noqa: F401 - registers the engines that --physics offers
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.files import cache_folder, check_output, write_atomically
 from congrasp.common.runtime.engines import PhysicsName
+from congrasp.services.ops.lifetime import on_signal
 
 _MANIFEST = "caches.json"
 
@@ -54,10 +56,8 @@ def warmup(
       congrasp warmup --preset human --export caches.tar
       congrasp warmup --import caches.tar
     """
-    from rich.console import Console
 
     from congrasp.common.runtime.stages import imported
-    from congrasp.services.ops.lifetime import on_signal
     from congrasp.services.train.command import first_update
     from congrasp.services.train.learn import until_first_update
     from congrasp.services.train.presets import get_preset
