@@ -207,9 +207,6 @@ EPISODE = MessageSpec(
 METRICS = MessageSpec("metrics", meta={"time": (int, float), "values": dict})
 EVENT = MessageSpec("event", meta={"time": (int, float), "level": str, "text": str})
 TICKET = MessageSpec("ticket request", meta={"actor": str, "incarnation": str, "ticket": str})
-ANNOUNCEMENT = MessageSpec("announcement", meta={"version": int, "run_id": str, "session_id": str})
-"""Learner to all: a new version is available. `run_id` changes when training starts from scratch, `session_id` each
-time that the learner's process starts."""
 
 
 def validate(message: Message, spec: MessageSpec, **sizes: int) -> dict[str, int]:

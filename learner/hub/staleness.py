@@ -151,7 +151,12 @@ class Counters:
 
 
 class StalenessManager:
-    """Tickets and counters, independent of messages and transports; thread-safe."""
+    """Tickets and counters, independent of messages and transports; thread-safe.
+
+    Attributes (read only):
+      max_staleness: eta, the greatest lag in versions.
+      version: current policy version.
+    """
 
     def __init__(
         self,
@@ -171,7 +176,7 @@ class StalenessManager:
           tickets_per_owner: most tickets of one owner, so that no owner takes all of them.
           clock: seconds, monotonic.
         """
-        self._max_staleness = max_staleness
+        self.max_staleness = max_staleness
         self._batch = rollouts_per_update
         slots = (max_staleness + 1) * rollouts_per_update
         self._budget = TicketBudget(slots, rollouts_per_update, ticket_seconds, clock)
@@ -180,26 +185,11 @@ class StalenessManager:
         self._lock = threading.RLock()
         self._tickets: dict[tuple[Owner, str], Ticket] = {}
         self._expired: collections.OrderedDict[tuple[Owner, str], Ticket] = collections.OrderedDict()
-        self._version = 0
+        self.version = 0
         self._in_update = 0
         # Versions at the last resume: that of the checkpoint, and the new one of its policy.
         self._resumed: tuple[int, int | None] = 0, 0
         self._counters = Counters()
-
-    @property
-    def version(self) -> int:
-        """Current policy version."""
-        return self._version
-
-    @property
-    def max_staleness(self) -> int:
-        """eta, the greatest lag in versions."""
-        return self._max_staleness
-
-    @property
-    def rollouts_per_update(self) -> int:
-        """Size of the batch."""
-        return self._batch
 
     @property
     def queued(self) -> int:
@@ -211,8 +201,8 @@ class StalenessManager:
         """Number of tickets that could be granted now."""
         with self._lock:
             # Every version counts for one batch, so that a resumed run, or an update of another size, leaves no debt.
-            accepted = self._version * self._batch + self._in_update + self.queued
-            return (self._max_staleness + self._version + 1) * self._batch - accepted - self._awaited()
+            accepted = self.version * self._batch + self._in_update + self.queued
+            return (self.max_staleness + self.version + 1) * self._batch - accepted - self._awaited()
 
     def grant(self, owner: Owner, ticket_id: str) -> Ticket | None:
         """Grants a ticket, or returns None if there is none now; repeating the id returns the same ticket."""
@@ -225,7 +215,7 @@ class StalenessManager:
             if mine >= self._per_owner or not self._budget.admits(owner[0], shared) or self.capacity <= 0:
                 return None
             now = self._clock()
-            ticket = Ticket(owner, ticket_id, self._version, now, now + self._budget.lasts(owner[0]))
+            ticket = Ticket(owner, ticket_id, self.version, now, now + self._budget.lasts(owner[0]))
             self._tickets[owner, ticket_id] = ticket
             self._counters.granted += 1
             return ticket
@@ -265,7 +255,7 @@ class StalenessManager:
         """
         with self._lock:
             self._expire()
-            if self.is_stale(version) or version > self._version:
+            if self.is_stale(version) or version > self.version:
                 if ticket := self._known(owner, ticket_id):
                     self._budget.measure(owner[0], self._clock() - ticket.granted)
                 self.refuse_stale(owner, ticket_id)
@@ -311,12 +301,12 @@ class StalenessManager:
         """Number of updates between the policy of a version and the current one."""
         source, renamed = self._resumed
         if renamed is None or version >= renamed:
-            return self._version - version
-        return abs(version - source) + self._version - renamed
+            return self.version - version
+        return abs(version - source) + self.version - renamed
 
     def is_stale(self, version: int) -> bool:
         """True if a rollout of this policy version is too old to learn from."""
-        return self.lag(version) > self._max_staleness
+        return self.lag(version) > self.max_staleness
 
     def take(self, version: int) -> bool:
         """Passes an accepted rollout to the coming update; returns False if it has become too old, and drops it."""
@@ -332,8 +322,8 @@ class StalenessManager:
         """Advances to a version, after the update that led to it."""
         with self._lock:
             if self._resumed[1] is None:
-                self._resumed = self._version, version
-            self._version = version
+                self._resumed = self.version, version
+            self.version = version
             self._in_update = 0
 
     def counters(self) -> dict[str, int]:
@@ -358,7 +348,7 @@ class StalenessManager:
         with self._lock:
             self._counters = Counters(**durable)
             self._tickets.clear()
-            self._version, self._in_update = version, 0
+            self.version, self._in_update = version, 0
             self._resumed = version, None
 
     def note_undone(self, count: int) -> None:

@@ -5,7 +5,7 @@ import math
 import pathlib
 import zlib
 from collections.abc import Sequence, Set
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,9 +31,6 @@ from congrasp.services.evaluate.pools import Pools, evaluate_pools
 from congrasp.services.evaluate.references import reference_policy
 from congrasp.services.evaluate.scores import TABLES, Row, known_rows
 
-Table = Literal[
-    "single", "composed", "cross", "hands", "ablation", "objects", "noise", "sensing", "payload", "peers", "all"
-]
 MASSES = (0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0)
 """Masses of the table `payload`, kg."""
 _OTHERS = {"noise", "sensing", "objects", "payload", "peers"}  # tables whose rows are not constraints

@@ -269,11 +269,6 @@ class Recorder:
         return self._subscription.dropped
 
     @property
-    def native_id(self) -> int | None:
-        """Native id of the recorder's thread; None before it starts."""
-        return self._thread.native_id
-
-    @property
     def files(self) -> list[pathlib.Path]:
         """Files so far, the current one last."""
         return list(self._writer.files) if self._writer else []
