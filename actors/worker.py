@@ -259,15 +259,11 @@ class RolloutWorker:
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         """Collects a rollout as one program; see `collect`."""
+        parameters, bank, carry = _on_device((parameters, self._bank, (self.state, self._episode_key)))
         (self.state, self._episode_key), rollout = self.programs.scan(
-            *self._scan_arguments(parameters, key), steps=steps
+            parameters, self._settings, self._stationary, bank, carry, key, steps=steps
         )
         return rollout
-
-    def _scan_arguments(self, parameters: Any, key: Array) -> tuple[Any, ...]:
-        """Arguments of `_scan` except for the steps."""
-        parameters, bank, carry = _on_device((parameters, self._bank, (self.state, self._episode_key)))
-        return parameters, self._settings, self._stationary, bank, carry, key
 
 
 def _on_device(tree: Any) -> Any:

@@ -199,14 +199,10 @@ class WarpBuffers:
             self._substep_all()
             return
         if self._graph is None:
-            self._graph = self._capture()
+            with wp.ScopedCapture() as capture:
+                self._substep_all()
+            self._graph = capture.graph
         wp.capture_launch(self._graph)
-
-    def _capture(self) -> wp.Graph:
-        """Records the kernels of one control step as a CUDA graph."""
-        with wp.ScopedCapture() as capture:
-            self._substep_all()
-        return capture.graph
 
     def _substep_all(self) -> None:
         """Runs the physics steps of a control step; contacts are read in the last one."""

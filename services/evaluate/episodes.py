@@ -70,8 +70,7 @@ class Sample:
 
     def first(self, count: int) -> "Sample":
         """Returns the first `count` episodes."""
-        values = {name: column[:count] for name, column in self.values.items()}
-        return Sample(values, self.link_force[:count], self.torque[:count])
+        return self.where(np.arange(len(self.values["success"])) < count)
 
 
 def joined(samples: Sequence[Sample]) -> Sample:

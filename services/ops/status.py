@@ -55,15 +55,11 @@ def warnings(status: Mapping[str, Any]) -> list[str]:
     found = []
     for total, parts in _SUMS.items():
         if counters[total] != sum(counters[part] for part in parts):
-            found.append(f"The counters are inconsistent: {total} {counters[total]} is not {_sum(counters, parts)}.")
+            terms = " + ".join(f"{part} {counters[part]}" for part in parts)
+            found.append(f"The counters are inconsistent: {total} {counters[total]} is not {terms}.")
     if counters["queued"] != queue["length"]:
         found.append(f"{counters['queued']} rollouts are counted as queued, but the queue holds {queue['length']}.")
     return [*found, *filter(None, [status.get("trouble")])]  # a learner of an earlier version tells none
-
-
-def _sum(counters: Mapping[str, int], parts: tuple[str, ...]) -> str:
-    """Formats a sum of counters as a formula."""
-    return " + ".join(f"{part} {counters[part]}" for part in parts)
 
 
 def tables(status: Mapping[str, Any]) -> Group:

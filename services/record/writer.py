@@ -162,7 +162,8 @@ def _merge(fields: dict[str, Any], value: Mapping[str, Any]) -> bool:
             known = fields.setdefault(name, {})
             grown |= _merge(known, item) if isinstance(known, dict) else False
         elif name not in fields:
-            fields[name] = _kind(item)
+            is_number = isinstance(item, int | float)
+            fields[name] = "boolean" if isinstance(item, bool) else "number" if is_number else "string"
             grown = True
     return grown
 
@@ -179,13 +180,6 @@ def _known(fields: Mapping[str, Any], value: Mapping[str, Any]) -> dict[str, Any
 def _count(fields: Mapping[str, Any]) -> int:
     """Number of fields at any depth."""
     return sum(_count(item) if isinstance(item, Mapping) else 1 for item in fields.values())
-
-
-def _kind(item: Any) -> str:
-    """JSON type of a value."""
-    if isinstance(item, bool):
-        return "boolean"
-    return "number" if isinstance(item, int | float) else "string"
 
 
 def _schema(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -240,21 +234,18 @@ class LogWriter:
         """
         if not entries:
             return
-        if self._file is not None and self._is_over(self._file, entries[0].time):
+        time = entries[0].time
+        # A clock that was set back must not keep a file open forever.
+        if self._file and (self._file.tell() > self._max_bytes or abs(time - self._first) > self._max_ns):
             self.close()
         if self._file is None:
-            self._begin(entries[0].time)
+            self._begin(time)
         for entry in entries:
             channel = self._channels.get(entry.channel)
             if channel is None:
                 channel = self._channels[entry.channel] = self._register(entry.channel)
             self._sequences[channel] = sequence = self._sequences.get(channel, 0) + 1
             self._writer.add_message(channel, entry.time, entry.data, entry.time, sequence)
-
-    def _is_over(self, file: IO[bytes], time: int) -> bool:
-        """True if an entry of this time (ns) belongs to the next file."""
-        # A clock that was set back must not keep a file open forever.
-        return file.tell() > self._max_bytes or abs(time - self._first) > self._max_ns
 
     def flush(self) -> None:
         """Flushes to the operating system; a killed writer loses only later entries.

@@ -166,8 +166,9 @@ class TrainingWindow:
             for record in read_records(file, lambda topic: topic.startswith(_READ) or is_episode(topic)):
                 _, kind, role, name = record.topic.split("/", 3)
                 if kind == "events":
+                    event = Log.FromString(record.data)
                     with self._lock:
-                        self._event(*_logged(record))
+                        self._event(record.time / 1e9, Log.Level.Name(event.level).lower(), event.message)
                     continue
                 if kind == "episode":
                     newest[role] = record
@@ -297,12 +298,6 @@ def labels_of(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
                 title = panel.title if len(panel.metrics) == 1 else f"{panel.title}: {name.rpartition('_')[2]}"
                 found[name] = {"title": title, "unit": panel.unit, "group": group}
     return found | {n: {"title": n, "unit": "", "group": "Details"} for n in sorted(metrics) if n not in found}
-
-
-def _logged(record: Record) -> tuple[float, str, str]:
-    """Time (seconds since 1970), level and text of a recorded event."""
-    event = Log.FromString(record.data)
-    return record.time / 1e9, Log.Level.Name(event.level).lower(), event.message
 
 
 def opened_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:

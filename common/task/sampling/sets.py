@@ -124,12 +124,8 @@ def _row(made: Message, split: Split) -> ConstraintBank:
 def _allowed(made: Message, kind: Literal["heading", "pose"], split: Split) -> np.ndarray:
     """(V, R, H or M) bool: headings or references of a split that clear the table."""
     allowed, training = made.arrays[f"{kind}/allowed"], made.arrays[f"{kind}/training"]
-    return allowed & _belongs(training, split)[:, None]
-
-
-def _belongs(training: np.ndarray, split: Split) -> np.ndarray:
-    """Mask (V, M) of the members of a split, from the mask of those for training (V, M)."""
-    return {"all": np.ones_like(training), "training": training, "held-out": ~training}[split]
+    belongs = {"all": np.ones_like(training), "training": training, "held-out": ~training}[split]
+    return allowed & belongs[:, None]
 
 
 def load(path: pathlib.Path) -> Message:
@@ -339,20 +335,17 @@ def save(constraints: Message, folder: pathlib.Path) -> pathlib.Path:
     return path
 
 
-def _scale_text(scale: float) -> str:
-    """Describes the scale of the object relative to its file; empty for 1."""
-    return "" if scale == 1.0 else f", {scale:g} times as large, for this hand"
-
-
 def describe(constraints: Message) -> dict[str, str]:
     """Describes the content of a set as text by name."""
     arrays, meta = constraints.arrays, constraints.meta
     allowed, poses = arrays["heading/allowed"], arrays["pose/allowed"]
     waypoints = arrays["trajectory/position"]
     length = np.linalg.norm(np.diff(waypoints, axis=2), axis=-1).sum(-1)
+    scale = meta["object_scale"]  # relative to the object's file
+    scaled = "" if scale == 1.0 else f", {scale:g} times as large, for this hand"
     rows = {
         "hand": f"{meta['hand']}, {len(meta['finger_joints'])} finger joints",
-        "object": f"{meta['object']} ({meta['object_digest']}){_scale_text(meta['object_scale'])}",
+        "object": f"{meta['object']} ({meta['object_digest']}){scaled}",
         "avoid region": f"{arrays['surface/avoid'].mean():.0%} of {len(arrays['surface/points'])} surface points",
         "headings": f"{allowed.shape[2]} for each of: {', '.join(meta['variants'])}",
         "reference poses": f"{poses.shape[2]} for each",
