@@ -31,7 +31,7 @@ def exposed(port: int, host: str, *collectors: Any) -> Iterator[None]:
     Raises:
       CongraspError: the port cannot be used.
     """
-    registry = CollectorRegistry()
+    registry = CollectorRegistry()  # collectors need no `describe`: names are not checked for clashes
     ProcessCollector(registry=registry)
     for collector in collectors:
         registry.register(collector)
@@ -56,10 +56,6 @@ class LearnerMetrics:
     def update(self, values: Mapping[str, float]) -> None:
         """Stores the metrics of an update."""
         self._values = values
-
-    def describe(self) -> Iterable[Metric]:
-        """Yields nothing, because the metrics depend on the run."""
-        return ()
 
     def collect(self) -> Iterator[Metric]:
         """Yields the metrics of the class."""
@@ -134,10 +130,6 @@ class ActorMetrics:
         """Stores the metrics of a rollout, including `rollouts` and `version`."""
         self._last = values
 
-    def describe(self) -> Iterable[Metric]:
-        """Yields nothing before the first rollout."""
-        return ()
-
     def collect(self) -> Iterator[Metric]:
         """Yields the metrics of the class."""
         last = dict(self._last)
@@ -176,10 +168,6 @@ class ServerMetrics:
     def batch(self, size: int) -> None:
         """Counts a batch."""
         self._batch.observe(size)
-
-    def describe(self) -> Iterable[Metric]:
-        """Yields nothing before there is a server."""
-        return ()
 
     def collect(self) -> Iterator[Metric]:
         """Yields the metrics of the class."""
