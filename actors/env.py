@@ -365,20 +365,11 @@ class GraspEnv:
     def _viewed(self, state: EnvState, moved: PhysicsState, followed: Action) -> EnvState:
         """Returns the environments with their views of a scene in the carried frame, and these followed targets."""
         reset_state = state.reset_state
+        physical = {name: value for name, value in moved._asdict().items() if name in SceneState._fields}
         scene = SceneState(
-            q=moved.q,
-            u=moved.u,
-            q_velocity=moved.q_velocity,
-            u_velocity=moved.u_velocity,
+            **physical,
             q_target=followed.q_target,
             u_target=followed.u_target,
-            object_position=moved.object_position,
-            object_quaternion=moved.object_quaternion,
-            object_velocity=moved.object_velocity,
-            object_angular_velocity=moved.object_angular_velocity,
-            contact_force=moved.contact_force,
-            contact_position=moved.contact_position,
-            contact_found=moved.contact_found,
             base_position=reset_state.base_position,
             base_quaternion=reset_state.base_quaternion,
             q_initial=reset_state.q,

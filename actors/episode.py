@@ -18,6 +18,8 @@ from congrasp.common.task.reward import terms
 from congrasp.common.task.types import Array, Goal, Surface
 from congrasp.common.wire.codec import Message
 
+_TRACED = "object_position", "object_quaternion", "contact_force", "q", "u", "q_target", "u_target", "action", "table"
+
 
 def episode_message(
     hand: Hand, task: TaskConfig, trace: Trace, goal: Goal, surface: Surface, obj: GraspObject, meta: dict[str, Any]
@@ -41,15 +43,7 @@ def episode_message(
     arrays = {
         "link_position": position[:steps],
         "link_quaternion": quaternion[:steps],
-        "object_position": cut.object_position,
-        "object_quaternion": cut.object_quaternion,
-        "contact_force": cut.contact_force,
-        "q": cut.q,
-        "u": cut.u,
-        "q_target": cut.q_target,
-        "u_target": cut.u_target,
-        "action": cut.action,
-        "table": cut.table,
+        **{name: getattr(cut, name) for name in _TRACED},
         **{f"reward/{name}": cut.terms[:, i] for i, name in enumerate(terms(task))},
         **{f"error/{spec.name}": cut.errors[:, i] for i, spec in enumerate(metrics.specs(task))},
         **{f"goal/{name}": value for name, value in goal.flat().items()},

@@ -18,6 +18,10 @@ from congrasp.common.task.resting import resting_mean
 from congrasp.common.task.settings import SensingConfig, TaskSettings
 from congrasp.common.task.types import Array, SceneState
 
+_DRAWN = (
+    *("period", "phase", "delay", "position_noise", "rotation_noise", "dropout", "position_bias", "rotation_bias"),
+    *("latency", "camera_distance", "camera_elevation", "camera_azimuth", "once"),
+)  # in the order of their random numbers; the ranges are those of `SensingConfig`, or 0 to 1
 NEVER = 20_000.0
 """Period in control steps that no episode reaches."""
 
@@ -89,21 +93,7 @@ def draw_sensors(config: SensingConfig, control_dt: float, key: Array, batch: in
       key: random key.
       batch: number B of episodes.
     """
-    ranges = {
-        "period": config.period,
-        "phase": (0.0, 1.0),
-        "delay": config.delay,
-        "position_noise": config.position_noise,
-        "rotation_noise": config.rotation_noise,
-        "dropout": config.dropout,
-        "position_bias": config.position_bias,
-        "rotation_bias": config.rotation_bias,
-        "latency": config.latency,
-        "camera_distance": config.camera_distance,
-        "camera_elevation": config.camera_elevation,
-        "camera_azimuth": config.camera_azimuth,
-        "once": (0.0, 1.0),
-    }
+    ranges = {name: getattr(config, name, (0.0, 1.0)) for name in _DRAWN}
     numbers = chance.uniforms(key, {"ranges": len(ranges), "biases": 6}, batch)
     low, high = np.array([*ranges.values()], np.float32).T
     drawn = dict(zip(ranges, (low + (high - low) * numbers["ranges"]).T, strict=True))
