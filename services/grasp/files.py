@@ -4,21 +4,18 @@ import functools
 import hashlib
 import json
 import pathlib
-import time
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.errors import os_errors_as
 from congrasp.common.io.files import write_atomically
 from congrasp.common.wire.codec import Message
 from congrasp.services.export.motion_file import GraspMotion, joint_trajectory, robot_joints, save_motion
 from congrasp.services.grasp.motion import Grasp
 from congrasp.services.record.episode import MovedArm
-from congrasp.services.record.scene import episode_entries
-from congrasp.services.record.writer import JsonChannels, LogWriter
+from congrasp.services.record.scene import save_episode
 from congrasp.services.viz.raster import render_scene
 from congrasp.services.viz.render import (
     Film,
@@ -76,7 +73,7 @@ def save_grasp(
     """
     (folder / RESULT).unlink(missing_ok=True)
     save_motion(folder / MOTION, found.motion)
-    save_recording(folder / RECORDING, found.episode)
+    save_episode(folder / RECORDING, "grasp", found.episode)
     episode, arm = found.episode, found.motion.arm
     if arm:
         save_trajectories(folder, found.motion, arm)
@@ -106,19 +103,6 @@ def _steps_to_draw(first: int, end: int, last: int) -> list[int]:
     reach = [0, first / 2] if first else []
     grasp = np.linspace(first, min(end, last), 6 - len(reach))
     return sorted({round(step) for step in [*reach, *grasp, (end + last) / 2, last]})
-
-
-def save_recording(path: pathlib.Path, episode: Message) -> None:
-    """Writes an episode as an MCAP file of that name.
-
-    Raises:
-      CongraspError: the file cannot be written.
-    """
-    with os_errors_as(f"{path} could not be written"):
-        writer = LogWriter(path.parent, f".{path.stem}", run=str(episode.meta["object"]))
-        writer.write(*episode_entries("grasp", episode, time.time_ns(), 0, JsonChannels()))
-        writer.close()
-        writer.files[-1].rename(path)
 
 
 def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:

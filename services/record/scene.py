@@ -6,6 +6,8 @@ frames, contacts and signals follow at each control step.
 
 import contextlib
 import functools
+import pathlib
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -21,7 +23,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 from scipy.spatial.transform import Rotation
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.flesh import skeleton_of
 from congrasp.common.hands.mjcf import WRIST_JOINTS, mujoco_link_poses
@@ -45,7 +47,7 @@ from congrasp.services.record.palette import (
     colours_at,
 )
 from congrasp.services.record.palette import MATERIALS as COLOURS
-from congrasp.services.record.writer import Entry, JsonChannels, opaque_channel, protobuf_channel
+from congrasp.services.record.writer import Entry, JsonChannels, LogWriter, opaque_channel, protobuf_channel
 
 _OVERLAP = 0.4  # weight of a link on a vertex above which the triangle belongs to the link
 _MOST_FACES = 12_000  # triangles of a hand; meshes of links may have more
@@ -167,6 +169,19 @@ def check_episode(episode: Message) -> None:
     arm_of_episode(episode)
     if sum(name.startswith(_OPEN) for name in episode.arrays) > _ARRAYS:
         raise CongraspError(f"The episode has more than {_ARRAYS} rewards, errors and goal arrays.")
+
+
+def save_episode(path: pathlib.Path, actor: str, episode: Message) -> None:
+    """Writes an episode, under this name of an actor, as an MCAP file.
+
+    Raises:
+      CongraspError: the file cannot be written.
+    """
+    with os_errors_as(f"{path} could not be written"):
+        writer = LogWriter(path.parent, f".{path.stem}", run=str(episode.meta["object"]))
+        writer.write(*episode_entries(actor, episode, time.time_ns(), 0, JsonChannels()))
+        writer.close()
+        writer.files[-1].rename(path)
 
 
 def episode_entries(actor: str, episode: Message, start: int, slot: int, channels: JsonChannels) -> Iterator[Entry]:

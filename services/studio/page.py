@@ -31,8 +31,7 @@ from congrasp.services.export.motion_file import FORMATS, export_motions, motion
 from congrasp.services.grasp.approaches import surface_of
 from congrasp.services.record.episode import active_blocks, active_constraints, markers
 from congrasp.services.record.palette import painted
-from congrasp.services.record.scene import episode_entries
-from congrasp.services.record.writer import JsonChannels, LogWriter
+from congrasp.services.record.scene import save_episode
 from congrasp.services.studio.drawing import vector
 from congrasp.services.studio.server import Download
 from congrasp.services.studio.state import Studio, tool_of
@@ -295,10 +294,7 @@ def data_file(episode: Message, key: str, kind: str) -> Download:
             if kind == "npz":
                 save_motion(path, motion_of_episode(episode))
             elif kind == "mcap":
-                writer = LogWriter(pathlib.Path(folder), "motion", run="studio")
-                writer.write(*episode_entries("studio", episode, 0, 0, JsonChannels()))
-                writer.close()
-                path = writer.files[0]
+                save_episode(path, "studio", episode)
             else:
                 export_motions([motion_of_episode(episode)], kind, path)
         except ModuleNotFoundError as error:
