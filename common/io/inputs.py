@@ -69,6 +69,15 @@ def safe_name(text: str) -> str:
     return safe or "object"
 
 
+def numbers_in(text: str) -> np.ndarray:
+    """(N,) the numbers of a user's text, separated by spaces or commas; none if a word is no finite number."""
+    try:
+        found = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        return np.zeros(0)
+    return found if np.isfinite(found).all() else np.zeros(0)
+
+
 def runs_back(times: np.ndarray) -> np.ndarray:
     """(T,) bool: where a clock (T,), in any unit, is earlier than before, by more than a tenth of its median step."""
     if len(times) < 2:

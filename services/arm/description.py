@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError, MissingPackageError
-from congrasp.common.io.inputs import read_npz
+from congrasp.common.io.inputs import numbers_in, read_npz
 from congrasp.services.assets.hands.compile import confined, robot_spec, robot_text
 
 SPEED = 3.14
@@ -214,11 +214,8 @@ def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
 def _speeds(path: pathlib.Path, joints: tuple[str, ...], text: str) -> np.ndarray:
     """(N,) speed limits: the given ones, those of a URDF, or `SPEED`."""
     if text:
-        try:
-            given = np.array([float(word) for word in text.split()])
-        except ValueError:
-            given = np.zeros(0)
-        if len(given) not in (1, len(joints)) or not (np.isfinite(given).all() and (given > 0).all()):
+        given = numbers_in(text)
+        if len(given) not in (1, len(joints)) or not (given > 0).all():
             raise CongraspError(f"--arm-speed is '{text}'.", f"Write one positive number, or {len(joints)}.")
         return np.broadcast_to(given, len(joints))
     stated = {}

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands.spec import Hand
+from congrasp.common.io.inputs import numbers_in
 from congrasp.common.objects.spec import GraspObject
 from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import arm_file, load_arm
@@ -303,7 +304,7 @@ class ArmPlanner:
         self._mount = default_mount(hand)
         if options.mount:
             given = _numbers("--mount", options.mount, "X Y Z ROLL PITCH YAW")
-            self._mount = Pose(np.array(given[:3]), Rotation.from_euler("xyz", given[3:], degrees=True))
+            self._mount = Pose(given[:3], Rotation.from_euler("xyz", given[3:], degrees=True))
         self._hand, self._seed = hand, seed
         self._robot: tuple[GraspObject, Robot] | None = None
         self.identity = (hashlib.sha256(file.read_bytes()).hexdigest(), dataclasses.astuple(options))
@@ -350,16 +351,13 @@ def _path(motion: GraspMotion, base: Pose) -> Path:
     )
 
 
-def _numbers(option: str, text: str, form: str) -> list[float]:
+def _numbers(option: str, text: str, form: str) -> np.ndarray:
     """Parses the numbers of an option, as many as its form has words.
 
     Raises:
       CongraspError: the text does not match the form.
     """
-    try:
-        found = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        found = []
-    if len(found) != len(form.split()) or not np.isfinite(found).all():
+    found = numbers_in(text)
+    if len(found) != len(form.split()):
         raise CongraspError(f"{option} is '{text}'.", f'Write "{form}" in metres and degrees.')
     return found

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.motors import coupled
 from congrasp.common.hands.spec import Hand
-from congrasp.common.io.inputs import read_json
+from congrasp.common.io.inputs import numbers_in, read_json
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
 from congrasp.common.rotations import continuous
@@ -137,11 +137,8 @@ def _direction(text: str, target: Target) -> np.ndarray:
 
 def _numbers(text: str, name: str) -> np.ndarray:
     """(3,) finite numbers."""
-    try:
-        values = np.array([float(word) for word in text.replace(",", " ").split()])
-    except ValueError:
-        values = np.zeros(0)
-    if values.shape != (3,) or not np.isfinite(values).all():
+    values = numbers_in(text)
+    if len(values) != 3:
         example = f'{name} "0 0 -1"' + (f" or {name} {ABOVE}" if name == "--heading" else "")
         raise CongraspError(f"{name} is '{text}', not 3 numbers.", f"Write for example {example}.")
     return values

@@ -11,6 +11,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
 from congrasp.common.hands.skin import MATERIALS, skin_of
 from congrasp.common.hands.spec import Hand
+from congrasp.common.io.inputs import numbers_in
 from congrasp.common.objects.spec import Colours
 from congrasp.common.task.constraints.base import Arrow, Ghost, Paint, Polyline
 from congrasp.common.wire.codec import Message
@@ -130,12 +131,9 @@ def view_of(text: str) -> View | None:
     """
     if not text:
         return None
-    try:
-        azimuth, elevation = map(float, text.replace(",", " ").split())
-        if abs(azimuth) <= 360 and -10 <= elevation <= 85:
-            return View(azimuth, elevation)
-    except ValueError:
-        pass
+    given = numbers_in(text).tolist()
+    if len(given) == 2 and abs(given[0]) <= 360 and -10 <= given[1] <= 85:
+        return View(*given)
     raise CongraspError(
         f"--camera is '{text}'.",
         'Write degrees around the table, from -360 to 360, and above it, from -10 to 85: --camera "120 25"',
