@@ -15,11 +15,11 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.io.journal import Journal
-from congrasp.common.transport.base import Transport
+from congrasp.common.transport.base import Closing, Transport
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message, SharedMessage, checksum
 
@@ -265,7 +265,7 @@ class Ticket(NamedTuple):
     """Policy version of the learner when it was granted."""
 
 
-class ActorLink:
+class ActorLink(Closing):
     """An actor's connection to its learner, for use by one thread."""
 
     def __init__(
@@ -443,12 +443,6 @@ class ActorLink:
         """Stops sending; rollouts without an outcome are abandoned. The transport stays open."""
         self._uploads.close()
         self._announcements.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _identity(self, ticket: str) -> dict[str, Any]:
         """Identity and ticket, as metadata entries of the actor's requests."""

@@ -79,7 +79,21 @@ class Subscription:
         self._on_close()
 
 
-class Transport(Protocol):
+class Closing(Protocol):
+    """A context that is closed at its end."""
+
+    def close(self) -> None:
+        """Closes it and all that it declared; may be called repeatedly."""
+        ...
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+class Transport(Closing, Protocol):
     """Endpoint of a process."""
 
     def serve(
@@ -134,13 +148,3 @@ class Transport(Protocol):
     def watch_alive(self, key_expression: str, on_change: Callable[[str, bool], None]) -> None:
         """Calls `on_change`, in a daemon thread, for each token that exists, appears or disappears."""
         ...
-
-    def close(self) -> None:
-        """Closes all declarations; may be called repeatedly."""
-        ...
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()

@@ -9,12 +9,13 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
+from congrasp.common.transport.base import Closing
 from congrasp.services.client.limits import Floor, JointLimits, Limiter, Speeds, as_numbers
 from congrasp.services.client.policy import Answer, Policy, State
 
@@ -81,7 +82,7 @@ class Command(NamedTuple):
     """The answer that it follows; None in the other modes."""
 
 
-class Guard:
+class Guard(Closing):
     """A policy whose answers reach a robot only within limits and while they are fresh.
 
     An answer is fresh if the state of its query is at most `stale` seconds old. While there is none, the last targets
@@ -223,12 +224,6 @@ class Guard:
     def close(self) -> None:
         """Ends the querying thread, and closes the policy."""
         self._asker.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _take(self, outcome: "_Outcome | None") -> None:
         """Accepts an answer if it is fresh and finite, and counts the outcome."""

@@ -7,7 +7,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from congrasp.common import mirror
 from congrasp.common.errors import LayoutError, RefusedError
 from congrasp.common.request import GraspRequest, Pose
 from congrasp.common.task.resting import resting_mean
+from congrasp.common.transport.base import Closing
 from congrasp.common.wire.codec import Message
 
 State = Mapping[str, np.ndarray]
@@ -52,7 +53,7 @@ class Answer(NamedTuple):
     """Part of it that the policy's process took: checks, queue and inference."""
 
 
-class Policy(Protocol):
+class Policy(Closing, Protocol):
     """Joint targets for one hand and object, one control step after the other.
 
     It remembers the start of the episode and the previous targets. `PolicyClient` queries a server, `LocalPolicy`
@@ -124,12 +125,6 @@ class Policy(Protocol):
     def close(self) -> None:
         """Ends the connection, if there is one."""
         ...
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
 
 class EpisodePolicy(Policy):

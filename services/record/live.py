@@ -16,6 +16,7 @@ import urllib.parse
 from typing import Any
 
 from congrasp.common.errors import PORT_ERRORS, need_package, os_errors_as
+from congrasp.common.transport.base import Closing
 from congrasp.services.record.writer import Channel, Entry
 
 _HOST, _LOOPBACK = "127.0.0.1", ("127.0.0.1", "localhost", "::1")
@@ -27,7 +28,7 @@ _TOPICS = 4096  # open channels; beyond this the one that was silent for longest
 _KEPT = 64 << 20  # bytes of latched messages kept for late subscribers
 
 
-class LiveServer:
+class LiveServer(Closing):
     """A WebSocket server; a sink of `services.record.recorder.Recorder`.
 
     An episode arrives as a whole after its end; its entries are sent at their times, so that the viewer plays it. A
@@ -93,14 +94,6 @@ class LiveServer:
         self._thread.join(timeout)
         self._gate.close()
         self._server.stop()
-
-    def __enter__(self) -> "LiveServer":
-        """Returns the server."""
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        """Closes."""
-        self.close()
 
     def _work(self) -> None:
         """Sends entries at their times, and latched ones to new subscribers."""
