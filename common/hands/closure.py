@@ -5,7 +5,6 @@ a pose is the free space between the skins of the thumb's and the nearest other 
 The outline of a hand is its extent around its centre in a few of these poses.
 """
 
-import concurrent.futures
 import functools
 from typing import NamedTuple
 
@@ -46,9 +45,7 @@ def preshape(hand: Hand, width: Array, margin: Array | float = MARGIN) -> Array:
 @functools.cache
 def table_of_gaps(hand: Hand) -> np.ndarray:
     """Gaps (S,) in metres at `CLOSURES`, made strictly decreasing where the hand's are not."""
-    # In a separate thread nothing is being traced; inside a trace, there would be no numbers.
-    with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        gaps = np.asarray(thread.submit(_least_gaps, hand, CLOSURES.astype(np.float32)).result(), np.float64)
+    gaps = np.asarray(kinematics.untraced(_least_gaps, hand, CLOSURES.astype(np.float32)), np.float64)
     return np.minimum.accumulate(gaps) - 1e-6 * np.arange(len(gaps))
 
 
@@ -57,8 +54,7 @@ def wide_angles(hand: Hand) -> np.ndarray:
     """Finger angles (F,) of the hand's widest pose, computed if the hand's data has none."""
     if hand.wide_pose is not None:
         return hand.posed(hand.wide_pose)
-    with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        return hand.posed(thread.submit(widest_pose, hand).result())
+    return hand.posed(kinematics.untraced(widest_pose, hand))
 
 
 def widest_gap(hand: Hand) -> float:
@@ -139,9 +135,7 @@ def outline(hand: Hand) -> Outline:
     """Returns the hand's capsules in the poses of `CLOSURES`."""
     frame = kinematics.grasp_frame(hand)
     axes = np.stack([frame.heading, frame.cross, np.cross(frame.heading, frame.cross)])
-    # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
-    with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        posed = thread.submit(_posed, hand, CLOSURES.astype(np.float32)).result()
+    posed = kinematics.untraced(_posed, hand, CLOSURES.astype(np.float32))
     ends, center = (np.asarray(part, np.float64) for part in posed)
     radii = np.repeat(hand.capsule_radii, 2).astype(np.float64)
     return Outline((ends - center[:, None]) @ axes.T, radii, table_of_gaps(hand))

@@ -6,7 +6,8 @@ Everything is in the wrist frame. A link's frame at zero has the wrist frame's o
 
 import concurrent.futures
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,8 @@ import numpy as np
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand, link_origin
 from congrasp.common.task.types import Array
+
+T = TypeVar("T")
 
 
 class _Chain(NamedTuple):
@@ -128,12 +131,16 @@ def _points(hand: Hand, q: Array) -> Array:
     return keypoints(hand, link_transforms(hand, q))
 
 
+def untraced(function: Callable[..., T], *arguments: Any) -> T:
+    """The result of a function; inside a trace, it has numbers, and is not compiled operation by operation."""
+    with concurrent.futures.ThreadPoolExecutor(1) as thread:  # in another thread nothing is being traced
+        return thread.submit(function, *arguments).result()
+
+
 @functools.cache
 def grasp_frame(hand: Hand) -> GraspFrame:
     """The grasp frame of the open hand; v is the direction from the wrist to the centre, made orthogonal to w."""
-    # In a separate thread nothing is being traced; inside a trace, this would compile operation by operation.
-    with concurrent.futures.ThreadPoolExecutor(1) as thread:
-        points = thread.submit(lambda: np.asarray(_points(hand, np.array(hand.q_open, np.float32)))).result()
+    points = np.asarray(untraced(_points, hand, np.array(hand.q_open, np.float32)))
     tips = points[len(hand.links) :]
     center = 0.5 * (tips[0] + tips[1:].mean(0))
     across = tips[1:].mean(0) - tips[0]
