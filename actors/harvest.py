@@ -139,7 +139,6 @@ def save_references(path: pathlib.Path, bank: ConstraintBank) -> None:
     arrays = {name: np.asarray(getattr(bank, name), np.float16) for name in _POSES}
     arrays["grasps"] = np.asarray(bank.grasps)
     with contextlib.suppress(CongraspError, OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, encode(Message(arrays, {"objects": _digest(bank)})))
 
 

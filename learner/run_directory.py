@@ -63,7 +63,6 @@ def create_run(run_dir: pathlib.Path, config: RunConfig, initial: PolicyBundle |
     if initial is not None:
         spec = bundles.policy_spec(config.task, config.network)
         begun = bundles.with_inputs_of(spec, config.task, initial)
-        run_dir.mkdir(parents=True, exist_ok=True)
         bundles.save(begun, run_dir / INITIAL_FILE)
     write_atomically(run_dir / CONFIG_FILE, to_json(config).encode())
     (run_dir / LOGS).mkdir(exist_ok=True)

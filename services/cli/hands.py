@@ -137,7 +137,6 @@ def _keep(proposal: "Proposal", out: pathlib.Path | None, png: pathlib.Path | No
     path = out or hands_folder() / f"{hand.name}{SUFFIX}"
     if path.exists():
         say(f"The file {path} of an earlier import is replaced (--name or --out keeps it).")
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, hand_text(hand).encode())
     save_meshes(path, proposal.meshes)
     get_hand.cache_clear()

@@ -89,7 +89,6 @@ def train_hand(request: Request, note: Callable[[str], None]) -> pathlib.Path:
 def _begin(request: Request) -> None:
     """Creates the folder for this hand; raises a CongraspError if it holds the training of another."""
     file, text = request.out / HAND, hand_text(request.hand).encode()
-    request.out.mkdir(parents=True, exist_ok=True)
     if file.exists() and file.read_bytes() == text:
         return
     if any(request.out.glob(f"*/{CONFIG_FILE}")):
@@ -147,7 +146,6 @@ def _install(request: Request, policy: pathlib.Path, note: Callable[[str], None]
         if there.spec.hand == hand.reference and there.transitions > fresh.transitions:
             note(f"{own} has more training ({there.transitions:,} steps) and remains; this one is --policy {policy}.")
             return
-    own.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(own, policy.read_bytes())
     note(f"The policy of --hand {hand.name} is {own}.")
 
