@@ -80,31 +80,23 @@ def find(folder: pathlib.Path, role: str) -> Credentials:
     if not (folder / CERTIFICATE_FILE).exists() and (folder / f"{role}.0").exists():
         folder = folder / f"{role}.0"
     credentials = Credentials(folder, role)
+    authority = folder.parent if folder.name.partition(".")[0] in ROLES else folder
+    remedy = f"Run: congrasp certs issue {authority} --role {role}"
     for path in (credentials.ca, credentials.certificate, credentials.key):
         if not os.access(path, os.R_OK):
-            raise CongraspError(f"{path} is missing or cannot be read.", f"Run: {_hint(folder, role)}")
+            raise CongraspError(f"{path} is missing or cannot be read.", remedy)
     certificate = read(credentials.certificate)
     actual = certificate.identity.role if certificate.identity else "ca"
     if actual != role:
-        raise CongraspError(
-            f"{credentials.certificate} has the role {actual}, not {role}.", f"Run: {_hint(folder, role)}"
-        )
+        raise CongraspError(f"{credentials.certificate} has the role {actual}, not {role}.", remedy)
     for expires, path in (
         (certificate.expires, credentials.certificate),
         (read(credentials.ca).expires, credentials.ca),
     ):
         if expires <= datetime.datetime.now(datetime.UTC):
-            raise CongraspError(f"{path} expired on {expires:%Y-%m-%d %H:%M} UTC.", f"Run: {_hint(folder, role)}")
+            raise CongraspError(f"{path} expired on {expires:%Y-%m-%d %H:%M} UTC.", remedy)
     try:
         ssl.create_default_context().load_cert_chain(credentials.certificate, credentials.key)
     except (ssl.SSLError, OSError):
-        raise CongraspError(
-            f"{credentials.key} is not the key of {credentials.certificate}.", f"Run: {_hint(folder, role)}"
-        ) from None
+        raise CongraspError(f"{credentials.key} is not the key of {credentials.certificate}.", remedy) from None
     return credentials
-
-
-def _hint(folder: pathlib.Path, role: str) -> str:
-    """Command that creates the missing file."""
-    where = folder.parent if folder.name.partition(".")[0] in ROLES else folder
-    return f"congrasp certs issue {where} --role {role}"

@@ -25,7 +25,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name
-from congrasp.common.transport.base import Transport
+from congrasp.common.transport.base import Closing, Transport
 from congrasp.common.transport.keys import Keys, check_name
 from congrasp.common.wire.codec import Message, encode, finite
 from congrasp.common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
@@ -220,7 +220,7 @@ class Sink(Protocol):
         """Accepts an entry; must not block."""
 
 
-class Recorder:
+class Recorder(Closing):
     """Subscribes to a run's logs and writes them to MCAP files.
 
     Attributes:
@@ -289,10 +289,6 @@ class Recorder:
     def __enter__(self) -> "Recorder":
         """Starts."""
         return self.start()
-
-    def __exit__(self, *exc: object) -> None:
-        """Closes."""
-        self.close()
 
     def _work(self) -> None:
         """Receives, writes and flushes until it is stopped."""
