@@ -78,6 +78,16 @@ def account(key: str) -> str:
     return before + slash + name.partition(".")[0]
 
 
+class _Fixed:
+    """A key of a run that holds no name."""
+
+    def __init__(self, *parts: str):
+        self._parts = parts
+
+    def __get__(self, keys: "Keys", owner: type) -> str:
+        return keys._key(*self._parts)
+
+
 @dataclasses.dataclass(frozen=True)
 class Keys:
     """The keys of one run."""
@@ -91,76 +101,54 @@ class Keys:
     def _key(self, *parts: str) -> str:
         return "/".join((ROOT, self.run, *parts))
 
-    @property
-    def config(self) -> str:
-        """Query: the run's configuration."""
-        return self._key("config")
+    config = _Fixed("config")
+    """Query: the run's configuration."""
 
-    @property
-    def tickets(self) -> str:
-        """Expression of the keys under which actors request a ticket for a rollout."""
-        return self._key("ticket", "*")
+    tickets = _Fixed("ticket", "*")
+    """Expression of the keys under which actors request a ticket for a rollout."""
 
     def ticket(self, actor: str) -> str:
         """Query: a ticket for a rollout of an actor."""
         return self._key("ticket", check_name("actor", actor))
 
-    @property
-    def rollouts(self) -> str:
-        """Expression of the keys under which actors send rollouts."""
-        return self._key("rollout", "*")
+    rollouts = _Fixed("rollout", "*")
+    """Expression of the keys under which actors send rollouts."""
 
     def rollout(self, actor: str) -> str:
         """Query: sends a rollout of an actor and returns the acknowledgement."""
         return self._key("rollout", check_name("actor", actor))
 
-    @property
-    def weights(self) -> str:
-        """Query: the latest policy bundle, for a peer without a name."""
-        return self._key("weights", "latest")
+    weights = _Fixed("weights", "latest")
+    """Query: the latest policy bundle, for a peer without a name."""
 
     def weights_for(self, role: str, name: str) -> str:
         """Query: the latest policy bundle, for an actor or a policy server of this name."""
         return self._key("weights", "latest", check_name("role", role), check_name(role, name))
 
-    @property
-    def announcement(self) -> str:
-        """Publication: a new policy version is available."""
-        return self._key("weights", "announce")
+    announcement = _Fixed("weights", "announce")
+    """Publication: a new policy version is available."""
 
-    @property
-    def status(self) -> str:
-        """Query: roles, versions, rates and counters."""
-        return self._key("status")
+    status = _Fixed("status")
+    """Query: roles, versions, rates and counters."""
 
-    @property
-    def act(self) -> str:
-        """Query: an action of the current policy, for a client without a name."""
-        return self._key("policy", "act")
+    act = _Fixed("policy", "act")
+    """Query: an action of the current policy, for a client without a name."""
 
     def act_for(self, client: str) -> str:
         """Query: an action of the current policy, for a client of this name."""
         return self._key("policy", "act", check_name("client", client))
 
-    @property
-    def health(self) -> str:
-        """Query: readiness of the policy server."""
-        return self._key("policy", "health")
+    health = _Fixed("policy", "health")
+    """Query: readiness of the policy server."""
 
-    @property
-    def logs(self) -> str:
-        """Expression of all publications for logs."""
-        return self._key("log", "**")
+    logs = _Fixed("log", "**")
+    """Expression of all publications for logs."""
 
-    @property
-    def learner_metrics(self) -> str:
-        """Expression of the learner's metrics."""
-        return self._key("log", "metrics", "learner", "*")
+    learner_metrics = _Fixed("log", "metrics", "learner", "*")
+    """Expression of the learner's metrics."""
 
-    @property
-    def everyone(self) -> str:
-        """Expression of all liveliness tokens."""
-        return self._key("alive", "*", "*", "*")
+    everyone = _Fixed("alive", "*", "*", "*")
+    """Expression of all liveliness tokens."""
 
     def alive(self, role: str, name: str, incarnation: str) -> str:
         """Liveliness token of one start of one process."""
