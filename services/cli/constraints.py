@@ -192,7 +192,6 @@ class Import:
 
 def _print_report(report: "Report", hand: str, out: pathlib.Path, objects: pathlib.Path) -> None:
     """Prints what was kept, what each rule dropped, and the locations of the results."""
-
     kept, dropped = report.kept, report.dropped
     say(f"{len(kept)} of {len(kept) + len(dropped)} sequences kept.")
     if dropped:

@@ -153,7 +153,6 @@ class Evaluate:
 
     def _show(self, results: Sequence[tables.Found], lineup: Lineup, engine: str) -> None:
         """Prints the tables, the effect of the rules for headings, the references' source, and skipped rows."""
-
         console, rows = Console(highlight=False, width=None if sys.stdout.isatty() else 160), _rows(results)
         where = f"{lineup.objects(self.objects, self.exam)}, {engine_title(engine)}, friction {self.friction:g}"
         what = f"{lineup.title}, on {where}"
@@ -167,7 +166,6 @@ class Evaluate:
 
     def _write(self, results: Sequence[tables.Found], lineup: Lineup, engine: str) -> None:
         """Writes the rows, with policies, settings and provenance, to the JSON file."""
-
         policies = [facts(one) for one, _ in lineup.entrants]
         rules = {
             one.hand: dataclasses.asdict(found.heading_rules)

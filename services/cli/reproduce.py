@@ -68,7 +68,6 @@ class Reproduce:
 
     def __call__(self) -> int:
         """Trains, evaluates, and prints a summary."""
-
         in_range(0, episodes=self.episodes, pool=self.pool)
         in_range(1, patience=self.patience)
         chosen, compared = tuple(dict.fromkeys(self.hands)) or tuple(pretrained_hands()), self.methods or BASELINES
@@ -106,7 +105,6 @@ class Reproduce:
 
 def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
     """Raises a CongraspError for an unknown hand or method."""
-
     for name in hands:
         if get_hand(name).name != name:
             raise CongraspError(f"'{name[:60]}' is no hand's name.", "Choose from 'congrasp hands list'.")
@@ -116,7 +114,6 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
 
 def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[RequiredPolicy, Entrant]:
     """Policies by hand and method; raises a CongraspError for one that no table needs."""
-
     found = {RequiredPolicy(one.hand, one.method): one for one in read_entrants(texts)}
     for policy, one in found.items():
         if policy not in needed:
@@ -129,7 +126,6 @@ def _given(texts: tuple[str, ...], needed: list[RequiredPolicy]) -> dict[Require
 
 def _check_device(wanted: list[str]) -> None:
     """Raises a CongraspError if policies must be trained and there is no GPU."""
-
     if wanted and processes.accelerators()[0] == "cpu":
         raise CongraspError(
             f"{', '.join(wanted)} must be trained first, and this machine has no GPU.",

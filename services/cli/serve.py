@@ -46,7 +46,6 @@ class Serve:
 
     def __call__(self) -> int:
         """Serves until a signal."""
-
         starting = contextlib.ExitStack()
         starting.enter_context(announced("Loading and compiling the policy"))
         # Waking a thread costs more than it saves in one policy's inference: no pool (JAX reads it when it starts) ...
