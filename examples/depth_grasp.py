@@ -35,7 +35,7 @@ SCENE = """<mujoco><worldbody><geom type="plane" size="2 2 .1"/>
 class Arguments:
     """Image, camera and grasp."""
 
-    policy: str = "allegro-camera"
+    policy: str = "human-camera"
     """A policy trained with --method camera: a file, or the name of a pretrained one."""
     depth: pathlib.Path | None = None
     """Depth along the optical axis: PNG, mm, or NPY, m; zero or not finite where there is none."""
@@ -125,7 +125,11 @@ def main(arguments: Arguments) -> None:
         hand, q, u = get_hand(described["hand"]), np.asarray(described["open_pose"]), np.zeros(6)
         aligned, turn = heading_wrist_pose(hand, HeadingGoal(**heading), grasp_frame(hand).center)
         wrist = np.asarray(aligned) - arguments.back_off * direction, np.asarray(turn)
-        policy.reset(congrasp.GraspRequest({"heading": heading}, cloud=cloud, q=q, wrist=wrist))
+        policy.reset(
+            congrasp.GraspRequest(
+                {"heading": heading}, cloud=cloud, camera=np.asarray(arguments.camera[:3]), q=q, wrist=wrist
+            )
+        )
         rows = []
         for step in range(arguments.steps):
             answer = policy.act({"q": q, "u": u, "table": step < described["approach_steps"]})

@@ -29,13 +29,14 @@ class Eye:
     Everything is in the frame that rises with the hand; until the lift that is the world frame.
     """
 
-    def __init__(self, hand: Hand, count: int, box: str):
+    def __init__(self, hand: Hand, count: int, box: str, world: str):
         """Reads the box.
 
         Args:
           hand: the hand, whose points are removed from the clouds.
           count: number of points that the policy observes.
           box: X Y Z DX DY DZ: middle and sides of the box in which the object is, m.
+          world: name of the world frame; clouds in it do not say where the camera is.
 
         Raises:
           CongraspError: the box is no six numbers, or a side is not positive.
@@ -50,10 +51,12 @@ class Eye:
             )
         self._low, self._high = middle - sides / 2, middle + sides / 2
         self._low[2] = max(self._low[2], FLOOR)
-        self._hand, self._count = hand, count
+        self._hand, self._count, self._world = hand, count, world
         self._last: Any = None
         self.points: np.ndarray | None = None
         """(count, 3) m; None until an object was seen."""
+        self.camera: dict[str, np.ndarray] = {}
+        """Its position, m, when it saw them, as the field `camera_position` of a query; none if it is unknown."""
         self.seen = ""
         """Text that counts the newest cloud's points on the object."""
 
@@ -76,6 +79,7 @@ class Eye:
         self.seen = f"{len(points)} of {len(everything)} points in --box above the table, and none of the hand's"
         if len(points) >= _FEWEST:
             self.points = points[np.arange(self._count) * len(points) // self._count]
+            self.camera = {} if message.header.frame_id == self._world else {"camera_position": camera.position}
 
     def _on_hand(self, points: np.ndarray, palm: Pose, q: np.ndarray) -> np.ndarray:
         """(N,) true for points (N, 3) that belong to the hand."""

@@ -176,14 +176,15 @@ class Pictured:
         self._sensors.unseen = self._eye.seen if points is None else ""
         if frame is None or points is None:
             return {"cloud": np.full((1, 3), np.nan)}
-        return {"cloud": points} | ({"surface_avoid": labelled(points, *self._first)} if self._first else {})
+        avoid = {"surface_avoid": labelled(points, *self._first)} if self._first else {}
+        return {"cloud": points, **self._eye.camera, **avoid}
 
     def request(self, fields: dict[str, np.ndarray]) -> congrasp.GraspRequest:
         """See `Target.request`."""
         points = fields["cloud"]
         request = self._read(seen_object(points), points.mean(0))
         self._first = None if request.avoid is None else (points, request.avoid)
-        return dataclasses.replace(request, cloud=points)
+        return dataclasses.replace(request, cloud=points, camera=fields.get("camera_position"))
 
 
 class PolicyNode:
@@ -325,7 +326,7 @@ def target_of(arguments: Arguments, sensors: Sensors, hand: Hand, described: dic
         return dataclasses.replace(request, constraints={**request.constraints, "heading": heading})
 
     if camera:
-        return Pictured(sensors, Eye(hand, described["surface_points"], arguments.box), read)
+        return Pictured(sensors, Eye(hand, described["surface_points"], arguments.box, arguments.world), read)
     obj = find_object(arguments.object)
     request = dataclasses.replace(read(obj, np.zeros(3)), surface=obj.points)
     return Tracked(sensors, request, np.asarray(obj.origin))

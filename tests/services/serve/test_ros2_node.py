@@ -498,6 +498,7 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
         np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
         np.testing.assert_allclose(policy.state["cloud"], expected, atol=1e-6)
         assert policy.request.surface is None and policy.request.object_pose is None
+        np.testing.assert_allclose([policy.request.camera, policy.state["camera_position"]], [CAMERA] * 2)
         heading = policy.request.constraints["heading"]
         middle = expected.mean(0)
         top = expected[np.linalg.norm((expected - middle)[:, :2], axis=1) < 0.01, 2].max()
@@ -508,6 +509,13 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
         bus.said = camera_says(cloud_of(points - off))
         eventually(lambda: (node.step() or Fields(mode="")).mode == "follow")
         np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
+        np.testing.assert_allclose(policy.request.camera, CAMERA + off)
+    with camera_node(example, bus) as (node, policy):  # a cloud in the world's frame does not say where the camera is
+        bus.said = camera_says(cloud_of(CAMERA + CAMERA_TURN.apply(points)))
+        bus.said[-1][1].header.frame_id = "world"
+        eventually(lambda: (node.step() or Fields(mode="")).mode == "follow")
+        np.testing.assert_allclose(policy.request.cloud, expected, atol=1e-6)
+        assert policy.request.camera is None and "camera_position" not in policy.state
 
 
 def test_a_cloud_is_read_as_it_comes_over_either_bus(example):
