@@ -26,8 +26,9 @@ _UNIT = re.compile(r" ?[\[(]([^][()]*)[])]")
 _LETTERED = re.compile(r"([wxyz]) *(?:\[([^][]*)\]|_(m|mm|cm|in))?$")  # letter and unit at the end of a column's name
 _SEPARATOR = re.compile(r"[\W_]+")
 _NO_PLACE = re.compile(
-    r"(?:.* )?(?:[vawfnre]|(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*)"
-)
+    r"(?!p(?: [a-z]{1,2})+$)(?:[vawb](?: (?![pt]\b)[a-z]{1,2})+|(?:.* )?(?:[vawfnre]|"
+    r"(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*))"
+)  # a symbol with frames, as p_RS_R of EuRoC, has its kind first
 _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.*")  # first word without a body
 _TIME = re.compile(
     r"(?:.*[.%])?(?:t|time|(?:time[_ ]?)?stamp|secs?|seconds?)(?: ?\[.*|[_ ](?:[mnuµ]?s|secs?|seconds?))?"
