@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import os
 import pathlib
 import re
 import stat
@@ -285,7 +286,13 @@ def _rejected(spec: mujoco.MjSpec, error: str) -> tuple[Any, str, str]:
         assets = (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)
         files = {name: asset for asset in assets for name in (asset.file, *getattr(asset, "cubefiles", ())) if name}
         if same := [name for name in files if pathlib.PurePath(name).name == pathlib.PurePath(opened[1]).name]:
-            name = max(same, key=lambda name: (opened[1].endswith(name), len(name)))  # folders may have equal names
+
+            def likeness(name: str) -> tuple[bool, bool, int]:  # folders may have equal names
+                folder = spec.texturedir if isinstance(files[name], mujoco.MjsTexture) else spec.meshdir
+                whole = os.path.normpath(os.path.join(folder, name)) == opened[1]
+                return whole, opened[1].endswith(name), len(name)
+
+            name = max(same, key=likeness)
             return files[name], "not found", name
     mesh = next((mesh for mesh in spec.meshes if error.endswith(mesh.info)), None)
     why = next(why for pattern, why in _REASONS.items() if re.search(pattern, error.partition("\n")[0]))
