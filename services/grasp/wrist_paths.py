@@ -101,7 +101,9 @@ def read_bvh(path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, floa
     try:
         return _bvh(read_file(path, _LARGEST, "Cut it into shorter ones.").decode(), path, joint)
     except (ValueError, LookupError, StopIteration) as error:
-        raise CongraspError(f"{path} cannot be read as BVH: {str(error)[:200]}.", "Export it again.") from None
+        raise CongraspError(
+            f"{path} cannot be read as BVH: {str(error)[:200] or 'it was cut'}.", "Export it again."
+        ) from None
 
 
 def _bvh(text: str, path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, float]:
@@ -124,6 +126,8 @@ def _bvh(text: str, path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotatio
             if channel.endswith("position"):
                 # A position takes the place of the offset, as most programs read it.
                 moved[:, "XYZ".index(axis)] = column
+            elif not channel.endswith("rotation"):
+                raise ValueError(f"it has the channel {channel[:30]}")
             else:
                 turn = turn * Rotation.from_euler(axis, column[:, None], degrees=True)
         position = position + rotation.apply(moved)
@@ -157,10 +161,10 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
             channels = [next(tokens) for _ in range(int(next(tokens)))]
             stack[-1] = (stack[-1][0], channels, column)
             column += len(channels)
-            if name == joint:
-                found = list(stack)
         elif token == "}":
             stack.pop()
+        if name == joint and token in ("OFFSET", "CHANNELS"):
+            found = list(stack)
     return found, column, names
 
 

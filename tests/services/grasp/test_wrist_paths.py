@@ -261,6 +261,24 @@ def test_another_wrist_frame_is_converted(tmp_path):
     check(read_wrist_path(tmp_path / "a.npz", fingers="+x", back="+y"))
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [("Xrotation", "Xscale", "it has the channel Xscale"), ("CHANNELS 6", "CHANNELS 999", "it was cut")],
+)
+def test_a_skeleton_that_could_be_misread_is_refused(tmp_path, old, new, complaint):
+    file = bvh(tmp_path / "motion.bvh")
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(CongraspError, match=rf"cannot be read as BVH: {complaint}"):
+        read_bvh(file, "Hand")
+
+
+def test_a_joint_without_channels_moves_with_its_parents(tmp_path):
+    file = bvh(tmp_path / "motion.bvh")
+    lines = file.read_text().replace("    JOINT Hand", "    JOINT Held\n{\nOFFSET 1 0 0\n}\nJOINT Hand")
+    file.write_text(lines)
+    np.testing.assert_allclose(read_bvh(file, "Held")[1].as_matrix(), read_bvh(file, "Arm")[1].as_matrix())
+
+
 def test_unreadable_files_are_errors(tmp_path):
     file = bvh(tmp_path / "motion.bvh")
     with pytest.raises(CongraspError, match="no joint 'RightHand'"):
