@@ -127,6 +127,13 @@ def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words, monkeypatch
     is_one_line(end.value.code, capfd.readouterr().err, words)
 
 
+@pytest.mark.parametrize("out", ["link", "link/grasps"])
+def test_an_output_behind_a_link_to_nothing_is_refused(tmp_path, out):
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    with pytest.raises(CongraspError, match="link is a file or a link to nothing"):
+        cli.run(["objects", "generate", "--out", str(tmp_path / out)])
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
