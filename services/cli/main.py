@@ -169,6 +169,8 @@ def _check_files(arguments: Sequence[str]) -> None:
         if argument.startswith("-"):
             option = argument
             continue
+        if not argument and (not option or option in _WRITTEN):  # as of a variable that is not set
+            raise CongraspError(f"{option or 'An argument'} is empty.", "Name a file or a folder.")
         path = pathlib.Path(re.sub(r":\w+$", "", argument))
         if path.suffix.lower() not in _READ or option in _WRITTEN or _is_there(path):
             continue

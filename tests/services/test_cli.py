@@ -93,6 +93,8 @@ def test_help_names_every_command_and_every_command_exists():
         (["train", "--objects.seed", "9" * 23], "--objects.seed: a seed is a whole number"),
         (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It must be from 1 to 1024"),
         (["grasp"], "nothing to grasp"),
+        (["grasp", ""], "An argument is empty"),
+        (["grasp", "mug:7", "--out", ""], "--out is empty"),
         (["grasp", "mug:7", "--approach", "-1"], "--approach is -1.0. It must be from 0 to"),
         (["grasp", "mug:7", "--approach", "11"], "--approach is 11.0. It must be from 0 to"),
         (["grasp", "mug:7", "--lift", "0.6"], "--lift is 0.6. It must be from 0 to"),
