@@ -225,11 +225,12 @@ def _foreign(text: bytes, data: bytes) -> tuple[str, str] | None:
         except (OSError, zipfile.BadZipFile):
             return "a zip archive that is damaged", "Download it again."
         inside = "".join(f"{name}\n" for name in names).lower().encode()
-    for row in tomllib.loads(_FOREIGN.read_text())["format"]:
+    groups = tomllib.loads(_FOREIGN.read_text())["group"]
+    for remedy, row in ((group["remedy"], row) for group in groups for row in group["files"]):
         begins = tuple(beginning.encode("latin-1") for beginning in row["begins"])
         holds = row.get("holds", [""])
         if (text.startswith(begins) or text.lower().startswith(begins)) and any(x.encode() in inside for x in holds):
-            return row["what"], row["remedy"]
+            return row["what"], remedy
     if meshes := [name for name in names if name.lower().endswith(SUFFIXES)]:
         return f"a zip archive with {', '.join(meshes[:3])}{' …' if len(meshes) > 3 else ''} in it", _UNPACK
     return ("a zip archive without a mesh in it", CONVERT) if zipped else None
