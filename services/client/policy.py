@@ -31,7 +31,7 @@ _POINTS = ("cloud", "surface_points", "surface_avoid", "surface_normals")
 NORMALS, CAMERA = "surface_normals", "camera_position"
 """Names of the normals at the points of a query, and of the position of the camera."""
 _SIZE, _TURN = 1.0, 2 * math.pi  # m, median deviation of points; rad
-_ANGLES = re.compile(r"(?:\w+_)?q(?:_initial|_target)?")
+_ANGLES = re.compile(r"(?:\w+_)?q(?:_initial|_target)?|u")  # of u, the last three
 _LONGEST = 64  # largest history of a policy, control steps
 
 
@@ -353,7 +353,7 @@ def _checked(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         if (size := np.median(np.abs(points - np.median(points, 0)))) > _SIZE:
             raise RefusedError(f"The field '{name}' has half of its points beyond {size:.3g} m.", "Give it in metres.")
     for name in filter(_ANGLES.fullmatch, fields):
-        if (turn := np.abs(fields[name]).max(initial=0.0)) > _TURN:
+        if _TURN < (turn := np.abs(fields[name].ravel()[3 * (name == "u") :]).max(initial=0.0)) < math.inf:
             raise RefusedError(f"The field '{name}' has an angle of {turn:.4g}.", "Give it in radians.")
     return fields
 
