@@ -190,6 +190,20 @@ def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(error, lin
     assert capsys.readouterr().err.splitlines() == [f"congrasp: error: {line}"]
 
 
+@pytest.mark.parametrize("name", ["JAX_PLATFORMS", "MUJOCO_GL", ""])
+def test_a_variable_at_which_a_library_fails_is_named(name, monkeypatch, capsys):
+    error = RuntimeError(f"invalid value for {name}") if name else AssertionError()  # as JAX, without a platform
+    error.add_note("For simplicity, JAX has removed its internal frames from the traceback.")
+    monkeypatch.setattr(cli, "run", mock.Mock(side_effect=error))
+    monkeypatch.delenv(name or "JAX_PLATFORMS", raising=False)
+    with pytest.raises(type(error)):
+        cli.main([])
+    monkeypatch.setenv(name or "JAX_PLATFORMS", "abacus")
+    with pytest.raises(SystemExit, match="2"):
+        cli.main([])
+    assert re.search(rf"{name} is 'abacus', which does not work here\. Correct or unset it", capsys.readouterr().err)
+
+
 @pytest.mark.parametrize(
     ("said", "what"),
     [
