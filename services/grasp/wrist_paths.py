@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import read_file, read_npz, runs_back
+from congrasp.common.io.inputs import check_arrays, read_file, read_npz, runs_back
 from congrasp.services.assets.objects.options import METRES
 
 _LARGEST, _DEEPEST = 32 << 20, 200
@@ -77,7 +77,6 @@ def read_wrist_path(
         position, rotation = _FROM_Y_UP.apply(position * _CM), _FROM_Y_UP * rotation
     elif kind in (".csv", ".npz"):
         position, quaternion = _npz(path) if kind == ".npz" else read_csv(path, _LARGEST)
-        _check(path, position, quaternion)
         seconds = 0.01
         rotation = Rotation.from_quat(quaternion, scalar_first=True)
     else:
@@ -327,23 +326,15 @@ def _number(word: str) -> float | None:
 
 
 def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and quaternions of an NPZ file."""
+    """Positions (T, 3) and unit quaternions (T, 4) of an NPZ file."""
     try:
         data = read_npz(path, remedy := "It needs 'position' and 'quaternion'.")
-        keys = ("wrist_position", "wrist_quaternion") if "wrist_position" in data else ("position", "quaternion")
-        position, quaternion = (data[key].astype(float) for key in keys)
+        prefix = "wrist_" if "wrist_position" in data else ""
+        meanings = {f"{prefix}position": "(T, 3) m", f"{prefix}quaternion": "(T, 4) w x y z"}
+        check_arrays(data, meanings, indices=(), largest=HUGE)
     except (KeyError, ValueError) as error:
         raise CongraspError(f"{path} cannot be read: {error}.", remedy) from None
+    position, quaternion = (data[name].astype(float) for name in meanings)
+    if np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > _UNIT_LENGTH:
+        raise CongraspError(f"{path} holds quaternions that are not of length one.", "Write w, x, y, z, of length one.")
     return position, quaternion
-
-
-def _check(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> None:
-    """Raises a CongraspError if a shape is wrong, a number is not finite, or a quaternion is not normalised."""
-    if position.ndim != 2 or position.shape[1:] != (3,) or quaternion.shape != (len(position), 4) or not len(position):
-        raise CongraspError(
-            f"{path} has positions {position.shape} and quaternions {quaternion.shape}.",
-            "A frame is x, y, z and a quaternion w, x, y, z.",
-        )
-    both = np.concatenate([position, quaternion], 1)
-    if not np.isfinite(both).all() or np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > _UNIT_LENGTH:
-        raise CongraspError(f"{path} holds numbers that are not finite, or quaternions that are not of length one.")
