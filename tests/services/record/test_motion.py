@@ -81,10 +81,7 @@ def test_arrays_that_are_not_known_are_left_alone(tmp_path):
 def test_the_file_alone_suffices_for_the_kinematics():
     motion = motion_of_episode(episode())
     q = motion.joint_position[-1]
-    turns, places = (
-        [],
-        [],
-    )  # of every link: x = turn x0 + place, for points x0 of the wrist frame with all joints at zero
+    turns, places = [], []  # of every link: x = turn x0 + place, for x0 of the wrist frame with all joints at zero
     for link, parent in enumerate(motion.link_parent):
         turn, place = (Rotation.identity(), np.zeros(3)) if parent < 0 else (turns[parent], places[parent])
         for j in np.flatnonzero(motion.joint_link == link):
