@@ -26,9 +26,10 @@ _UNIT = re.compile(r" ?[\[(]([^][()]*)[])]")
 _LETTERED = re.compile(r"([wxyz]) *(?:\[([^][]*)\]|_(m|mm|cm|in))?$")  # letter and unit at the end of a column's name
 _SEPARATOR = re.compile(r"[\W_]+")
 _NO_PLACE = re.compile(
-    r"(?!p(?: [a-z]{1,2})+$)(?:[vawb](?: (?![pt]\b)[a-z]{1,2})+|(?:.* )?(?:[vawfnre]|"
-    r"(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*))"
-)  # a symbol with frames, as p_RS_R of EuRoC, has its kind first
+    r"(?!p(?: [a-z]{1,2})+$)"  # a position between frames, as p_RS_R of EuRoC
+    r"(?:.* )?(?:[vawfnre]|(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*)"
+)
+_RATE = re.compile(r"[ /^]")  # in a unit, as of m s^-1
 _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.*")  # first word without a body
 _TIME = re.compile(
     r"(?:.*[.%])?(?:t|time|(?:time[_ ]?)?stamp|secs?|seconds?)(?: ?\[.*|[_ ](?:[mnuµ]?s|secs?|seconds?))?"
@@ -291,7 +292,8 @@ def _columns(names: list[str], *, titled: bool) -> tuple[list[int], int, float] 
         return None
     if titled and any(len(same) > 1 for same in groups.values()):
         raise ValueError("names columns twice below another line: it needs a header of one line")
-    places = [one for one in places if not _NO_PLACE.fullmatch(one[0])]
+    rates = [group for _, group in places if any(_RATE.search(unit) for _, unit in group.values())]
+    places = [one for one in places if not (_NO_PLACE.fullmatch(one[0]) or one[1] in rates)]
     if len(turns) == 1:
         turned = turns[0][0]
         shared = [_shared(name.split(), turned.split()) for name, _ in places]
