@@ -70,7 +70,6 @@ _LESS_MEMORY = (
 _NO_MEMORY = re.compile(
     r"(?:out[ _]of[ _]memory|failed to allocate (?:request for )?\d)[^[\n]*|RESOURCE_EXHAUSTED", re.IGNORECASE
 )
-_VARIABLE = re.compile(r"\b[A-Z]+_[A-Z\d_]+")
 _PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError, FileExistsError)
 _PATH_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP)
 
@@ -139,7 +138,7 @@ def _said_by(error: Exception) -> tuple[str, int]:
         # No bad input: a run restarts its processes, since another program may have held the memory.
         return f"The device's memory does not suffice: {max(found, key=len)}. {_LESS_MEMORY}", 1
     unnamed = isinstance(error, AssertionError) and "JAX" in str(getattr(error, "__notes__", ""))  # without a platform
-    for name in ["JAX_PLATFORMS"] * unnamed or _VARIABLE.findall(str(error)):
+    for name in ["JAX_PLATFORMS"] * unnamed or re.findall(r"\b[A-Z]+_[A-Z\d_]+", str(error)):
         if name in os.environ:
             return f"{name} is '{os.environ[name]}', which does not work here. Correct or unset it.", USAGE_ERROR
     raise error

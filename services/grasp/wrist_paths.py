@@ -29,7 +29,6 @@ _NO_PLACE = re.compile(
     r"(?!p(?: [a-z]{1,2})+$)"  # a position between frames, as p_RS_R of EuRoC
     r"(?:.* )?(?:[vawfnre]|(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*)"
 )
-_RATE = re.compile(r"[ /^]")  # in a unit, as of m s^-1
 _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.*")  # first word without a body
 _TIME = re.compile(
     r"(?:.*[.%])?(?:t|time|(?:time[_ ]?)?stamp|secs?|seconds?)(?: ?\[.*|[_ ](?:[mnuµ]?s|secs?|seconds?))?"
@@ -292,7 +291,7 @@ def _columns(names: list[str], *, titled: bool) -> tuple[list[int], int, float] 
         return None
     if titled and any(len(same) > 1 for same in groups.values()):
         raise ValueError("names columns twice below another line: it needs a header of one line")
-    rates = [group for _, group in places if any(_RATE.search(unit) for _, unit in group.values())]
+    rates = [group for _, group in places if any(set(unit) & set(" /^") for _, unit in group.values())]  # as m s^-1
     places = [one for one in places if not (_NO_PLACE.fullmatch(one[0]) or one[1] in rates)]
     if len(turns) == 1:
         turned = turns[0][0]

@@ -274,8 +274,7 @@ def test_a_skeleton_that_could_be_misread_is_refused(tmp_path, old, new, complai
 
 def test_a_joint_without_channels_moves_with_its_parents(tmp_path):
     file = bvh(tmp_path / "motion.bvh")
-    lines = file.read_text().replace("    JOINT Hand", "    JOINT Held\n{\nOFFSET 1 0 0\n}\nJOINT Hand")
-    file.write_text(lines)
+    file.write_text(file.read_text().replace("    JOINT Hand", "JOINT Held\n{\nOFFSET 1 0 0\n}\nJOINT Hand"))
     np.testing.assert_allclose(read_bvh(file, "Held")[1].as_matrix(), read_bvh(file, "Arm")[1].as_matrix())
 
 
