@@ -137,7 +137,8 @@ def _said_by(error: Exception) -> tuple[str, int]:
     if found := [text[0].strip(". ") for text in _NO_MEMORY.finditer(str(error))]:
         # No bad input: a run restarts its processes, since another program may have held the memory.
         return f"The device's memory does not suffice: {max(found, key=len)}. {_LESS_MEMORY}", 1
-    unnamed = isinstance(error, AssertionError) and "JAX" in str(getattr(error, "__notes__", ""))  # without a platform
+    unnamed = isinstance(error, AssertionError) and "JAX" in str(getattr(error, "__notes__", "")) and not str(error)
+    unnamed = unnamed and "cpu" not in os.environ.get("JAX_PLATFORMS", "cpu")  # none of JAX's platforms is there
     for name in ["JAX_PLATFORMS"] * unnamed or re.findall(r"\b[A-Z]+_[A-Z\d_]+", str(error)):
         if name in os.environ:
             return f"{name} is '{os.environ[name]}', which does not work here. Correct or unset it.", USAGE_ERROR

@@ -26,7 +26,7 @@ _UNIT = re.compile(r" ?[\[(]([^][()]*)[])]")
 _LETTERED = re.compile(r"([wxyz]) *(?:\[([^][]*)\]|_(m|mm|cm|in))?$")  # letter and unit at the end of a column's name
 _SEPARATOR = re.compile(r"[\W_]+")
 _NO_PLACE = re.compile(
-    r"(?!p(?: [a-z]{1,2})+$)"  # a position between frames, as p_RS_R of EuRoC
+    r"(?!p [a-z]?([a-z])[a-z]? \1$)"  # a position between two frames, in one of them, as p_RS_R of EuRoC
     r"(?:.* )?(?:[vawfnre]|(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*)"
 )
 _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.*")  # first word without a body
@@ -121,11 +121,11 @@ def _bvh(text: str, path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotatio
         moved = np.tile(offset, (len(rows), 1))
         turn = Rotation.identity(len(rows))
         for channel, column in zip(channels, values.T, strict=True):
-            axis = channel[0].upper()
-            if channel.endswith("position"):
+            axis, kind = channel[0].upper(), channel[1:].lower()
+            if kind == "position":
                 # A position takes the place of the offset, as most programs read it.
                 moved[:, "XYZ".index(axis)] = column
-            elif not channel.endswith("rotation"):
+            elif kind != "rotation":
                 raise ValueError(f"it has the channel {channel[:30]}")
             else:
                 turn = turn * Rotation.from_euler(axis, column[:, None], degrees=True)
@@ -149,7 +149,7 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
             name = next(tokens)
             names.append(name)
         elif token == "End":
-            name = next(tokens)
+            name = ""
         elif token == "{":
             stack.append((np.zeros(3), [], column))
             if len(stack) > _DEEPEST:
@@ -291,7 +291,7 @@ def _columns(names: list[str], *, titled: bool) -> tuple[list[int], int, float] 
         return None
     if titled and any(len(same) > 1 for same in groups.values()):
         raise ValueError("names columns twice below another line: it needs a header of one line")
-    rates = [group for _, group in places if any(set(unit) & set(" /^") for _, unit in group.values())]  # as m s^-1
+    rates = [group for _, group in places if any(set(unit) & set("/^") for _, unit in group.values())]  # as m s^-1
     places = [one for one in places if not (_NO_PLACE.fullmatch(one[0]) or one[1] in rates)]
     if len(turns) == 1:
         turned = turns[0][0]

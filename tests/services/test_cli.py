@@ -204,6 +204,15 @@ def test_a_variable_at_which_a_library_fails_is_named(name, monkeypatch, capsys)
     assert re.search(rf"{name} is 'abacus', which does not work here\. Correct or unset it", capsys.readouterr().err)
 
 
+def test_a_failed_assertion_of_a_traced_function_is_a_bug_where_the_cpu_is_a_platform(monkeypatch):
+    error = AssertionError()
+    error.add_note("For simplicity, JAX has removed its internal frames from the traceback.")
+    monkeypatch.setattr(cli, "run", mock.Mock(side_effect=error))
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    with pytest.raises(AssertionError):
+        cli.main([])
+
+
 @pytest.mark.parametrize(
     ("said", "what"),
     [

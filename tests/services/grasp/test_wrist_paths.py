@@ -67,9 +67,11 @@ def check(found):
 
 @pytest.mark.parametrize("order", ["".join(axes) for axes in itertools.permutations("XYZ")])
 def test_the_channels_of_a_skeleton_may_have_any_order(tmp_path, order):
-    found = read_wrist_path(bvh(tmp_path / "motion.bvh", order), joint="Hand")
+    found = read_wrist_path(file := bvh(tmp_path / "motion.bvh", order), joint="Hand")
     check(found)
     assert found.seconds == 0.02
+    file.write_text(file.read_text().replace("position", "POSITION").replace("rotation", "Rotation"))
+    check(read_wrist_path(file, joint="Hand"))
 
 
 def test_csv_and_npz_give_the_same_path(tmp_path):
@@ -102,6 +104,8 @@ ROS = "x,y,z,qx,qy,qz,qw"
         (ROS + ",vx,vy,vz", "pqp", ","),
         ("a title of the file\n" + ROS, "pq", ","),
         ("px,py,pz,vx,vy,vz,qx,qy,qz,qw", "pvq", ","),
+        ("p_x,p_y,p_z,p_v_x,p_v_y,p_v_z,qx,qy,qz,qw", "pvq", ","),
+        ("p_BW_W_x,p_BW_W_y,p_BW_W_z,p_BW_v_x,p_BW_v_y,p_BW_v_z,qx,qy,qz,qw", "pvq", ","),
         ("t,qx,qy,qz,qw,wx,wy,wz,px,py,pz", "tqvp", ","),
         (
             "twist.linear.x,twist.linear.y,twist.linear.z,pose.position.x,pose.position.y,pose.position.z,"
@@ -156,6 +160,8 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
     ("header", "complaint"),
     [
         ("vx,vy,vz,qx,qy,qz,qw", "no position"),
+        ("p_v_x,p_v_y,p_v_z,qx,qy,qz,qw", "no position"),
+        ("x [m map],y [m map],z [m map],goal_x,goal_y,goal_z,qx,qy,qz,qw", "several positions: x, y, z, goal"),
         ("x,y,z,q1,q2,q3,q4", "no quaternion"),
         ("#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]", "no quaternion"),
         ("x,y,z,roll,pitch,yaw,grip", "no quaternion"),
@@ -280,8 +286,9 @@ def test_a_joint_without_channels_moves_with_its_parents(tmp_path):
 
 def test_unreadable_files_are_errors(tmp_path):
     file = bvh(tmp_path / "motion.bvh")
-    with pytest.raises(CongraspError, match="no joint 'RightHand'"):
-        read_wrist_path(file)
+    for joint in ("RightHand", "Site"):
+        with pytest.raises(CongraspError, match=f"no joint '{joint}'"):
+            read_wrist_path(file, joint=joint)
     file.write_text(file.read_text()[:-200])
     with pytest.raises(CongraspError, match="cannot be read as BVH"):
         read_bvh(file, "Hand")
