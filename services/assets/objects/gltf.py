@@ -34,7 +34,7 @@ def packed(data: bytes) -> bytes:
       CongraspError: its buffers are other files; a predicate without a subject.
       ValueError: an embedded buffer is damaged.
     """
-    tree, binary, starts = json.loads(data), b"", list[int]()
+    tree, binary, starts = json.loads(data), bytearray(), list[int]()
     for buffer in _list(tree, "buffers"):
         head, mark, text = str(buffer.get("uri")).partition(";base64,")
         if not (mark and head.startswith("data:")):
@@ -45,7 +45,7 @@ def packed(data: bytes) -> bytes:
     for view in _list(tree, "bufferViews"):
         view["byteOffset"] = view.get("byteOffset", 0) + starts[view.get("buffer", 0)]
         view["buffer"] = 0
-    return _glb({**tree, "buffers": [{"byteLength": len(binary)}]}, binary)
+    return _glb({**tree, "buffers": [{"byteLength": len(binary)}]}, bytes(binary))
 
 
 def _glb(tree: dict[str, Any], binary: bytes) -> bytes:
