@@ -162,8 +162,8 @@ def faults(hand: Hand) -> list[str]:
         found.append("the thumb must be a link with a tip, and at least one other link needs one")
     elif not found and len({chain_of(hand, tip)[0] for tip in tips}) < len(tips):
         found.append("two fingertips are on the same finger")
-    if not hand.object_scale > 0:
-        found.append("the object scale must be above zero")
+    if not min(hand.object_scale, *dataclasses.astuple(hand.wrist)) > 0:
+        found.append("the object scale and the numbers of the wrist must be above zero")
     return found
 
 

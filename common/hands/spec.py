@@ -286,7 +286,6 @@ class Hand:
 
     def posed(self, angles: dict[str, float]) -> np.ndarray:
         """(F,) angles in the order of the joints; coupled joints are set by their leaders."""
-
         follow = {x.joint: x.offset + x.ratio * angles.get(x.leader, 0.0) for x in self.couplings}
         return np.array([(angles | follow).get(joint.name, 0.0) for joint in self.joints], np.float32)
 

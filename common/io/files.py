@@ -52,9 +52,10 @@ def check_output(option: str, path: pathlib.Path, *, is_folder: bool) -> None:
     if path.exists() and path.is_dir() != is_folder:
         found, remedy = ("file", "Pass a folder; it need not exist.") if is_folder else ("folder", "Pass a file in it.")
         raise CongraspError(f"{option} is the {found} {path}.", remedy)
-    parent = path if path.is_dir() else next(folder for folder in path.absolute().parents if folder.exists())
+    places = [path] * is_folder + list(path.absolute().parents)
+    parent = next(place for place in places if os.path.lexists(place))
     if not parent.is_dir():
-        raise CongraspError(f"{option} is {path}, but {parent} is a file.", "Pass another path.")
+        raise CongraspError(f"{option} is {path}, but {parent} is a file or a link to nothing.", "Pass another path.")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise CongraspError(f"{option} is {path}, but {parent} cannot be written.", "Pass a path in another folder.")
 

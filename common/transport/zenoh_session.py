@@ -48,6 +48,14 @@ _CLOSERS = 64  # threads of a listener that accept and close connections and wai
 _RUNTIME = os.environ.get("ZENOH_RUNTIME", "").strip() or "()"  # of the user; read at the first session
 if not re.search(r"\bacc\s*:", _RUNTIME):  # other values than of the form (…) or Name(…) are the user's alone
     os.environ["ZENOH_RUNTIME"] = re.sub(r"^\w*\s*\(", rf"\g<0>acc: (worker_threads: {_CLOSERS}), ", _RUNTIME)
+_POOL = "(?:app|acc|tx|rx|net)"
+_THREADS = r"worker_threads:\+?\d[\d_]{0,3}|max_blocking_threads:\+?[1-9][\d_]{0,3}"
+_SETTINGS = rf"\((?:(?:{_THREADS}|handover:(?:{_POOL}|None|Some\({_POOL}\)))(?:,|(?=\))))*\)"
+_FORM = re.compile(
+    rf"(?:#!\[enable\(\w+\)\])*(?:AbstractRuntimeParam)?"
+    rf"\((?!.*\b(\w+):\(.*\b\1:\()(?:{_POOL}:(?:RuntimeParamHelper)?{_SETTINGS}(?:,|(?=\))))*\)"
+)
+_FILLING = re.compile(r"/\*.*?\*/|//[^\n]*|\s+", re.DOTALL)
 _SESSIONS = 1000  # most connected peers, but at most a quarter of the open files: Zenoh panics if none is left
 STAMP = struct.Struct("<8sQ")
 """Sender and count of a sample, by which a subscriber detects gaps."""
@@ -57,7 +65,14 @@ _log = logging.getLogger(__name__)
 def configuration(
     name: Flow, endpoints: list[str], listens: bool, max_message: int, credentials: Credentials | None
 ) -> zenoh.Config:
-    """Returns the Zenoh configuration of one flow's session."""
+    """Returns the Zenoh configuration of one flow's session.
+
+    Raises:
+      CongraspError: Zenoh rejects a setting, or would panic at the user's `ZENOH_RUNTIME`.
+    """
+    if not _FORM.fullmatch(_FILLING.sub("", _RUNTIME)):
+        what = f"ZENOH_RUNTIME is {ascii(_RUNTIME)[:80]}, which Zenoh cannot read."
+        raise CongraspError(what, "Unset it, or write for example '(tx: (worker_threads: 2))'.")
     longest = min(max_message, LONGEST.get(name, max_message))
     files = _open_files() if listens else _FILES
     answers = {"id": "patience", "messages": ["query"], "key_exprs": ["**"], "flows": ["ingress"]}

@@ -45,7 +45,6 @@ def query(repeat: int = 1000, concurrency: int = 1, states: int = 1) -> int:
       congrasp bench query
       congrasp bench query --repeat 5000 --concurrency 4
     """
-
     import psutil
 
     from congrasp.common.policy import bundle as bundles

@@ -106,7 +106,6 @@ def show(folder: Folder = pathlib.Path("certs")) -> int:
       congrasp certs show
       congrasp certs show certs
     """
-
     from congrasp.services.ops.certificates import certificates
 
     revoked = Credentials(folder, "").revoked()

@@ -156,7 +156,6 @@ class Import:
 
     def __call__(self) -> int:
         """Imports the sets, and prints what was dropped."""
-
         from congrasp.common.task.sampling.sets import save
         from congrasp.services.assets.captures.build import Options, import_sets
         from congrasp.services.assets.captures.sequence import Meshes

@@ -63,7 +63,6 @@ class Dataset:
 
     def __call__(self) -> int:
         """Makes the missing shards, and the card."""
-
         from congrasp.actors.physics import resolve_physics
         from congrasp.common.policy import bundle as bundles
         from congrasp.common.policy.pretrained import policy_file

@@ -97,11 +97,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code = UNREAD
     except OSError as error:
         code = _fail(_said_of(error), USAGE_ERROR, debug)
-    except RuntimeError as error:  # of XLA or Warp, whose types are imported late
-        if not (found := [text[0].strip(". ") for text in _NO_MEMORY.finditer(str(error))]):
-            raise
-        # No bad input: a run restarts its processes, since another program may have held the memory.
-        code = _fail(f"The device's memory does not suffice: {max(found, key=len)}. {_LESS_MEMORY}", 1, debug)
+    except (RuntimeError, ValueError, AssertionError) as error:  # of libraries whose types are imported late
+        code = _fail(*_said_by(error), debug)
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
         if package == "congrasp":
@@ -132,6 +129,19 @@ def _said_of(error: OSError) -> str:
         return "The working folder does not exist any more. Change to another."
     if error.errno == errno.EIO:
         return "A file could not be read or written, because its disk failed. Try another path."
+    raise error
+
+
+def _said_by(error: Exception) -> tuple[str, int]:
+    """Text and exit code of a library's error about memory or an environment variable; raises others, as bugs."""
+    if found := [text[0].strip(". ") for text in _NO_MEMORY.finditer(str(error))]:
+        # No bad input: a run restarts its processes, since another program may have held the memory.
+        return f"The device's memory does not suffice: {max(found, key=len)}. {_LESS_MEMORY}", 1
+    unnamed = isinstance(error, AssertionError) and "JAX" in str(getattr(error, "__notes__", "")) and not str(error)
+    unnamed = unnamed and "cpu" not in os.environ.get("JAX_PLATFORMS", "cpu")  # none of JAX's platforms is there
+    for name in ["JAX_PLATFORMS"] * unnamed or re.findall(r"\b[A-Z]+_[A-Z\d_]+", str(error)):
+        if name in os.environ:
+            return f"{name} is '{os.environ[name]}', which does not work here. Correct or unset it.", USAGE_ERROR
     raise error
 
 
@@ -169,6 +179,8 @@ def _check_files(arguments: Sequence[str]) -> None:
         if argument.startswith("-"):
             option = argument
             continue
+        if not argument and (not option or option in _WRITTEN):  # as of a variable that is not set
+            raise CongraspError(f"{option or 'An argument'} is empty.", "Name a file or a folder.")
         path = pathlib.Path(re.sub(r":\w+$", "", argument))
         if path.suffix.lower() not in _READ or option in _WRITTEN or _is_there(path):
             continue

@@ -171,7 +171,6 @@ def show(object: Annotated[str, tyro.conf.Positional], folder: str = "objects", 
       congrasp objects show mug:7 --png mug.png
       congrasp objects show mug_7 --folder my-objects
     """
-
     from congrasp.common.task.sampling.headings import sample_headings
     from congrasp.services.assets.objects.named import find_object
 
@@ -222,7 +221,6 @@ def rests(
       congrasp objects rests mug:7 --png rests.png
       congrasp objects rests examples/mug.obj
     """
-
     from congrasp.common.objects.resting import rest_tilts
     from congrasp.services.assets.objects.named import find_object
 

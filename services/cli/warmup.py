@@ -56,7 +56,6 @@ def warmup(
       congrasp warmup --preset human --export caches.tar
       congrasp warmup --import caches.tar
     """
-
     from congrasp.common.runtime.stages import imported
     from congrasp.services.train.command import first_update
     from congrasp.services.train.learn import until_first_update

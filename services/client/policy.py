@@ -5,6 +5,7 @@ A left hand's policy is that of the right one, with mirrored states and targets.
 
 import dataclasses
 import math
+import re
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -30,7 +31,8 @@ _READ = (*_MEASURED, "q_target", "u_target")
 _POINTS = ("cloud", "surface_points", "surface_avoid", "surface_normals")
 NORMALS, CAMERA = "surface_normals", "camera_position"
 """Names of the normals at the points of a query, and of the position of the camera."""
-_SIZE, _TURN = 1.0, 10.0  # m, median deviation of points; rad
+_SIZE, _TURN = 1.0, 2 * math.pi  # m, median deviation of points; rad
+_ANGLES = re.compile(r"(?:\w+_)?q(?:_initial|_target)?|u")  # of u, the last three
 _LONGEST = 64  # largest history of a policy, control steps
 
 
@@ -252,14 +254,14 @@ class Packer:
             policy refuses its name.
 
         Raises:
-          RefusedError: a field is unknown, absent or of the wrong shape.
+          RefusedError: a field is unknown, absent, of the wrong shape or in another unit.
         """
         self._layout, self._fields, self.settle = layout, layout["fields"], float(layout["settle"])
         self._past = {name: self._fields[f"past_{name}"][1] for name in _READ if f"past_{name}" in self._fields}
         needs = layout["constraints"]
         known = {name: own for name, own in constraints.items() if name in needs}
         goals = {f"{name}_{field}": value for name, own in known.items() for field, value in own.items()}
-        fields = {**episode, **{name: _numbers(name, value) for name, value in goals.items()}}
+        fields = {**episode, **_checked({name: _numbers(name, value) for name, value in goals.items()})}
         _require([field for name in known for field in needs[name]], fields)
         self._meta = {"constraints": list(constraints), "layout": layout["digest"]}
         self._vector = np.zeros(layout["size"], np.float32)
@@ -271,7 +273,7 @@ class Packer:
         The oldest step is repeated where the history reaches back beyond the start of the episode.
 
         Raises:
-          RefusedError: there are too many states, or a field is unknown, absent or of the wrong shape.
+          RefusedError: there are too many states, or a field is unknown, absent, of the wrong shape or in another unit.
         """
         if len(states) > self._layout["states"]:
             raise RefusedError(
@@ -280,7 +282,7 @@ class Packer:
         vectors = np.tile(self._vector, (len(states), 1))
         for vector, state in zip(vectors, states, strict=True):
             _require([name for name in _MEASURED if name in self._fields], state)
-            self._write(vector, {name: _numbers(name, value) for name, value in state.items()})
+            self._write(vector, _checked({name: _numbers(name, value) for name, value in state.items()}))
             for name, steps in self._past.items():
                 rows = [_numbers(name, reading[name]) for reading in (past or [state])[:steps]]
                 self._write(vector, {f"past_{name}": np.stack(rows + rows[-1:] * (steps - len(rows)))})
@@ -333,22 +335,22 @@ def _episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
         "surface_normals": request.normals,
         "camera_position": request.camera,
     }
-    fields = {name: _numbers(name, value) for name, value in given.items() if value is not None}
-    _check_units(fields)
-    return fields
+    return _checked({name: _numbers(name, value) for name, value in given.items() if value is not None})
 
 
-@np.errstate(invalid="ignore")  # of points that are not finite, which the first `act` refuses
-def _check_units(fields: Mapping[str, np.ndarray]) -> None:
-    """Raises a RefusedError for points in mm or cm, by their median, and for angles in degrees."""
+@np.errstate(invalid="ignore")  # of numbers that are not finite, which the first `act` refuses
+def _checked(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Returns the fields; raises a RefusedError for points in mm or cm, by their median, and for angles in degrees."""
     for name in ("surface_points", "cloud"):
         points = fields.get(name)
         if points is None or points.ndim != 2 or not points.size:
             continue
         if (size := np.median(np.abs(points - np.median(points, 0)))) > _SIZE:
             raise RefusedError(f"The field '{name}' has half of its points beyond {size:.3g} m.", "Give it in metres.")
-    if (turn := np.abs(fields["q_initial"]).max(initial=0.0)) > _TURN:
-        raise RefusedError(f"The field 'q' has an angle of {turn:.4g}.", "Give it in radians.")
+    for name in filter(_ANGLES.fullmatch, fields):
+        if _TURN < (turn := np.abs(fields[name].ravel()[3 * (name == "u") :]).max(initial=0.0)) < math.inf:
+            raise RefusedError(f"The field '{name}' has an angle of {turn:.4g}.", "Give it in radians.")
+    return fields
 
 
 def _pair(name: str, pose: Pose | None) -> tuple[Any, Any]:

@@ -55,7 +55,7 @@ FORMATS = {"glb": ".glb", "usd": ".usda", "bvh": ".bvh", "ros2": "", "lerobot": 
 DATASETS = ("lerobot",)
 """Formats that hold several motions, and videos."""
 _QUATERNIONS = ("wrist_quaternion", "link_quaternion", "object_quaternion")
-_UNIT = 1e-3  # largest difference of a quaternion's length from one
+_UNIT, _ROUNDED = 1e-3, 1e-2  # largest difference of a quaternion's length from one, and in a recording
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -168,6 +168,7 @@ def motion_of_episode(episode: Message) -> GraspMotion:
     arm = arm_of_episode(episode)
     meta.pop("arm", None)
     of_hand: dict[str, Any] = hand_arrays(hand)
+    links = _normalised(arrays["link_quaternion"])
     return GraspMotion(
         hand=hand.name,
         object=file_name(meta.pop("object"), "the object of a motion"),
@@ -179,14 +180,14 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         time=dt * np.arange(len(arrays["table"])),
         table=arrays["table"].astype(bool),
         wrist_position=arrays["link_position"][:, 0],
-        wrist_quaternion=arrays["link_quaternion"][:, 0],
+        wrist_quaternion=links[:, 0],
         joint_position=arrays["q"],
         joint_target=arrays["q_target"],
         link_position=arrays["link_position"],
-        link_quaternion=arrays["link_quaternion"],
+        link_quaternion=links,
         link_force=arrays["contact_force"],
         object_position=arrays["object_position"],
-        object_quaternion=arrays["object_quaternion"],
+        object_quaternion=_normalised(arrays["object_quaternion"]),
         object_vertices=arrays["visual_vertices"],
         object_faces=arrays["visual_faces"],
         object_file_origin=np.asarray(meta.pop("object_file_origin", (0.0, 0.0, 0.0)), np.float64),
@@ -200,6 +201,12 @@ def motion_of_episode(episode: Message) -> GraspMotion:
         },
         arm=arm,
     )
+
+
+def _normalised(quaternions: np.ndarray) -> np.ndarray:
+    """Quaternions (..., 4) of length one; those whose length differs by more than `_ROUNDED` are unchanged."""
+    lengths = np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    return quaternions / np.where(np.abs(lengths - 1) <= _ROUNDED, lengths, 1)
 
 
 def hand_arrays(hand: Hand) -> dict[str, np.ndarray]:

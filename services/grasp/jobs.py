@@ -20,7 +20,7 @@ from congrasp.services.assets.objects.named import ObjectAt, located, objects_at
 from congrasp.services.assets.objects.options import ImportOptions, check_options, size_in_words
 from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, key_of, save_grasp
 from congrasp.services.grasp.grasper import Grasper, Progress
-from congrasp.services.grasp.parse import numbered, read_request
+from congrasp.services.grasp.parse import read_request
 from congrasp.services.viz.object_sheet import import_sheet, mesh_of_file
 from congrasp.services.viz.render import Film
 from congrasp.services.viz.sheets import contact_sheet, save_png
@@ -189,8 +189,10 @@ def _load(at: ObjectAt, options: ImportOptions) -> GraspObject:
 
 def _identity(text: str) -> str:
     """Identity of a constraint: the content of its file, if it names one."""
-    path, number = numbered(text)
-    return f"{hashlib.sha256(path.read_bytes()).hexdigest()}:{number}" if path.is_file() else text
+    for name, part in ((text, "0"), text.rpartition(":")[::2]):  # a number, or a joint
+        if name and pathlib.Path(name).is_file():
+            return f"{hashlib.sha256(pathlib.Path(name).read_bytes()).hexdigest()}:{part}"
+    return text
 
 
 def save_summary(out: pathlib.Path, hand: str, results: Sequence[Result]) -> None:

@@ -171,7 +171,7 @@ def _part(text: str, target: Target) -> Part:
 
 def _pose(text: str, target: Target) -> dict[str, np.ndarray]:
     """A reference pose from a motion, a constraint set, or JSON."""
-    path, index = numbered(text)
+    path, index = _numbered(text)
     if path.suffix == ".npz":
         motion = _motion(path, target.hand, index)
         last = grasp_part(motion)[1]
@@ -198,7 +198,7 @@ def _pose(text: str, target: Target) -> dict[str, np.ndarray]:
 
 def _path(text: str, target: Target) -> dict[str, np.ndarray]:
     """A wrist trajectory from a motion, a constraint set, CSV, BVH, or JSON."""
-    path, index = numbered(text)
+    path, index = _numbered(text)
     file, _, joint = text.partition(":")
     if file.lower().endswith(".bvh"):
         return _recorded(pathlib.Path(file), joint or "RightHand", target)
@@ -239,7 +239,7 @@ def _recorded(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.nd
     return {"position": places, "quaternion": turns}
 
 
-def numbered(text: str) -> tuple[pathlib.Path, int]:
+def _numbered(text: str) -> tuple[pathlib.Path, int]:
     """The file and the number in FILE or FILE:NUMBER; the number is 0 by default."""
     name, colon, number = text.rpartition(":")
     if colon and number.isdecimal() and len(number) < 10:

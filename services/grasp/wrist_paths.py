@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.io.inputs import read_file, read_npz, runs_back
+from congrasp.common.io.inputs import check_arrays, read_file, read_npz, runs_back
 from congrasp.services.assets.objects.options import METRES
 
 _LARGEST, _DEEPEST = 32 << 20, 200
@@ -26,6 +26,7 @@ _UNIT = re.compile(r" ?[\[(]([^][()]*)[])]")
 _LETTERED = re.compile(r"([wxyz]) *(?:\[([^][]*)\]|_(m|mm|cm|in))?$")  # letter and unit at the end of a column's name
 _SEPARATOR = re.compile(r"[\W_]+")
 _NO_PLACE = re.compile(
+    r"(?!p [a-z]?([a-z])[a-z]? \1$)"  # a position between two frames, in one of them, as p_RS_R of EuRoC
     r"(?:.* )?(?:[vawfnre]|(?:vel|speed|acc|linear|linv|ang|gyro|force|torq|rot|euler|normal|omega|twist|wrench).*)"
 )
 _KIND = re.compile(r"|[ptcqo]|pos.*|trans.*|loc.*|cent.*|quat.*|rot.*|ori.*|att.*")  # first word without a body
@@ -76,7 +77,6 @@ def read_wrist_path(
         position, rotation = _FROM_Y_UP.apply(position * _CM), _FROM_Y_UP * rotation
     elif kind in (".csv", ".npz"):
         position, quaternion = _npz(path) if kind == ".npz" else read_csv(path, _LARGEST)
-        _check(path, position, quaternion)
         seconds = 0.01
         rotation = Rotation.from_quat(quaternion, scalar_first=True)
     else:
@@ -100,7 +100,9 @@ def read_bvh(path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, floa
     try:
         return _bvh(read_file(path, _LARGEST, "Cut it into shorter ones.").decode(), path, joint)
     except (ValueError, LookupError, StopIteration) as error:
-        raise CongraspError(f"{path} cannot be read as BVH: {str(error)[:200]}.", "Export it again.") from None
+        raise CongraspError(
+            f"{path} cannot be read as BVH: {str(error)[:200] or 'it was cut'}.", "Export it again."
+        ) from None
 
 
 def _bvh(text: str, path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotation, float]:
@@ -119,10 +121,12 @@ def _bvh(text: str, path: pathlib.Path, joint: str) -> tuple[np.ndarray, Rotatio
         moved = np.tile(offset, (len(rows), 1))
         turn = Rotation.identity(len(rows))
         for channel, column in zip(channels, values.T, strict=True):
-            axis = channel[0].upper()
-            if channel.endswith("position"):
+            axis, kind = channel[0].upper(), channel[1:].lower()
+            if kind == "position":
                 # A position takes the place of the offset, as most programs read it.
                 moved[:, "XYZ".index(axis)] = column
+            elif kind != "rotation":
+                raise ValueError(f"it has the channel {channel[:30]}")
             else:
                 turn = turn * Rotation.from_euler(axis, column[:, None], degrees=True)
         position = position + rotation.apply(moved)
@@ -145,7 +149,7 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
             name = next(tokens)
             names.append(name)
         elif token == "End":
-            name = next(tokens)
+            name = ""
         elif token == "{":
             stack.append((np.zeros(3), [], column))
             if len(stack) > _DEEPEST:
@@ -156,10 +160,10 @@ def _chain(text: str, joint: str) -> tuple[list[_Link] | None, int, list[str]]:
             channels = [next(tokens) for _ in range(int(next(tokens)))]
             stack[-1] = (stack[-1][0], channels, column)
             column += len(channels)
-            if name == joint:
-                found = list(stack)
         elif token == "}":
             stack.pop()
+        if name == joint and token in ("OFFSET", "CHANNELS"):
+            found = list(stack)
     return found, column, names
 
 
@@ -287,7 +291,8 @@ def _columns(names: list[str], *, titled: bool) -> tuple[list[int], int, float] 
         return None
     if titled and any(len(same) > 1 for same in groups.values()):
         raise ValueError("names columns twice below another line: it needs a header of one line")
-    places = [one for one in places if not _NO_PLACE.fullmatch(one[0])]
+    rates = [group for _, group in places if any(set(unit) & set("/^") for _, unit in group.values())]  # as m s^-1
+    places = [one for one in places if not (_NO_PLACE.fullmatch(one[0]) or one[1] in rates)]
     if len(turns) == 1:
         turned = turns[0][0]
         shared = [_shared(name.split(), turned.split()) for name, _ in places]
@@ -322,23 +327,15 @@ def _number(word: str) -> float | None:
 
 
 def _npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and quaternions of an NPZ file."""
+    """Positions (T, 3) and unit quaternions (T, 4) of an NPZ file."""
     try:
         data = read_npz(path, remedy := "It needs 'position' and 'quaternion'.")
-        keys = ("wrist_position", "wrist_quaternion") if "wrist_position" in data else ("position", "quaternion")
-        position, quaternion = (data[key].astype(float) for key in keys)
+        prefix = "wrist_" if "wrist_position" in data else ""
+        meanings = {f"{prefix}position": "(T, 3) m", f"{prefix}quaternion": "(T, 4) w x y z"}
+        check_arrays(data, meanings, indices=(), largest=HUGE)
     except (KeyError, ValueError) as error:
         raise CongraspError(f"{path} cannot be read: {error}.", remedy) from None
+    position, quaternion = (data[name].astype(float) for name in meanings)
+    if np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > _UNIT_LENGTH:
+        raise CongraspError(f"{path} holds quaternions that are not of length one.", "Write w, x, y, z, of length one.")
     return position, quaternion
-
-
-def _check(path: pathlib.Path, position: np.ndarray, quaternion: np.ndarray) -> None:
-    """Raises a CongraspError if a shape is wrong, a number is not finite, or a quaternion is not normalised."""
-    if position.ndim != 2 or position.shape[1:] != (3,) or quaternion.shape != (len(position), 4) or not len(position):
-        raise CongraspError(
-            f"{path} has positions {position.shape} and quaternions {quaternion.shape}.",
-            "A frame is x, y, z and a quaternion w, x, y, z.",
-        )
-    both = np.concatenate([position, quaternion], 1)
-    if not np.isfinite(both).all() or np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > _UNIT_LENGTH:
-        raise CongraspError(f"{path} holds numbers that are not finite, or quaternions that are not of length one.")

@@ -310,7 +310,7 @@ def opened_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:
     Raises:
       CongraspError: there is no folder or recording of this name.
     """
-    parts = [part for part in recordings.resolve().parts if part != LOGS] if recordings else []
+    parts = [part for part in recordings.resolve().parts if part != LOGS] if recordings else [""]
     window = TrainingWindow(run or parts[-1], Recordings(recordings) if recordings else None)
     threading.Thread(target=window.load, daemon=True, name="curves").start()
     return window

@@ -140,6 +140,9 @@ def main() -> None:
         "stl_cut/part.stl": box[:-30],
         "stl_solid/part.stl": b"solid part of facet".ljust(80) + box[80:],
         "glb_quantised/part.glb": quantised(),
+        "gltf_embedded/part.gltf": trimesh.exchange.gltf.export_gltf(trimesh.Scene(BOX), embed_buffers=True)[
+            "model.gltf"
+        ],
         "glb_draco/part.glb": compressed("KHR_draco_mesh_compression"),
         "glb_meshopt/part.glb": compressed("EXT_meshopt_compression"),
         "glb_unknown/part.glb": compressed("ACME_folded_surfaces"),

@@ -444,6 +444,22 @@ def test_a_listener_has_its_threads_in_addition_to_the_user_s_settings():
     assert int(threads) > zenoh_session._CLOSERS and b"tx: (worker_threads: 2)" in settings
 
 
+@pytest.mark.parametrize(
+    ("given", "sound"),
+    [
+        *((text, False) for text in ("acc", "(tx: (worker_threads: 2)", "(tx: (worker_threads: two))", "(tx: 2)")),
+        *((text, False) for text in ("(all: ())", "(tx: (handover: all))", "(tx: (threads: 2))", "(tx: (),,)")),
+        *((text, False) for text in ("(tx: (), tx: ())", "(tx: (max_blocking_threads: 0))")),
+        ("#![enable(implicit_some)] ( tx: (worker_threads: 1_0,), /* of\nmine */ rx: (handover: Some(tx)), )", True),
+        ("AbstractRuntimeParam(app: (worker_threads: 2, max_blocking_threads: 9)) // mine", True),
+    ],
+)
+def test_settings_at_which_zenoh_would_panic_are_refused(monkeypatch, given, sound):
+    monkeypatch.setattr(zenoh_session, "_RUNTIME", given)
+    with contextlib.nullcontext() if sound else pytest.raises(CongraspError, match=r"ZENOH_RUNTIME is '.*Unset it"):
+        zenoh_session.configuration("policy", ["tcp/127.0.0.1:7457"], False, 1 << 20, None)
+
+
 @pytest.mark.parametrize(("hard", "files", "warnings"), [(1024, 1024, 1), (20_000, 16_384, 0)])
 def test_a_listener_raises_its_limit_of_files_or_warns_once_and_leaves_some_free(
     monkeypatch, caplog, hard, files, warnings

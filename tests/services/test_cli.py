@@ -93,6 +93,8 @@ def test_help_names_every_command_and_every_command_exists():
         (["train", "--objects.seed", "9" * 23], "--objects.seed: a seed is a whole number"),
         (["grasp", "mug:7", "--attempts", "100000000"], "--attempts is 100000000. It must be from 1 to 1024"),
         (["grasp"], "nothing to grasp"),
+        (["grasp", ""], "An argument is empty"),
+        (["grasp", "mug:7", "--out", ""], "--out is empty"),
         (["grasp", "mug:7", "--approach", "-1"], "--approach is -1.0. It must be from 0 to"),
         (["grasp", "mug:7", "--approach", "11"], "--approach is 11.0. It must be from 0 to"),
         (["grasp", "mug:7", "--lift", "0.6"], "--lift is 0.6. It must be from 0 to"),
@@ -125,6 +127,13 @@ def test_bad_input_is_one_line_and_a_non_zero_exit(arguments, words, monkeypatch
     with mock.patch.dict(os.environ), pytest.raises(SystemExit) as end:
         cli.main(arguments)
     is_one_line(end.value.code, capfd.readouterr().err, words)
+
+
+@pytest.mark.parametrize("out", ["link", "link/grasps"])
+def test_an_output_behind_a_link_to_nothing_is_refused(tmp_path, out):
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    with pytest.raises(CongraspError, match="link is a file or a link to nothing"):
+        cli.run(["objects", "generate", "--out", str(tmp_path / out)])
 
 
 @pytest.mark.parametrize(
@@ -179,6 +188,29 @@ def test_a_disk_that_is_full_or_fails_is_one_line_wherever_it_strikes(error, lin
         cli.main([])
     assert end.value.code == 2
     assert capsys.readouterr().err.splitlines() == [f"congrasp: error: {line}"]
+
+
+@pytest.mark.parametrize("name", ["JAX_PLATFORMS", "MUJOCO_GL", ""])
+def test_a_variable_at_which_a_library_fails_is_named(name, monkeypatch, capsys):
+    error = RuntimeError(f"invalid value for {name}") if name else AssertionError()  # as JAX, without a platform
+    error.add_note("For simplicity, JAX has removed its internal frames from the traceback.")
+    monkeypatch.setattr(cli, "run", mock.Mock(side_effect=error))
+    monkeypatch.delenv(name or "JAX_PLATFORMS", raising=False)
+    with pytest.raises(type(error)):
+        cli.main([])
+    monkeypatch.setenv(name or "JAX_PLATFORMS", "abacus")
+    with pytest.raises(SystemExit, match="2"):
+        cli.main([])
+    assert re.search(rf"{name} is 'abacus', which does not work here\. Correct or unset it", capsys.readouterr().err)
+
+
+def test_a_failed_assertion_of_a_traced_function_is_a_bug_where_the_cpu_is_a_platform(monkeypatch):
+    error = AssertionError()
+    error.add_note("For simplicity, JAX has removed its internal frames from the traceback.")
+    monkeypatch.setattr(cli, "run", mock.Mock(side_effect=error))
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    with pytest.raises(AssertionError):
+        cli.main([])
 
 
 @pytest.mark.parametrize(

@@ -190,6 +190,7 @@ def test_a_policy_with_sizes_that_nothing_holds_is_refused_at_once(tmp_path, par
         (lambda h: h["links"][0].update(mass=0.0), "needs a mass above zero"),
         (lambda h: h["links"][0].update(mass=NAN), "not a finite number"),
         (lambda h: h["links"][1]["joints"][0].update(lower=2.0, upper=-2.0), "wrong order"),
+        (lambda h: h["wrist"].update(slide_kp=-1.0), "numbers of the wrist must be above zero"),
         (lambda h: h["links"][1]["joints"][0].update(kp=1e300), "not a finite number"),
         (lambda h: h["links"][1].update(capsules=h["links"][1]["capsules"] * 10_000), "more than"),
         (lambda h: h.update(links=h["links"] * 1000), "the limit is"),

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import os
 import pathlib
 import re
 import stat
@@ -282,11 +283,17 @@ def _compiled(spec: mujoco.MjSpec, notes: list[str]) -> mujoco.MjModel:
 def _rejected(spec: mujoco.MjSpec, error: str) -> tuple[Any, str, str]:
     """The asset that MuJoCo's error is about, the reason and a name; None if there is no such asset."""
     if opened := _OPENING.search(error):
-        assets = (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)
-        files = {name: asset for asset in assets for name in (asset.file, *getattr(asset, "cubefiles", ())) if name}
+        folders = (spec.meshdir, (*spec.meshes, *spec.hfields, *spec.skins)), (spec.texturedir, spec.textures)
+        files = {
+            name: (asset, os.path.normpath(os.path.join(folder, name)))
+            for folder, assets in folders
+            for asset in assets
+            for name in (asset.file, *getattr(asset, "cubefiles", ()))
+            if name
+        }
         if same := [name for name in files if pathlib.PurePath(name).name == pathlib.PurePath(opened[1]).name]:
-            name = max(same, key=lambda name: (opened[1].endswith(name), len(name)))  # folders may have equal names
-            return files[name], "not found", name
+            name = max(same, key=lambda name: (files[name][1] == opened[1], opened[1].endswith(name), len(name)))
+            return files[name][0], "not found", name
     mesh = next((mesh for mesh in spec.meshes if error.endswith(mesh.info)), None)
     why = next(why for pattern, why in _REASONS.items() if re.search(pattern, error.partition("\n")[0]))
     return mesh, why, mesh.name if mesh else ""

@@ -1,5 +1,9 @@
-"""GLB files as trimesh reads them: triangles alone, positions and texture coordinates as floats, in bounded memory."""
+"""GLB files as trimesh reads them: triangles alone, positions and texture coordinates as floats, in bounded memory.
 
+A glTF file with embedded buffers becomes GLB.
+"""
+
+import base64
 import json
 from typing import Any
 
@@ -21,6 +25,35 @@ _COMPRESSED = {
 _LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp", "KHR_animation_")
 """Beginnings of glTF extensions that change no geometry."""
 _TRIANGLES = (4, 5)  # glTF's modes of primitives: triangles and strips of them
+
+
+def packed(data: bytes) -> bytes:
+    """The GLB file of a glTF scene in one file, whose buffers are embedded as data URIs.
+
+    Raises:
+      CongraspError: its buffers are other files; a predicate without a subject.
+      ValueError: an embedded buffer is damaged.
+    """
+    tree, binary, starts = json.loads(data), bytearray(), list[int]()
+    for buffer in _list(tree, "buffers"):
+        head, mark, text = str(buffer.get("uri")).partition(";base64,")
+        if not (mark and head.startswith("data:")):
+            raise CongraspError("is a glTF scene in several files.", "Export it as GLB, which is a single file.")
+        starts.append(len(binary))
+        binary += base64.b64decode(text)
+        binary += bytes(-len(binary) % 4)
+    for view in _list(tree, "bufferViews"):
+        view["byteOffset"] = view.get("byteOffset", 0) + starts[view.get("buffer", 0)]
+        view["buffer"] = 0
+    return _glb({**tree, "buffers": [{"byteLength": len(binary)}]}, bytes(binary))
+
+
+def _glb(tree: dict[str, Any], binary: bytes) -> bytes:
+    """A GLB file of a scene and its numbers."""
+    text = json.dumps(tree).encode()
+    chunks = ((text + b" " * (-len(text) % 4), b"JSON"), (binary + bytes(-len(binary) % 4), b"BIN\0"))
+    body = b"".join(len(chunk).to_bytes(4, "little") + name + chunk for chunk, name in chunks)
+    return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
 
 
 def plain_glb(data: bytes, notes: list[str]) -> bytes:
@@ -64,12 +97,7 @@ def plain_glb(data: bytes, notes: list[str]) -> bytes:
         binary += values.tobytes()
         view = len(tree["bufferViews"]) - 1
         accessors[index] = {"bufferView": view, "componentType": 5126, "count": len(values), "type": part["type"]}
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    binary += bytes(-len(binary) % 4)
-    whole = data[:8] + (28 + len(text) + len(binary)).to_bytes(4, "little")
-    chunks = ((text, b"JSON"), (bytes(binary), b"BIN\0"))
-    return whole + b"".join(len(chunk).to_bytes(4, "little") + name + chunk for chunk, name in chunks)
+    return _glb(tree, bytes(binary))
 
 
 def _check_extensions(tree: dict[str, Any]) -> None:

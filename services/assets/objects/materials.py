@@ -75,7 +75,11 @@ def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
     Raises:
       CongraspError: unknown material or part, or a part without material.
     """
-    named = dict(_entry(entry) for entry in text.split(","))
+    entries = [_entry(entry) for entry in text.split(",")]
+    if len(named := dict(entries)) < len(entries):
+        raise CongraspError(
+            f"--material is '{text}', with two materials for a part.", "Name one, or PART=NAME for each."
+        )
     if unknown := sorted(named.keys() - {"", *parts}):
         known = ", ".join(filter(None, parts))
         remedy = f"The parts are: {known}." if known else "Name the material alone: the object has no parts."

@@ -23,7 +23,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_file
 from congrasp.common.objects.spec import COLOUR_POINTS, Colours
 from congrasp.services.assets.objects import repair
-from congrasp.services.assets.objects.gltf import MAX_FACES, plain_glb
+from congrasp.services.assets.objects.gltf import MAX_FACES, packed, plain_glb
 from congrasp.services.assets.objects.options import Up
 from congrasp.services.assets.objects.ply import plain_ply
 from congrasp.services.assets.objects.polygons import alike, cut_dented
@@ -96,7 +96,7 @@ def read_mesh(path: pathlib.Path, notes: list[str] | None = None, up: Up = "auto
     mesh = repair.merged(upright(vertices, axis), faces, said)
     if len(mesh.faces) < 4:
         raise CongraspError(f"{path} has no volume: only {len(mesh.faces)} proper triangles.", "Export a closed mesh.")
-    mesh.metadata["kind"] = kind
+    mesh.metadata["kind"] = loaded.metadata["kind"]
     return mesh
 
 
@@ -126,7 +126,7 @@ def load_geometry(path: pathlib.Path, remedy: str, *, notes: list[str] | None = 
       **options: of `trimesh.load`.
 
     Returns:
-      The geometry; its `metadata["kind"]` is stl, obj, ply or glb.
+      The geometry; its `metadata["kind"]` is stl, obj, ply or glb, also of a glTF file.
 
     Raises:
       CongraspError: it cannot be read; the line ends with the remedy.
@@ -142,6 +142,7 @@ def _geometry(path: pathlib.Path, kind: str, data: bytes, remedy: str, notes: li
         if kind == "stl":
             found: Any = _stl(data, notes)
         else:
+            kind, data = ("glb", packed(data)) if kind == "gltf" else (kind, data)
             prepared = {"ply": plain_ply, "glb": plain_glb, "obj": _plain_obj}[kind](data, notes)
             files = _Files(path, notes)
             found = trimesh.load(io.BytesIO(prepared), file_type=kind, resolver=files, process=False, **options)
@@ -191,6 +192,8 @@ def _content(path: pathlib.Path) -> tuple[str, bytes]:
     if kind := _supported(start, len(data)):
         return kind, data
     text = start.removeprefix(_MARK).lstrip()
+    if text.startswith(b"{") and b'"asset"' in data:
+        return "gltf", data
     if foreign := _foreign(text, data):
         raise CongraspError(f"{path} is {foreign[0]}.", foreign[1])
     if suffix not in SUFFIXES:
@@ -222,11 +225,12 @@ def _foreign(text: bytes, data: bytes) -> tuple[str, str] | None:
         except (OSError, zipfile.BadZipFile):
             return "a zip archive that is damaged", "Download it again."
         inside = "".join(f"{name}\n" for name in names).lower().encode()
-    for row in tomllib.loads(_FOREIGN.read_text())["format"]:
+    groups = tomllib.loads(_FOREIGN.read_text())["group"]
+    for remedy, row in ((group["remedy"], row) for group in groups for row in group["files"]):
         begins = tuple(beginning.encode("latin-1") for beginning in row["begins"])
         holds = row.get("holds", [""])
         if (text.startswith(begins) or text.lower().startswith(begins)) and any(x.encode() in inside for x in holds):
-            return row["what"], row["remedy"]
+            return row["what"], remedy
     if meshes := [name for name in names if name.lower().endswith(SUFFIXES)]:
         return f"a zip archive with {', '.join(meshes[:3])}{' …' if len(meshes) > 3 else ''} in it", _UNPACK
     return ("a zip archive without a mesh in it", CONVERT) if zipped else None

@@ -31,7 +31,7 @@ from congrasp.services.cli.main import load
 from congrasp.services.export.motion_file import load_motion, motion_of_episode
 from congrasp.services.grasp.files import MOTION, OBJECT, PICTURE, PORTRAIT, RECORDING, RESULT, save_grasp
 from congrasp.services.grasp.grasper import Grasper, _places
-from congrasp.services.grasp.jobs import Result
+from congrasp.services.grasp.jobs import Result, _identity
 from congrasp.services.grasp.motion import Grasp, costs
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.record.reader import read_episodes
@@ -249,6 +249,14 @@ def test_a_folder_with_a_bad_mesh_is_grasped_once(tmp_path, capsys, monkeypatch,
     assert fake_grasps[7:] == ["c"]
     assert command(folder, "--out", out, "--heading", "above", "--again") == 0
     assert fake_grasps[8:] == ["a", "b", "c"]
+
+
+def test_another_file_of_a_constraint_is_another_request(tmp_path):
+    found = set()
+    for content in ("one", "other"):
+        (tmp_path / "a.bvh").write_text(content)
+        found |= {_identity(f"{tmp_path}/a.bvh{part}") for part in ("", ":0", ":1", ":Hand")}
+    assert len(found) == 6
 
 
 def test_exit_codes(tmp_path, capsys, monkeypatch, fake_grasps):

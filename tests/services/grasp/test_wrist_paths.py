@@ -67,9 +67,11 @@ def check(found):
 
 @pytest.mark.parametrize("order", ["".join(axes) for axes in itertools.permutations("XYZ")])
 def test_the_channels_of_a_skeleton_may_have_any_order(tmp_path, order):
-    found = read_wrist_path(bvh(tmp_path / "motion.bvh", order), joint="Hand")
+    found = read_wrist_path(file := bvh(tmp_path / "motion.bvh", order), joint="Hand")
     check(found)
     assert found.seconds == 0.02
+    file.write_text(file.read_text().replace("position", "POSITION").replace("rotation", "Rotation"))
+    check(read_wrist_path(file, joint="Hand"))
 
 
 def test_csv_and_npz_give_the_same_path(tmp_path):
@@ -102,6 +104,8 @@ ROS = "x,y,z,qx,qy,qz,qw"
         (ROS + ",vx,vy,vz", "pqp", ","),
         ("a title of the file\n" + ROS, "pq", ","),
         ("px,py,pz,vx,vy,vz,qx,qy,qz,qw", "pvq", ","),
+        ("p_x,p_y,p_z,p_v_x,p_v_y,p_v_z,qx,qy,qz,qw", "pvq", ","),
+        ("p_BW_W_x,p_BW_W_y,p_BW_W_z,p_BW_v_x,p_BW_v_y,p_BW_v_z,qx,qy,qz,qw", "pvq", ","),
         ("t,qx,qy,qz,qw,wx,wy,wz,px,py,pz", "tqvp", ","),
         (
             "twist.linear.x,twist.linear.y,twist.linear.z,pose.position.x,pose.position.y,pose.position.z,"
@@ -121,6 +125,13 @@ ROS = "x,y,z,qx,qy,qz,qw"
         (",".join(f"torso_{name}" for name in ROS.split(",")), "pq", ","),
         ("title,of,the,file,and,its,cells,written\n" + ROS, "pq", ","),
         (ROS, "pq", " "),
+        (
+            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_x [], q_RS_y [], q_RS_z [], q_RS_w [], "
+            "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
+            "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]",
+            "tpqvvv",
+            ",",
+        ),
         ("Pos X [cm],Pos Y [cm],Pos Z [cm],QX [-],QY [-],QZ [-],QW [-]", "cq", ","),
     ],
 )
@@ -149,7 +160,10 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
     ("header", "complaint"),
     [
         ("vx,vy,vz,qx,qy,qz,qw", "no position"),
+        ("p_v_x,p_v_y,p_v_z,qx,qy,qz,qw", "no position"),
+        ("x [m map],y [m map],z [m map],goal_x,goal_y,goal_z,qx,qy,qz,qw", "several positions: x, y, z, goal"),
         ("x,y,z,q1,q2,q3,q4", "no quaternion"),
+        ("#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]", "no quaternion"),
         ("x,y,z,roll,pitch,yaw,grip", "no quaternion"),
         ("px,py,pz,elbow.px,elbow.py,elbow.pz,qx,qy,qz,qw", "several positions: p, elbow p"),
         ("x_mm,y_mm,z_m,qx,qy,qz,qw", "positions in m and mm, not all in one of m, cm, mm, in"),
@@ -253,10 +267,28 @@ def test_another_wrist_frame_is_converted(tmp_path):
     check(read_wrist_path(tmp_path / "a.npz", fingers="+x", back="+y"))
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [("Xrotation", "Xscale", "it has the channel Xscale"), ("CHANNELS 6", "CHANNELS 999", "it was cut")],
+)
+def test_a_skeleton_that_could_be_misread_is_refused(tmp_path, old, new, complaint):
+    file = bvh(tmp_path / "motion.bvh")
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(CongraspError, match=rf"cannot be read as BVH: {complaint}"):
+        read_bvh(file, "Hand")
+
+
+def test_a_joint_without_channels_moves_with_its_parents(tmp_path):
+    file = bvh(tmp_path / "motion.bvh")
+    file.write_text(file.read_text().replace("    JOINT Hand", "JOINT Held\n{\nOFFSET 1 0 0\n}\nJOINT Hand"))
+    np.testing.assert_allclose(read_bvh(file, "Held")[1].as_matrix(), read_bvh(file, "Arm")[1].as_matrix())
+
+
 def test_unreadable_files_are_errors(tmp_path):
     file = bvh(tmp_path / "motion.bvh")
-    with pytest.raises(CongraspError, match="no joint 'RightHand'"):
-        read_wrist_path(file)
+    for joint in ("RightHand", "Site"):
+        with pytest.raises(CongraspError, match=f"no joint '{joint}'"):
+            read_wrist_path(file, joint=joint)
     file.write_text(file.read_text()[:-200])
     with pytest.raises(CongraspError, match="cannot be read as BVH"):
         read_bvh(file, "Hand")

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.mjcf import mujoco_link_poses
+from congrasp.common.wire.codec import Message
 from congrasp.services.export.motion_file import load_motion, motion_of_episode, save_motion
 from tests.episodes import CONTROL_DT, episode
 
@@ -34,6 +35,15 @@ def test_a_motion_survives_its_file_and_the_file_says_what_every_array_means(tmp
             assert file[name].ndim == len(axes), name
             wanted = [int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes]
             assert all(n in (None, size) for n, size in zip(wanted, file[name].shape, strict=True)), name
+
+
+def test_rounded_quaternions_of_an_episode_are_normalised(tmp_path):
+    whole = episode()
+    rounded = {name: 1.002 * np.asarray(whole.arrays[name]) for name in ("link_quaternion", "object_quaternion")}
+    save_motion(tmp_path / "a.npz", motion_of_episode(Message({**whole.arrays, **rounded}, whole.meta)))
+    again, motion = load_motion(tmp_path / "a.npz"), motion_of_episode(whole)
+    for name in ("wrist_quaternion", "link_quaternion", "object_quaternion"):
+        np.testing.assert_allclose(getattr(again, name), getattr(motion, name), atol=1e-6)
 
 
 def test_a_file_of_the_first_format_is_read(tmp_path):
@@ -71,10 +81,7 @@ def test_arrays_that_are_not_known_are_left_alone(tmp_path):
 def test_the_file_alone_suffices_for_the_kinematics():
     motion = motion_of_episode(episode())
     q = motion.joint_position[-1]
-    turns, places = (
-        [],
-        [],
-    )  # of every link: x = turn x0 + place, for points x0 of the wrist frame with all joints at zero
+    turns, places = [], []  # of every link: x = turn x0 + place, for x0 of the wrist frame with all joints at zero
     for link, parent in enumerate(motion.link_parent):
         turn, place = (Rotation.identity(), np.zeros(3)) if parent < 0 else (turns[parent], places[parent])
         for j in np.flatnonzero(motion.joint_link == link):

@@ -153,6 +153,17 @@ def test_what_a_request_lacks_is_named_at_once(policies, episode):
             policy.reset(dataclasses.replace(episode.request, surface=None, wrist=None))
 
 
+@pytest.mark.parametrize("where", ["q", "u", "q_initial", "pose_q"])
+def test_angles_in_degrees_are_refused_wherever_they_are(policies, episode, where):
+    request, degrees, state = asked(episode.request, "pose"), np.full(20, 12.5), episode.state
+    if where == "pose_q":
+        request.constraints["pose"]["q"] = degrees
+    for policy in policies:
+        with pytest.raises(RefusedError, match=rf"The field '{where}' has an angle of 12\.5\. Give it in radians"):
+            policy.reset(dataclasses.replace(request, q=degrees if where == "q_initial" else request.q))
+            policy.act({**state, where: degrees[: state[where].size]} if where in state else state)
+
+
 def test_both_refuse_a_contradiction(policies, episode):
     highest = episode.request.surface[episode.request.surface[:, 2].argmax()]
     request = asked(episode.request, "trajectory affordance")

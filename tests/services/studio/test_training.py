@@ -16,7 +16,15 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.studio import training as training_module
-from congrasp.services.studio.training import FIRST, Curve, Follower, Recordings, TrainingWindow, labels_of
+from congrasp.services.studio.training import (
+    FIRST,
+    Curve,
+    Follower,
+    Recordings,
+    TrainingWindow,
+    labels_of,
+    opened_window,
+)
 from tests import studio as fake
 from tests.studio import BEGIN, DIP
 from tests.waits import eventually
@@ -185,6 +193,12 @@ def test_curves_and_newest_episodes_are_read_from_recordings(tmp_path: pathlib.P
     assert [event["text"] for event in view["events"]] == ["The run is complete after 40 updates."]
     row = view["actors"][0]
     assert (row["version"], row["rollouts"], row["steps_per_second"]) == (39, 12.0, 800.0)
+
+
+def test_a_window_has_the_name_of_the_run_or_of_the_recordings_folder(tmp_path: pathlib.Path) -> None:
+    fake.record(tmp_path / "mine" / "logs", [(BEGIN, 3)])
+    for run, folder, name in (("", tmp_path / "mine" / "logs", "mine"), ("r", tmp_path / "mine", "r"), ("", None, "")):
+        assert opened_window(run, folder).run == name
 
 
 def test_a_finished_run_stays_finished_when_its_learner_has_gone() -> None:

@@ -103,6 +103,7 @@ def test_a_folder_s_unusable_files_are_named_and_its_mesh_is_imported(tmp_path, 
     [
         ("adamantium", r"--material is 'adamantium'\. Materials: aluminium,"),
         ("handle=wood", r"--material names the part 'handle'\. Name the material alone"),
+        ("wood,steel", "'wood,steel', with two materials for a part"),
         ("=wood", r"--material is '=wood'\. Materials: aluminium,"),
     ],
 )
