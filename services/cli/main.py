@@ -141,7 +141,8 @@ def _said_by(error: Exception) -> tuple[str, int]:
     unnamed = unnamed and "cpu" not in os.environ.get("JAX_PLATFORMS", "cpu")  # none of JAX's platforms is there
     for name in ["JAX_PLATFORMS"] * unnamed or re.findall(r"\b[A-Z]+_[A-Z\d_]+", str(error)):
         if name in os.environ:
-            return f"{name} is '{os.environ[name]}', which does not work here. Correct or unset it.", USAGE_ERROR
+            said = f" ({str(error).strip().splitlines()[0]})" if str(error).strip() else ""
+            return f"{name} is '{os.environ[name]}', which does not work here{said}. Correct or unset it.", USAGE_ERROR
     raise error
 
 

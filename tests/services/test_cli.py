@@ -201,7 +201,9 @@ def test_a_variable_at_which_a_library_fails_is_named(name, monkeypatch, capsys)
     monkeypatch.setenv(name or "JAX_PLATFORMS", "abacus")
     with pytest.raises(SystemExit, match="2"):
         cli.main([])
-    assert re.search(rf"{name} is 'abacus', which does not work here\. Correct or unset it", capsys.readouterr().err)
+    said = f"{name} is 'abacus', which does not work here (invalid value for {name})"
+    line = said if name else "JAX_PLATFORMS is 'abacus', which does not work here"
+    assert capsys.readouterr().err == f"congrasp: error: {line}. Correct or unset it.\n"
 
 
 def test_a_failed_assertion_of_a_traced_function_is_a_bug_where_the_cpu_is_a_platform(monkeypatch):
