@@ -240,7 +240,7 @@ def evaluate_pools(experiment: Experiment, pools: Pools, kept: pathlib.Path | No
     """
     number = len(pools.make)
     each = -(-experiment.episodes // (pools.size * number))
-    advance = experiment.track("Episodes on many objects", experiment.episodes)
+    advance = experiment.track("Episodes on many objects", each * pools.size * number)
     experiment = dataclasses.replace(
         experiment, constraints=None, episodes=each * pools.size, measured=pools.size * number <= MEASURED
     )
